@@ -1,0 +1,226 @@
+"""The command line. JAX is imported only when a command runs."""
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from ._cylinder import Cylinder
+    from ._heightfield import Heightfield
+    from ._scene import Scene
+    from ._settings import Settings
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; returns its exit code: 0, 2 after an error of the user's, 130 after Ctrl-C."""
+    options = _parser().parse_args(arguments)
+    try:
+        options.run(options)
+    except KeyboardInterrupt:
+        print("\njaxhf: interrupted", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        print(f"jaxhf: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="jaxhf", description="Renders heightfields.")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+
+    render = commands.add_parser("render", help="render a scene to a picture", description="Render a scene to a picture.")
+    render.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
+    render.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="the picture: .png (sRGB), .exr, .npy or .pfm (linear)"
+    )
+    render.add_argument(
+        "--width", type=int, metavar="PIXELS", help="size; with one of the two, the other keeps the scene's proportions"
+    )
+    render.add_argument("--height", type=int, metavar="PIXELS")
+    render.add_argument("--samples", type=int, metavar="N", help="rays a pixel, a square number [the scene's, rounded up]")
+    render.add_argument("--traversal", metavar="WALK", help="how the hit is searched for: dda [dda]")
+    render.add_argument("--shading", help="smooth or flat [smooth]")
+    render.add_argument("--normals", help="central, four, six, six-angle or six-equal [six]")
+    render.add_argument("--no-shadows", dest="shadows", action="store_false", default=None, help="let light through everything")
+    render.add_argument("--max-depth", type=int, metavar="N", help="mirror bounces [4]")
+    render.add_argument("--max-steps", type=int, metavar="N", help="step budget of a walk [as many as any ray needs]")
+    render.add_argument("--chunk", type=int, metavar="RAYS", help="rays traced together [1024]")
+    render.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
+    render.set_defaults(run=_render)
+
+    info = commands.add_parser("info", help="print what a scene holds", description="Print what a scene holds.")
+    info.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
+    info.set_defaults(run=_info)
+    return parser
+
+
+def _render(options: argparse.Namespace) -> None:
+    from .io import require_writable, save_image
+
+    require_writable(options.output)
+    settings = _settings(options)
+    if options.precision == "float64":
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+    scene = _resized(_load(options.scene, options.precision), options.width, options.height)
+    image, report = _timed_render(scene, settings)
+    save_image(options.output, image)
+    print(f"{options.output}: {report}")
+
+
+def _settings(options: argparse.Namespace) -> "Settings":
+    from ._settings import Settings
+
+    names = ("samples", "traversal", "shading", "normals", "shadows", "max_depth", "max_steps", "chunk")
+    return Settings(**{name: getattr(options, name) for name in names if getattr(options, name) is not None})
+
+
+def _load(path: str, precision: str) -> "Scene":
+    import numpy as np
+
+    from .io import load_scene
+
+    return load_scene(path, np.dtype(precision))
+
+
+def _resized(scene: "Scene", width: int | None, height: int | None) -> "Scene":
+    old = scene.camera
+    for name, value in (("width", width), ("height", height)):
+        if value is not None and value < 1:
+            raise ValueError(f"--{name} must be a whole number of pixels from 1 on, it is {value}")
+    if width is None and height is None:
+        return scene
+    if width is None:
+        width = max(1, round((height or 1) * old.width / old.height))
+    elif height is None:
+        height = max(1, round(width * old.height / old.width))
+    return replace(scene, camera=replace(old, width=width, height=height))
+
+
+def _timed_render(scene: "Scene", settings: "Settings") -> tuple[Any, str]:
+    import jax
+    import numpy as np
+
+    from ._render import render, settle
+
+    compiling = _CompileTime()
+    begin = time.perf_counter()
+    with _Progress() as progress:
+        image, aovs = render(scene, settings, aovs=("exhausted",), progress=progress)
+    elapsed = time.perf_counter() - begin
+    seconds = max(elapsed - compiling.seconds, 1e-9)
+    samples = settle(settings, scene).samples or 1
+    height, width = image.shape[:2]
+    rays = height * width * samples
+    return image, (
+        f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), "
+        f"{seconds:.3g} s + {compiling.seconds:.3g} s compiling, "
+        f"{jax.devices()[0].device_kind}, {rays / seconds:.3g} rays/s, {int(np.sum(aovs['exhausted']))} rays exhausted"
+    )
+
+
+class _CompileTime:
+    """Adds up the seconds that JAX spends on tracing and compiling from now on."""
+
+    def __init__(self) -> None:
+        import jax
+
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._add)
+
+    def _add(self, event: str, duration_secs: float, **_: Any) -> None:
+        if event.startswith("/jax/core/compile/"):
+            self.seconds += duration_secs
+
+
+class _Progress:
+    """A line that grows with the picture, on a terminal only, and not for what is done in half a second."""
+
+    def __init__(self) -> None:
+        self.begin = time.perf_counter()
+        self.shown = False
+
+    def __enter__(self) -> "_Progress":
+        return self
+
+    def __call__(self, done: int, total: int) -> None:
+        elapsed = time.perf_counter() - self.begin
+        if not sys.stderr.isatty() or elapsed < 0.5:
+            return
+        self.shown = True
+        left = elapsed * (total - done) / max(done, 1)
+        print(
+            f"\r{100 * done // total:3d} % of {total} pixels, {elapsed:.0f} s, {left:.0f} s left ",
+            end="",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    def __exit__(self, *_: object) -> None:
+        if self.shown:
+            print("\r" + " " * 70 + "\r", end="", file=sys.stderr, flush=True)
+
+
+def _info(options: argparse.Namespace) -> None:
+    import numpy as np
+
+    from ._heightfield import Heightfield
+
+    scene = _load(options.scene, "float32")
+    camera = scene.camera
+    eye = np.asarray(camera.world_from_camera)[:3, 3]
+    print(f"{options.scene}: {camera.width} x {camera.height} pixels, {scene.samples} samples a pixel")
+    print(f"camera: {type(camera).__name__}, at {_numbers(eye)}")
+    for k, obj in enumerate(scene.objects):
+        what = _heightfield(obj.shape) if isinstance(obj.shape, Heightfield) else _cylinder(obj.shape)
+        place = "" if obj.world_from_object is None else ", with a transform"
+        print(f"object {k}: {what}, {_material(obj.material)}{place}")
+    for k, light in enumerate(scene.lights):
+        values = ", ".join(f"{name} {_numbers(value)}" for name, value in vars(light).items())
+        print(f"light {k}: {type(light).__name__}, {values}")
+
+
+def _heightfield(field: "Heightfield") -> str:
+    import numpy as np
+
+    heights = np.asarray(field.heights)
+    ny, nx = heights.shape
+    finite = heights[np.isfinite(heights)]
+    span = _numbers([finite.min(), finite.max()]) if finite.size else "none"
+    holes = f", {heights.size - finite.size} holes" if finite.size < heights.size else ""
+    return (
+        f"Heightfield, {ny} x {nx} heights, cells {field.dx:.6g} x {field.dy:.6g}, "
+        f"origin {_numbers([field.x0, field.y0])}, range {span}{holes}"
+    )
+
+
+def _cylinder(cylinder: "Cylinder") -> str:
+    return f"Cylinder, radius {float(cylinder.radius):.6g}, z {_numbers([cylinder.z_min, cylinder.z_max])}"
+
+
+def _material(material: Any) -> str:
+    from ._texture import ImageTexture
+
+    (name, value), *_ = vars(material).items()
+    what = (
+        f"an image of {value.texels.shape[1]} x {value.texels.shape[0]}" if isinstance(value, ImageTexture) else _numbers(value)
+    )
+    return f"{type(material).__name__.lower()}, {name} {what}"
+
+
+def _numbers(values: Any) -> str:
+    return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

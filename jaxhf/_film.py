@@ -1,0 +1,21 @@
+"""Where in a pixel its samples lie, and how they become its value."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from ._types import Scalar
+
+
+def grid_side(samples: int) -> int:
+    """The side n of the n x n samples a pixel that hold at least `samples`."""
+    return math.isqrt(samples - 1) + 1
+
+
+def sample_offset(k: jax.Array, side: int, dtype) -> tuple[Scalar, Scalar]:
+    """The k-th sample's place in its pixel, 0..1 each way: the centres of a regular grid.
+
+    With the box filter of a pixel's width, the pixel is the mean of its samples.
+    """
+    return ((k % side).astype(dtype) + 0.5) / side, ((k // side).astype(dtype) + jnp.asarray(0.5, dtype)) / side

@@ -1,0 +1,225 @@
+"""What stands where the ray meets a surface. Every derivative starts here.
+
+The walk has said which triangle; the hit is computed again from that triangle's plane in plain differentiable
+arithmetic, so the derivative costs no memory a step and works in forward and in reverse mode.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Int
+
+from ._cylinder import Tube, tube_distance
+from ._heightfield import Grid
+from ._ray import Ray
+from ._settings import Settings
+from ._transform import dot, unit
+from ._traverse import CellHit, Departure, Status, corners, distance, first_hit, occluded, triangle_plane
+from ._types import Flag, Index, Point2, Scalar, Vector
+
+Surface = Grid | Tube
+
+
+class Hit(eqx.Module):
+    """Where a ray met a surface, in world units unless said.
+
+    Unless `status` is HIT the rest is finite (t excepted) but means nothing.
+
+    Attributes:
+      status: see `Status`.
+      t: the ray's parameter at the hit; infinite where there is none.
+      p: the point, on the surface rather than on the ray.
+      n: unit normal of the triangle, on the surface's +z side (a cylinder: outwards).
+      ns: unit shading normal, interpolated between the vertices; `n` with flat shading.
+      uv: place in the footprint, 0..1 over the whole grid.
+      dp_du, dp_dv: tangents, orthogonal to `ns` and to each other (Gram-Schmidt in this order).
+      dn_du, dn_dv: derivatives of `ns`.
+      cell: (ix, iy).
+      triangle: 0 for (00, 10, 11), 1 for (00, 11, 01).
+      side: 1 where the ray came from the side that `n` points to, else -1.
+      steps: cells visited on the way; None unless counted.
+    """
+
+    status: Index
+    t: Scalar
+    p: Vector
+    n: Vector
+    ns: Vector
+    uv: Point2
+    dp_du: Vector
+    dp_dv: Vector
+    dn_du: Vector
+    dn_dv: Vector
+    cell: Int[jax.Array, "2"]
+    triangle: Index
+    side: Index
+    steps: Index | None = None
+
+
+class Origin(eqx.Module):
+    """The hit that a ray starts from, and on which surface that hit lies.
+
+    A ray that leaves a triangle cannot meet it again, and lies on a known side of it; knowing this replaces the usual
+    offset by an epsilon.
+    """
+
+    hit: Hit
+    here: Flag
+
+    def departure(self, grid: Grid) -> Departure:
+        """As the walk over `grid` takes it; in range also where the hit lies on another surface."""
+        cells_x, cells_y = grid.cells
+        cell = jnp.clip(self.hit.cell, 0, jnp.array([cells_x - 1, cells_y - 1], self.hit.cell.dtype))
+        return Departure(
+            active=self.here,
+            ix=cell[0],
+            iy=cell[1],
+            upper=self.hit.triangle == 1,
+            x=self.hit.uv[0] * cells_x,
+            y=self.hit.uv[1] * cells_y,
+            side=self.hit.side,
+        )
+
+
+def intersect(
+    surface: Surface,
+    ray: Ray,
+    settings: Settings,
+    origin: Origin | None = None,
+    active: Flag | None = None,
+    count_steps: bool = False,
+) -> Hit:
+    """The first hit of a world-frame ray on one surface.
+
+    Args:
+      surface: a prepared shape.
+      ray: `d` of length around 1; one that is zero or not finite ends as INVALID.
+      settings: its max_steps counts here.
+      origin: None for rays that start in free space.
+      active: False spares the ray the search: it ends as a miss.
+      count_steps: whether to count the cells visited.
+    """
+    valid = jnp.isfinite(ray.o).all() & jnp.isfinite(ray.d).all()
+    ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
+    if isinstance(surface, Tube):
+        return _tube_interaction(surface, ray, origin, active, count_steps)
+    local = surface.grid_from_world.ray(ray)
+    departure = None if origin is None else origin.departure(surface)
+    found = first_hit(surface, local, max_steps=settings.max_steps, active=active, departure=departure, count_steps=count_steps)
+    return surface_interaction(surface, local, found)
+
+
+def blocked(
+    surface: Surface, ray: Ray, settings: Settings, origin: Origin, active: Flag, t_max: Scalar | None
+) -> tuple[Flag, Flag]:
+    """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out; no derivative."""
+    if isinstance(surface, Tube):
+        t, found = lax.stop_gradient(tube_distance(surface, ray, origin.here))
+        return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
+    local = surface.grid_from_world.ray(ray)
+    departure = origin.departure(surface)
+    return occluded(surface, local, max_steps=settings.max_steps, active=active, departure=departure, t_max=t_max)
+
+
+def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
+    """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray (grid frame)."""
+    t = distance(grid, ray, found)
+    upper, dtype = found.upper, t.dtype
+    place = ray(t)
+    x, y = found.ix.astype(dtype), found.iy.astype(dtype)
+    u, v = place[0] - x, place[1] - y
+    a, b, c = triangle_plane(grid.z, found.ix, found.iy, upper)
+    p = grid.world_from_grid.point(jnp.stack([place[0], place[1], c + a * u + b * v]))
+    one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
+    n = unit(grid.grid_from_world.covector(jnp.stack([-a, -b, one])))
+    cells_x, cells_y = grid.cells
+    per_u = grid.world_from_grid.vector(jnp.stack([one, zero, a])) * cells_x
+    per_v = grid.world_from_grid.vector(jnp.stack([zero, one, b])) * cells_y
+    ns, dn_du, dn_dv = _shading_normal(grid, found, u, v, n)
+    dp_du, dp_dv = _orthogonal(per_u, per_v, ns)
+    met = found.status == int(Status.HIT)
+    return Hit(
+        status=found.status,
+        t=jnp.where(met, t, jnp.inf),
+        p=p,
+        n=n,
+        ns=ns,
+        uv=jnp.stack([place[0] / cells_x, place[1] / cells_y]),
+        dp_du=dp_du,
+        dp_dv=dp_dv,
+        dn_du=dn_du * cells_x,
+        dn_dv=dn_dv * cells_y,
+        cell=jnp.stack([found.ix, found.iy]),
+        triangle=found.upper.astype(jnp.int32),
+        side=found.side,
+        steps=found.steps,
+    )
+
+
+def _shading_normal(grid: Grid, found: CellHit, u: Scalar, v: Scalar, n: Vector) -> tuple[Vector, Vector, Vector]:
+    """The barycentric mean of the triangle's three vertex normals (Phong 1975), and its derivatives by cells."""
+    if grid.normals is None:
+        return n, jnp.zeros_like(n), jnp.zeros_like(n)
+    n00, n10, n01, n11 = corners(grid.normals, found.ix, found.iy)
+    per_u = jnp.where(found.upper, n11 - n01, n10 - n00)
+    per_v = jnp.where(found.upper, n01 - n00, n11 - n10)
+    mean = n00 + u * per_u + v * per_v
+    if grid.object_from_world is not None:
+        mean, per_u, per_v = (grid.object_from_world.covector(normal) for normal in (mean, per_u, per_v))
+    largest = lax.stop_gradient(jnp.max(jnp.abs(mean)))
+    largest = jnp.where(largest > 0, largest, 1)
+    ns = unit(mean)
+    length = dot(mean / largest, ns)
+    length = jnp.where(length > 0, length, 1)
+
+    def turning(change: Vector) -> Vector:
+        change = change / largest
+        return (change - ns * dot(ns, change)) / length
+
+    return ns, turning(per_u), turning(per_v)
+
+
+def _orthogonal(per_u: Vector, per_v: Vector, ns: Vector) -> tuple[Vector, Vector]:
+    dp_du = per_u - ns * dot(ns, per_u)
+    length = dot(dp_du, dp_du)
+    along = dot(dp_du, per_v) / jnp.where(length > 0, length, 1)
+    return dp_du, per_v - ns * dot(ns, per_v) - dp_du * along
+
+
+def _tube_interaction(tube: Tube, ray: Ray, origin: Origin | None, active: Flag | None, count_steps: bool) -> Hit:
+    t, found = tube_distance(tube, ray, None if origin is None else origin.here)
+    found = found if active is None else found & active
+    valid = (ray.d != 0).any()
+    t = jnp.where(found, t, 0)
+    p = ray(t)
+    local = tube.object_from_world.point(p)
+    x, y = jnp.where(found, local[0], 1), jnp.where(found, local[1], 0)
+    turn = 2 * jnp.pi
+    phi = jnp.atan2(y, x)
+    phi = jnp.where(phi < 0, phi + turn, phi)
+    zero, height = jnp.zeros_like(x), tube.z_max - tube.z_min
+    n = unit(tube.object_from_world.covector(jnp.stack([x, y, zero])))
+    dp_du = tube.world_from_object.vector(jnp.stack([-y, x, zero])) * turn
+    dp_dv = tube.world_from_object.vector(jnp.stack([zero, zero, height]))
+    dp_du, dp_dv = _orthogonal(dp_du, dp_dv, n)
+    bend = tube.object_from_world.covector(jnp.stack([-y, x, zero])) * turn
+    scale = dot(n, tube.object_from_world.covector(jnp.stack([x, y, zero])))
+    none = jnp.zeros((), jnp.int32)
+    met = found & valid
+    return Hit(
+        status=jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID)).astype(jnp.int32),
+        t=jnp.where(met, t, jnp.inf),
+        p=p,
+        n=n,
+        ns=n,
+        uv=jnp.stack([phi / turn, (local[2] - tube.z_min) / height]),
+        dp_du=dp_du,
+        dp_dv=dp_dv,
+        dn_du=(bend - n * dot(n, bend)) / scale,
+        dn_dv=jnp.zeros_like(n),
+        cell=jnp.zeros(2, jnp.int32),
+        triangle=none,
+        side=jnp.where(dot(n, ray.d) < 0, 1, -1).astype(jnp.int32),
+        steps=none if count_steps else None,
+    )

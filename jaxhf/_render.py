@@ -1,0 +1,245 @@
+"""From a scene to a picture: the only place where rays are batched."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float, Int
+
+from ._camera import Camera
+from ._film import grid_side, sample_offset
+from ._heightfield import Heightfield
+from ._hit import Hit, intersect
+from ._ray import Ray
+from ._scene import Scene, localise
+from ._settings import Settings
+from ._shade import Vertex, World, first_vertex, in_shadow, make_surface, make_world, radiance
+
+AOVS = ("depth", "normal", "uv", "status", "object", "cell", "shadow", "steps", "exhausted")
+"""Arbitrary output variables, each (h, w) or (h, w, c), of the ray through the pixel's centre:
+
+depth: distance to the hit, infinite where there is none. normal: shading normal, world frame. uv: place in the
+footprint. status: see `Status`. object: its number in the scene, -1 for none. cell: (ix, iy), -1 for none. shadow: for each
+light but the sky, whether it fails to reach the hit (blocked, or behind the surface). steps: cells visited by the ray,
+over all objects. exhausted: walks that ran out of steps, over all samples of the pixel, shadow and mirrored rays included.
+"""
+
+
+def render(
+    scene: Scene,
+    settings: Settings = Settings(),
+    *,
+    aovs: Sequence[str] = (),
+    progress: Callable[[int, int], None] | None = None,
+) -> Any:
+    """Renders a picture.
+
+    Args:
+      scene: what to see. Values that are NumPy or Python numbers keep double precision until the origin has been moved to
+        the terrain; the rest is computed in the precision of the (first) heightfield's heights.
+      settings: the knobs.
+      aovs: names out of `AOVS`.
+      progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
+
+    Returns:
+      Linear radiance, shape (h, w, 3), top row first; with `aovs` that and a dict of them.
+
+    Raises:
+      ValueError: an unknown AOV.
+    """
+    aovs = tuple(aovs)
+    for name in aovs:
+        if name not in AOVS:
+            raise ValueError(f"render: aovs must be among {', '.join(AOVS)}; one is {name!r}")
+    settings = settle(settings, scene)
+    local = localise(scene)
+    outputs = _trace_all(local, settings, aovs) if progress is None else _trace_in_parts(local, settings, aovs, progress)
+    image = outputs.pop("image")
+    return (image, outputs) if aovs else image
+
+
+def settle(settings: Settings, scene: Scene) -> Settings:
+    """The settings with what they leave to the scene filled in."""
+    samples = scene.samples if settings.samples is None else settings.samples
+    return dataclasses.replace(settings, samples=grid_side(samples) ** 2)
+
+
+class _Tiling:
+    """How a picture is cut into squares of one fixed size: a fixed shape gives the same bits wherever a pixel lies."""
+
+    def __init__(self, camera: Camera, settings: Settings):
+        self.width, self.height = camera.width, camera.height
+        self.side = 1 << ((settings.chunk.bit_length() - 1) // 2)
+        self.columns, self.rows = math.ceil(self.width / self.side), math.ceil(self.height / self.side)
+
+    @property
+    def count(self) -> int:
+        return self.columns * self.rows
+
+    def assemble(self, tiles: Any) -> Any:
+        """(count, side * side, ...) to (height, width, ...), for NumPy and JAX arrays."""
+        tail = tiles.shape[2:]
+        grid = tiles.reshape(self.rows, self.columns, self.side, self.side, *tail).swapaxes(1, 2)
+        return grid.reshape(self.rows * self.side, self.columns * self.side, *tail)[: self.height, : self.width]
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "aovs"))
+def _trace_all(scene: Scene, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
+    tiling = _Tiling(scene.camera, settings)
+    world = make_world(scene, settings)
+    tiles = lax.map(
+        lambda tile: _trace_tile(world, scene.camera, settings, aovs, tile), jnp.arange(tiling.count, dtype=jnp.int32)
+    )
+    return jax.tree.map(tiling.assemble, tiles)
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "aovs"))
+def _trace_tiles(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]):
+    return lax.map(lambda tile: _trace_tile(world, camera, settings, aovs, tile), tiles)
+
+
+_make_world = jax.jit(make_world, static_argnames=("settings",))
+
+
+def _trace_in_parts(scene: Scene, settings: Settings, aovs: tuple[str, ...], progress: Callable[[int, int], None]):
+    """As `_trace_all`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
+    tiling = _Tiling(scene.camera, settings)
+    world = _make_world(scene, settings=settings)
+    size = math.ceil(tiling.count / 64)
+    pixels = tiling.width * tiling.height
+    parts = []
+    for first in range(0, tiling.count, size):
+        tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
+        parts.append(jax.device_get(_trace_tiles(world, scene.camera, settings, aovs, jnp.asarray(tiles, jnp.int32))))
+        progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
+    return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)
+
+
+def _trace_tile(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tile: jax.Array):
+    tiling = _Tiling(camera, settings)
+    corner_x, corner_y = (tile % tiling.columns) * tiling.side, (tile // tiling.columns) * tiling.side
+    pixel = jnp.arange(tiling.side * tiling.side, dtype=jnp.int32)
+
+    def one(pixel: jax.Array):
+        dtype = camera.world_from_camera.dtype
+        x = (corner_x + pixel % tiling.side).astype(dtype)
+        y = (corner_y + pixel // tiling.side).astype(dtype)
+        image, exhausted = _pixel(world, camera, settings, x, y)
+        outputs = {"image": image}
+        if aovs:
+            outputs |= _observe(world, camera.ray(x + 0.5, y + 0.5), settings, aovs)
+        if "exhausted" in aovs:
+            outputs["exhausted"] = exhausted
+        return outputs
+
+    return jax.vmap(one)(pixel)
+
+
+def _pixel(world: World, camera: Camera, settings: Settings, x: jax.Array, y: jax.Array):
+    """The mean over the pixel's samples, and how many walks ran out of steps."""
+    assert settings.samples is not None
+    side = math.isqrt(settings.samples)
+
+    def sample(k, sums):
+        dx, dy = sample_offset(k, side, x.dtype)
+        light, exhausted = radiance(world, camera.ray(x + dx, y + dy), settings)
+        return sums[0] + light, sums[1] + exhausted
+
+    sums = (jnp.zeros(3, x.dtype), jnp.zeros((), jnp.int32))
+    if side == 1:
+        return sample(jnp.zeros((), jnp.int32), sums)
+    total, exhausted = lax.fori_loop(0, side * side, sample, sums)
+    return total / (side * side), exhausted
+
+
+def _observe(world: World, ray: Ray, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
+    vertex = first_vertex(world, ray, settings, count_steps="steps" in aovs)
+    hit, found = vertex.hit, vertex.index >= 0
+    makers: dict[str, Callable[[], jax.Array]] = {
+        "depth": lambda: jnp.where(found, hit.t, jnp.inf),
+        "normal": lambda: jnp.where(found, hit.ns, 0),
+        "uv": lambda: jnp.where(found, hit.uv, 0),
+        "status": lambda: hit.status,
+        "object": lambda: vertex.index,
+        "cell": lambda: jnp.where(found, hit.cell, -1),
+        "shadow": lambda: in_shadow(world, vertex, settings),
+        "steps": lambda: jnp.asarray(hit.steps),
+    }
+    return {name: makers[name]() for name in aovs if name in makers}
+
+
+def cast_camera(
+    scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings = Settings()
+) -> Vertex:
+    """The first hits of the camera's rays through the points (x, y) of the picture, in pixels from its top left corner.
+
+    Returns:
+      A `Vertex` whose leaves have a leading axis n: the hits, with `p` relative to the terrain's corner, and the number of
+      the object that each is on, -1 for none.
+    """
+    local = localise(scene)
+    dtype = local.camera.world_from_camera.dtype
+    return _cast_camera(local, jnp.asarray(x, dtype), jnp.asarray(y, dtype), settings)
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -> Vertex:
+    world = make_world(scene, settings)
+    return jax.vmap(lambda x, y: first_vertex(world, scene.camera.ray(x, y), settings))(x, y)
+
+
+def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings()) -> Hit:
+    """Where rays meet a heightfield; differentiable in the heights, in `o` and in `d`.
+
+    Args:
+      heightfield: the surface, in the frame of the rays.
+      o, d: origins and directions, shape (..., 3) each, broadcast against each other; a direction need not be unit. NumPy
+        and Python numbers keep double precision until the grid's x0 and y0 have been subtracted.
+      settings: max_steps, shading, normals and chunk count here.
+
+    Returns:
+      A `Hit` with the same leading axes. A ray that is zero or not finite has the status INVALID.
+
+    Raises:
+      ValueError: `o` or `d` does not end in an axis of length 3.
+    """
+    dtype = heightfield.heights.dtype
+    corner = np.array([heightfield.x0, heightfield.y0, 0.0])
+    for name, value in (("o", o), ("d", d)):
+        if np.shape(value)[-1:] != (3,):
+            raise ValueError(f"cast: {name} must have shape (..., 3), its shape is {np.shape(value)}")
+    if isinstance(o, jax.Array):
+        o = o - jnp.broadcast_to(jnp.asarray(corner, o.dtype), o.shape)
+    else:
+        o = np.asarray(o, np.float64) - corner
+    o, d = jnp.broadcast_arrays(jnp.asarray(o, dtype), jnp.asarray(d, dtype))
+    hit = _cast(Heightfield(heightfield.heights, heightfield.dx, heightfield.dy), o.reshape(-1, 3), d.reshape(-1, 3), settings)
+    offset = jnp.asarray(corner, dtype)
+    hit = dataclasses.replace(hit, p=hit.p + jnp.broadcast_to(offset, hit.p.shape))
+    return jax.tree.map(lambda leaf: leaf.reshape(*o.shape[:-1], *leaf.shape[1:]), hit)
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def _cast(heightfield: Heightfield, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
+    surface = make_surface(heightfield, None, settings)
+
+    def one(ray: tuple[jax.Array, jax.Array]) -> Hit:
+        o, d = ray
+        # A power of two brings d near length 1: t neither over- nor underflows on the way, and no bit changes.
+        size = lax.stop_gradient(jnp.max(jnp.abs(d)))
+        _, exponent = jnp.frexp(jnp.where(jnp.isfinite(size), size, 1))
+        hit = intersect(surface, Ray(o, jnp.ldexp(d, -exponent)), settings)
+        return dataclasses.replace(hit, t=jnp.ldexp(hit.t, -exponent))
+
+    chunk = settings.chunk
+    count = math.ceil(o.shape[0] / chunk)
+    spare = ((0, count * chunk - o.shape[0]), (0, 0))
+    chunks = tuple(jnp.pad(value, spare).reshape(count, chunk, 3) for value in (o, d))
+    hits = lax.map(jax.vmap(one), chunks)
+    return jax.tree.map(lambda leaf: leaf.reshape(count * chunk, *leaf.shape[2:])[: o.shape[0]], hits)

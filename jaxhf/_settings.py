@@ -1,0 +1,51 @@
+"""Every knob that trades accuracy for speed."""
+
+import dataclasses
+import math
+from typing import Literal, get_args
+
+Traversal = Literal["dda"]
+Shading = Literal["smooth", "flat"]
+NormalScheme = Literal["central", "four", "six", "six-angle", "six-equal"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How a scene is rendered: frozen and hashable, so that it can be a static argument of a compiled function.
+
+    Attributes:
+      traversal: "dda", a walk over every cell under the ray (Amanatides and Woo 1987).
+      max_steps: the step budget of one walk; None: a bound that suffices for any ray. A ray that runs out of it ends
+        with `Status.EXHAUSTED`, which `render` shows black and the AOVs "status" and "exhausted" report.
+      shading: "smooth", interpolated normals; "flat", the triangle's own.
+      normals: at the vertices, see `vertex_normals`.
+      shadows: whether light is blocked by what stands before it.
+      samples: rays a pixel, a square number: the centres of a regular n x n grid. None: what the scene says, rounded up
+        to a square.
+      max_depth: how often a ray may be mirrored before the rest counts as black.
+      chunk: rays that are traced together; rounded down to a square of 8 x 8, 16 x 16, ... pixels.
+    """
+
+    traversal: Traversal = "dda"
+    max_steps: int | None = None
+    shading: Shading = "smooth"
+    normals: NormalScheme = "six"
+    shadows: bool = True
+    samples: int | None = None
+    max_depth: int = 4
+    chunk: int = 1024
+
+    def __post_init__(self):
+        for name, kind in (("traversal", Traversal), ("shading", Shading), ("normals", NormalScheme)):
+            if getattr(self, name) not in get_args(kind):
+                raise ValueError(f"Settings: {name} must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}")
+        if not isinstance(self.shadows, bool):
+            raise ValueError(f"Settings: shadows must be True or False, it is {self.shadows!r}")
+        for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("chunk", 64)):
+            value = getattr(self, name)
+            if value is None and name in ("max_steps", "samples"):
+                continue
+            if not isinstance(value, int) or isinstance(value, bool) or value < least:
+                raise ValueError(f"Settings: {name} must be a whole number from {least} on, it is {value!r}")
+        if self.samples is not None and math.isqrt(self.samples) ** 2 != self.samples:
+            raise ValueError(f"Settings: samples must be a square number (1, 4, 9, ...), it is {self.samples}")

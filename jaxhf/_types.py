@@ -1,0 +1,49 @@
+"""Array aliases with named axes, and the one rule for what becomes a leaf of a scene."""
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+# What a leaf of a scene may be: float64 NumPy until the scene is rendered, or whatever JAX array or tracer the caller put
+# there. A type checker takes it for the latter, which it is wherever rays are traced.
+if TYPE_CHECKING:
+    AnyArray = jax.Array
+else:
+    AnyArray = jax.Array | np.ndarray
+
+Scalar = Float[jax.Array, ""]
+Flag = Bool[jax.Array, ""]
+Index = Int[jax.Array, ""]
+Vector = Float[jax.Array, "3"]
+Point2 = Float[jax.Array, "2"]
+
+ScalarLeaf = Float[AnyArray, ""]
+VectorLeaf = Float[AnyArray, "3"]
+MatrixLeaf = Float[AnyArray, "4 4"]
+
+
+def float_leaf(value: Any) -> Any:
+    """Keeps a JAX array or tracer as it is; turns anything else into a float64 NumPy array.
+
+    Positions therefore keep double precision until `localise` has moved the origin next to the terrain, even where JAX
+    itself runs in single precision.
+    """
+    if isinstance(value, jax.Array):
+        return value
+    return np.asarray(value, dtype=np.float64)
+
+
+def rgb_leaf(value: Any) -> Any:
+    """A colour: three numbers, or one number that stands for a grey."""
+    leaf = float_leaf(value)
+    if leaf.shape == ():
+        return leaf[None].repeat(3) if isinstance(leaf, jax.Array) else np.repeat(leaf, 3)
+    return leaf
+
+
+def require_finite(place: str, leaf: Any) -> None:
+    """Raises ValueError where a value that is known now, not traced, holds a nan or an inf."""
+    if isinstance(leaf, np.ndarray) and not np.isfinite(leaf).all():
+        raise ValueError(f"{place} must be finite, it is {np.array2string(leaf, separator=', ')}")

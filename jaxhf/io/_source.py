@@ -1,0 +1,40 @@
+"""What all readers share: where an error is, which word was meant, and which files a scene may open."""
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class SceneError(ValueError):
+    """Something is wrong in a file that the user wrote; the message begins with `file:line:` where a line is known."""
+
+    def __init__(self, path: Path | str, line: int | None, message: str):
+        super().__init__(f"{path}:{line}: {message}" if line is not None else f"{path}: {message}")
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """A tail for an error message about an unknown word: what may have been meant, else what is known."""
+    known = sorted(known)
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f"did you mean {close[0]!r}?" if close else f"known: {', '.join(known)}"
+
+
+def resolve_inside(root: Path, folder: Path, name: str) -> Path:
+    """The file that `name` in a scene means.
+
+    Args:
+      root: the folder of the outermost scene file; nothing outside it is opened.
+      folder: that of the file in which `name` stands; a relative name starts there.
+      name: as written.
+
+    Raises:
+      ValueError: `name` leads out of `root`, by "..", by an absolute path or by a link.
+      FileNotFoundError: no file is there.
+    """
+    root = root.resolve()
+    path = (folder / name).resolve()
+    if not path.is_relative_to(root):
+        raise ValueError(f"{name!r} lies outside the scene's folder {str(root)!r}")
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {name!r} in {str(folder)!r}")
+    return path
