@@ -1,0 +1,29 @@
+"""Strictness for every test: double precision is there, types do not promote by themselves, ranks neither."""
+
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+SEEDS = Path(__file__).parents[2] / "shared" / "pbrt"
+PEERS = Path(__file__).parents[2] / "shared" / "peers"
+
+
+@pytest.fixture(scope="session")
+def seeds() -> Path:
+    """The folder of the seed scenes and of their references by pbrt-v2, which lie beside the project, not in it."""
+    if not SEEDS.is_dir():
+        pytest.skip("the seed scenes and pbrt-v2's references are not on this machine")
+    return SEEDS
+
+
+@pytest.fixture(scope="session")
+def peers() -> Path:
+    """The folder of the common work and of what other renderers made of it."""
+    if not PEERS.is_dir():
+        pytest.skip("the peers' measurements are not on this machine")
+    return PEERS

@@ -1,0 +1,48 @@
+"""The imports are a picture of the renderer: they point one way, from scene file to image."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "jaxhf"
+# Along the flow: a module imports only from modules before it.
+FLOW = (
+    "_types", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film", "_heightfield",
+    "_cylinder", "_scene", "_traverse", "_hit", "_shade", "_render", "io", "__init__", "__main__",
+)  # fmt: skip
+
+
+def _stage(path: Path) -> str:
+    relative = path.relative_to(PACKAGE)
+    return "io" if relative.parts[0] == "io" else relative.stem
+
+
+def _imported(path: Path) -> list[str]:
+    """The stages that a module imports, wherever in it the import stands."""
+    stages = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            inside_io = _stage(path) == "io" and node.level == 1
+            stages += ["io"] if inside_io else [node.module.split(".")[0]] if node.module else [a.name for a in node.names]
+        elif isinstance(node, ast.ImportFrom | ast.Import):
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names]
+            assert not any(name.split(".")[0] == "jaxhf" for name in names), f"{path}: imports within the package are relative"
+    return stages
+
+
+@pytest.mark.parametrize(
+    "path", sorted([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.pyi")]), ids=lambda path: str(path.relative_to(PACKAGE))
+)
+def test_imports_follow_the_flow(path):
+    here = FLOW.index(_stage(path))
+    for name in _imported(path):
+        assert FLOW.index(name) < here or name == _stage(path) == "io", f"{path.name} imports {name}, which comes after it"
+
+
+def test_rays_are_batched_and_compiled_in_one_place():
+    for path in PACKAGE.rglob("*.py"):
+        if _stage(path) != "_render":
+            text = path.read_text()
+            for word in ("jax.vmap", "jax.jit", "lax.map(", "shard_map"):
+                assert word not in text, f"{path.name} has {word}"
