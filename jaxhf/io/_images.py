@@ -1,0 +1,396 @@
+"""Image files to linear radiance and back.
+
+In memory every image is linear, shape (h, w, 3), top row first. Sizes that a file declares are checked against its
+length and against `MAX_PIXELS` before anything is decoded.
+"""
+
+import contextlib
+import io
+import math
+import os
+import re
+import secrets
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float32, UInt16
+from PIL import Image
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+
+from ._source import nearest
+
+MAX_PIXELS = 2**28  # 16384 x 16384, for images and for grids of heights
+
+PathLike = str | os.PathLike[str]
+Codec = TypeVar("Codec")
+
+
+def load_image(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
+    """Reads an image as linear radiance: float32, shape (h, w, 3), top row first.
+
+    .png and .jpg hold sRGB, and are decoded by the curve of IEC 61966-2-1; .exr (needs OpenEXR), .pfm and .npy (of
+    floats, shape (h, w, 3) or (h, w)) hold linear radiance. Grey becomes three equal channels, alpha is dropped, colour
+    profiles and EXIF rotations are not looked at.
+
+    Raises:
+      FileNotFoundError: no file is there.
+      ValueError: the ending is not known, or the file is not a whole image of that kind.
+    """
+    path = require_file(path)
+    reader = _lookup(_READERS, path, "read")
+    with reading(path):
+        image = reader(path)
+    return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
+
+
+def save_image(path: PathLike, image: Any) -> None:
+    """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
+
+    .png: 8-bit sRGB of the values clipped to 0..1; nan becomes 0. .exr and .pfm: float32. .npy: in the precision of
+    `image`. The last three keep nan and inf. The file appears whole or not at all: what was there before stays
+    until its successor is complete.
+
+    Raises:
+      FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of real numbers.
+    """
+    path = require_writable(path)
+    pixels = np.asarray(image)
+    if pixels.dtype.kind == "V":  # bfloat16 and its like, which .npy would store without their meaning
+        pixels = pixels.astype(np.float32)
+    if pixels.dtype.kind not in "fiub":
+        raise ValueError(f"{path}: an image must hold real numbers, this one holds {pixels.dtype}")
+    if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
+        raise ValueError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
+    with replacing(path) as temporary:
+        _WRITERS[path.suffix.lower()](temporary, pixels)
+
+
+def require_writable(path: PathLike) -> Path:
+    """Checks that `save_image` can write to `path`, so that nobody renders for an hour first.
+
+    Raises:
+      ValueError: the ending is not known, a package for it is missing, or `path` is a folder.
+      FileNotFoundError: the folder does not exist.
+      PermissionError: the folder cannot be written to.
+    """
+    path = Path(path)
+    _lookup(_WRITERS, path, "write")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: there is no folder {str(path.parent)!r}")
+    if path.is_dir():
+        raise ValueError(f"{path}: an image cannot be written here, it is a folder")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: the folder {str(path.parent)!r} cannot be written to")
+    if path.suffix.lower() == ".exr":
+        with reading(path):
+            _openexr("writing")
+    return path
+
+
+def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1: encoded values in 0..1 to linear ones."""
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1: linear values in 0..1 to encoded ones."""
+    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+# Shared with the readers of heights.
+
+
+def require_file(path: PathLike) -> Path:
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    if not path.is_file():
+        raise ValueError(f"{path}: must be a file, it is a folder or a device")
+    return path
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Puts the file's name in front of whatever goes wrong inside, as one ValueError.
+
+    The decoders raise nearly anything on broken files: OSError, SyntaxError, RuntimeError, EOFError, struct.error.
+    """
+    try:
+        yield
+    except (MemoryError, PermissionError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong."""
+    path = path.resolve()  # what a link points to is replaced, not the link
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def require_pixels(height: int, width: int) -> None:
+    if height < 1 or width < 1:
+        raise ValueError(f"its size must be positive, it is {width} x {height}")
+    if height * width > MAX_PIXELS:
+        raise ValueError(f"it must hold at most {MAX_PIXELS} pixels, it declares {width} x {height}")
+
+
+def read_npy(file: Any, size: int) -> np.ndarray:
+    """The array of an open .npy file, or member of an archive, of `size` bytes; ValueError where it is not of real numbers.
+
+    np.load trusts the header and asks for all the memory that it names, so its size is compared with the file's first.
+    """
+    version = np.lib.format.read_magic(file)
+    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if header is None:
+        raise ValueError(f"its .npy version must be 1.0 or 2.0, it is {version}")
+    shape, _, dtype = header(file)
+    if dtype.kind not in "fiub":
+        raise ValueError(f"its array must hold real numbers, it holds {dtype}")
+    require_pixels(*(*shape, 1, 1)[:2])
+    declared, present = math.prod(shape) * dtype.itemsize, size - file.tell()
+    if declared != present:
+        raise ValueError(f"it is cut off or damaged: its header declares {declared} bytes of data, {present} are there")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+class Png(NamedTuple):
+    """What a .png declares, and its still filtered rows."""
+
+    width: int
+    height: int
+    depth: int  # bits a sample
+    channels: int
+    interlaced: bool
+    rows: bytes
+
+
+def read_png(path: Path) -> Png:
+    """Reads a .png down to its unpacked rows; ValueError where it is not whole.
+
+    Pillow alone fills missing rows with zeros in silence. The layout is that of the PNG specification (ISO/IEC 15948).
+    """
+    data = path.read_bytes()
+    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise ValueError("it is not a PNG")
+    header, packed, at = b"", [], 8
+    while True:
+        if len(data) < at + 12:
+            raise ValueError("it is cut off: its end mark is missing")
+        (length,), kind = struct.unpack(">I", data[at : at + 4]), data[at + 4 : at + 8]
+        body, check = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
+        if len(check) < 4:
+            raise ValueError(f"it is cut off inside its part {kind.decode('latin1')!r}")
+        if zlib.crc32(kind + body) != int.from_bytes(check, "big"):
+            raise ValueError(f"it is damaged: the checksum of its part {kind.decode('latin1')!r} is wrong")
+        at += length + 12
+        if kind == b"IHDR":
+            header = body
+        elif kind == b"IDAT":
+            packed.append(body)
+        elif kind == b"IEND":
+            break
+    return _unpacked(header, b"".join(packed))
+
+
+def samples_16(png: Png) -> UInt16[np.ndarray, "h w channels"]:
+    """The samples of a 16-bit .png, uint16, shape (h, w, channels).
+
+    Pillow cuts 16-bit colours down to 8 bits. The filters (PNG specification, section 9) are undone along
+    anti-diagonals: a byte depends only on those left of it, above it, and left above it.
+    """
+    if png.interlaced:
+        raise ValueError("interlaced 16-bit PNG is not read: save it without interlacing")
+    h, w, step = png.height, png.width, 2 * png.channels
+    rows = np.frombuffer(png.rows, np.uint8).reshape(h, 1 + w * step)
+    filters, filtered = rows[:, :1].astype(np.int16), rows[:, 1:].reshape(h, w, step).astype(np.int16)
+    if filters.max() > 4:
+        raise ValueError(f"it is damaged: filters go from 0 to 4, it uses {filters.max()}")
+    out = np.zeros((h + 1, w + 1, step), np.int16)  # one row above and one column to the left, of zeros
+    for diagonal in range(h + w - 1):
+        y = np.arange(max(0, diagonal - w + 1), min(h, diagonal + 1))
+        x = diagonal - y
+        a, b, c = out[y + 1, x], out[y, x + 1], out[y, x]
+        kinds = filters[y]
+        near_a, near_b, near_c = abs(b - c), abs(a - c), abs(a + b - 2 * c)
+        paeth = np.where((near_a <= near_b) & (near_a <= near_c), a, np.where(near_b <= near_c, b, c))
+        predicted = np.choose(kinds, [np.zeros_like(a), a, b, (a + b) // 2, paeth])
+        out[y + 1, x + 1] = (filtered[y, x] + predicted) & 255
+    return out[1:, 1:].astype(np.uint8).reshape(h, w * step).view(">u2").reshape(h, w, png.channels).astype(np.uint16)
+
+
+def _unpacked(header: bytes, packed: bytes) -> Png:
+    if len(header) != 13:
+        raise ValueError("it is damaged: its header is missing")
+    width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", header)
+    require_pixels(height, width)
+    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour)
+    if channels is None or depth not in (1, 2, 4, 8, 16):
+        raise ValueError(f"it is damaged: there is no colour type {colour} with {depth} bits")
+    expected = _row_bytes(width, height, depth * channels, interlaced)
+    rows = zlib.decompressobj().decompress(packed, expected + 1)
+    if len(rows) != expected:
+        have = "more" if len(rows) > expected else len(rows)
+        raise ValueError(f"it is cut off or damaged: {width} x {height} pixels take {expected} bytes, it holds {have}")
+    return Png(width, height, depth, channels, bool(interlaced), rows)
+
+
+def _row_bytes(width: int, height: int, bits: int, interlaced: int) -> int:
+    """The length of all rows with their filter bytes; of the seven passes of Adam7 where `interlaced`."""
+    adam7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+    total = 0
+    for x, y, dx, dy in adam7 if interlaced else ((0, 0, 1, 1),):
+        w, h = max(0, -(-(width - x) // dx)), max(0, -(-(height - y) // dy))
+        total += h * (1 + (w * bits + 7) // 8) if w else 0
+    return total
+
+
+# One reader a format: a path to float32, shape (h, w, 3) or (h, w).
+
+
+def _read_png(path: Path) -> np.ndarray:
+    png = read_png(path)
+    if png.depth == 16:
+        return _decoded(samples_16(png)[:, :, : 3 if png.channels > 2 else 1], 65535)
+    return _read_pillow(PngImageFile(io.BytesIO(path.read_bytes())))
+
+
+def _read_jpeg(path: Path) -> np.ndarray:
+    with path.open("rb") as file:
+        return _read_pillow(JpegImageFile(file))
+
+
+def _read_pillow(image: Image.Image) -> np.ndarray:
+    # The classes are called directly: Image.open refuses 16384 x 16384 as an attack, by a limit for the whole process.
+    require_pixels(image.height, image.width)
+    image.info.pop("transparency", None)  # or convert warns that it will be lost
+    return _decoded(np.asarray(image.convert("RGB")), 255)
+
+
+def _decoded(samples: np.ndarray, top: int) -> np.ndarray:
+    linear = linear_from_srgb(np.arange(top + 1) / top).astype(np.float32)[samples]
+    return linear[:, :, 0] if linear.shape[2] == 1 else linear
+
+
+def _openexr(doing: str) -> Any:
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise ValueError(f"{doing} .exr needs OpenEXR: pip install 'jaxhf[exr]'") from error
+    return OpenEXR
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    exr = _openexr("reading")
+    try:
+        with exr.File(str(path), separate_channels=True, header_only=True) as file:
+            (x0, y0), (x1, y1) = file.header()["dataWindow"]
+        require_pixels(int(y1) - int(y0) + 1, int(x1) - int(x0) + 1)
+        with exr.File(str(path), separate_channels=True) as file:
+            channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    except RuntimeError as error:
+        raise ValueError("it is not an OpenEXR file, or damaged") from error
+    except ValueError as error:
+        if "part index" not in str(error):
+            raise
+        raise ValueError("it is cut off or damaged: pixels are missing") from error
+    names = next((names for names in ("RGB", "Y") if set(names) <= set(channels)), None)
+    if names is None:
+        raise ValueError(f"its channels must be R, G, B or Y, they are {', '.join(channels)}")
+    shapes = {channels[name].shape for name in names}
+    if len(shapes) > 1:
+        raise ValueError(f"its channels must have one size, they have {sorted(shapes)}")
+    return np.stack([channels[name] for name in names], axis=-1) if len(names) == 3 else channels[names]
+
+
+def _read_pfm(path: Path) -> np.ndarray:
+    """Paul Debevec's format: `PF` or `Pf`, width and height, a scale whose sign gives the byte order, rows from below."""
+    data = path.read_bytes()
+    header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]+)\s", data)
+    if header is None:
+        raise ValueError("it is not a PFM")
+    channels, width, height = 3 if header[1] == b"PF" else 1, int(header[2]), int(header[3])
+    scale = float(header[4])
+    if scale == 0:
+        raise ValueError("its scale must not be 0: the sign gives the byte order")
+    require_pixels(height, width)
+    declared, present = 4 * channels * width * height, len(data) - header.end()
+    if declared != present:
+        raise ValueError(f"it is cut off or damaged: {width} x {height} pixels take {declared} bytes, {present} are there")
+    pixels = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end())
+    return pixels.astype(np.float32).reshape((height, width, 3)[: 3 if channels == 3 else 2])[::-1].copy()
+
+
+def _read_npy(path: Path) -> np.ndarray:
+    with path.open("rb") as file:
+        image = read_npy(file, path.stat().st_size)
+    if image.dtype.kind != "f":
+        raise ValueError(f"its array must hold linear radiance in floats, it holds {image.dtype}")
+    if image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
+        raise ValueError(f"its array must have shape (h, w, 3) or (h, w), it has {image.shape}")
+    return image.astype(np.float32)
+
+
+# One writer a format.
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    clipped = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
+    encoded = (srgb_from_linear(clipped) * 255 + 0.5).astype(np.uint8)
+    Image.fromarray(encoded).save(path, format="PNG")
+
+
+def _write_exr(path: Path, pixels: np.ndarray) -> None:
+    exr = _openexr("writing")
+    planes = {"Y": pixels} if pixels.ndim == 2 else {name: pixels[:, :, c] for c, name in enumerate("RGB")}
+    channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
+    with exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, channels) as file:
+        file.write(str(path))
+
+
+def _write_pfm(path: Path, pixels: np.ndarray) -> None:
+    h, w = pixels.shape[:2]
+    header = f"{'PF' if pixels.ndim == 3 else 'Pf'}\n{w} {h}\n-1.0\n"
+    path.write_bytes(header.encode() + pixels[::-1].astype("<f4").tobytes())
+
+
+def _write_npy(path: Path, pixels: np.ndarray) -> None:
+    with path.open("wb") as file:  # np.save appends .npy to a name without it
+        np.save(file, pixels)
+
+
+_READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".png": _read_png,
+    ".jpg": _read_jpeg,
+    ".jpeg": _read_jpeg,
+    ".exr": _read_exr,
+    ".pfm": _read_pfm,
+    ".npy": _read_npy,
+}
+_WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
+    ".png": _write_png,
+    ".exr": _write_exr,
+    ".pfm": _write_pfm,
+    ".npy": _write_npy,
+}
+
+
+def _lookup(table: dict[str, Codec], path: Path, verb: str) -> Codec:
+    found = table.get(path.suffix.lower())
+    if found is None:
+        ending = f"the ending {path.suffix!r}" if path.suffix else "a name without an ending"
+        raise ValueError(f"{path}: cannot {verb} an image with {ending}; {nearest(path.suffix.lower(), table)}")
+    return found
