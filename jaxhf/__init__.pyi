@@ -8,10 +8,11 @@ from ._render import AOVS as AOVS, cast as cast, render as render
 from ._scene import Object as Object, Scene as Scene
 from ._settings import Settings as Settings
 from ._texture import ImageTexture as ImageTexture
-from ._traverse import Status as Status
+from ._walk import Status as Status
 from .io import (
     SceneError as SceneError,
     Terrain as Terrain,
+    jacksboro as jacksboro,
     load_heights as load_heights,
     load_image as load_image,
     load_scene as load_scene,

@@ -8,7 +8,7 @@ import numpy as np
 
 from ._ray import Ray
 from ._transform import affine, require_invertible, unit
-from ._types import MatrixLeaf, Scalar, ScalarLeaf, float_leaf, require_finite
+from ._types import MatrixLeaf, Scalar, ScalarLeaf, float_leaf, require_finite, require_number
 
 
 class Perspective(eqx.Module):
@@ -27,6 +27,7 @@ class Perspective(eqx.Module):
 
     def __check_init__(self):
         _check_camera(self)
+        require_number("Perspective: fov", self.fov)
         if isinstance(self.fov, np.ndarray) and not 0 < self.fov < 180:
             raise ValueError(f"Perspective: fov must lie between 0 and 180 degrees, it is {self.fov}")
 
@@ -61,8 +62,9 @@ class Orthographic(eqx.Module):
 
     def __check_init__(self):
         _check_camera(self)
-        if isinstance(self.extent, np.ndarray) and not self.extent > 0:
-            raise ValueError(f"Orthographic: extent must be positive, it is {self.extent}")
+        require_number("Orthographic: extent", self.extent)
+        if isinstance(self.extent, np.ndarray) and not 0 < self.extent < np.inf:
+            raise ValueError(f"Orthographic: extent must be positive and finite, it is {self.extent}")
 
     @classmethod
     def look_at(

@@ -3,10 +3,11 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from ._ray import Ray
 from ._transform import Affine
-from ._types import Flag, Scalar, ScalarLeaf, float_leaf
+from ._types import Flag, Scalar, ScalarLeaf, float_leaf, require_finite, require_number
 
 
 class Cylinder(eqx.Module):
@@ -23,10 +24,14 @@ class Cylinder(eqx.Module):
     z_max: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
 
     def __check_init__(self):
+        for name in ("radius", "z_min", "z_max"):
+            require_number(f"Cylinder: {name}", getattr(self, name))
         if isinstance(self.radius, np.ndarray) and not 0 < self.radius < np.inf:
             raise ValueError(f"Cylinder: radius must be positive, it is {self.radius}")
         if isinstance(self.z_min, np.ndarray) and isinstance(self.z_max, np.ndarray) and not self.z_min < self.z_max:
             raise ValueError(f"Cylinder: z_min must lie below z_max, they are {self.z_min} and {self.z_max}")
+        require_finite("Cylinder: z_min", self.z_min)
+        require_finite("Cylinder: z_max", self.z_max)
 
 
 class Tube(eqx.Module):
@@ -37,6 +42,11 @@ class Tube(eqx.Module):
     z_max: Scalar
     world_from_object: Affine
     object_from_world: Affine
+
+    @property
+    def sure(self) -> Flag:
+        """True, but not to the compiler: see `stored`."""
+        return lax.stop_gradient(self.radius) >= 0
 
 
 def make_tube(cylinder: Cylinder, world_from_object: Affine | None) -> Tube:

@@ -7,12 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Float
 
 from ._settings import NormalScheme
-from ._transform import Affine, scale, translate
-from ._types import AnyArray, Scalar
+from ._types import AnyArray
 
 
 def _heights(value: Any) -> jax.Array:
@@ -54,11 +52,6 @@ class Heightfield(eqx.Module):
         for name in ("x0", "y0"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"Heightfield: {name} must be finite, it is {getattr(self, name)}")
-
-    @property
-    def object_from_grid(self) -> Float[np.ndarray, "4 4"]:
-        """From cells (x in 0..nx-1, y in 0..ny-1, z a height) to the object's frame."""
-        return translate(self.x0, self.y0, 0) @ scale(self.dx, self.dy, 1)
 
 
 # The triangles round a vertex, counter-clockwise: each is spanned by two neighbouring offsets (ix, iy).
@@ -139,63 +132,3 @@ def _length(v):
     """Length of nonzero vectors along the last axis, without overflow."""
     largest = jnp.max(jnp.abs(v), axis=-1)
     return largest * jnp.sqrt(jnp.sum((v / largest[..., None]) ** 2, axis=-1))
-
-
-class Grid(eqx.Module):
-    """A heightfield made ready for tracing, in a frame of its own: cells by cells by heights.
-
-    In the grid's frame vertex (ix, iy) stands at x = ix, y = iy, and heights are relative to the lowest and divided by a
-    power of two, so that the walk sees the same bits whatever the offset, and neither over- nor underflows. Where the
-    frame lies (lowest height, scale) is held constant under differentiation, as any choice of it gives the same surface.
-
-    Attributes:
-      z: heights, shape (ny, nx); a hole is nan.
-      z_top: the largest of them.
-      normals: at the vertices, object frame, shape (ny, nx, 3); None where shading is flat.
-    """
-
-    z: Float[jax.Array, "ny nx"]
-    z_top: Scalar
-    normals: Float[jax.Array, "ny nx 3"] | None
-    world_from_grid: Affine
-    grid_from_world: Affine
-    object_from_world: Affine | None
-
-    @property
-    def cells(self) -> tuple[int, int]:
-        """Cells along x and along y."""
-        ny, nx = self.z.shape
-        return nx - 1, ny - 1
-
-
-def make_grid(field: Heightfield, world_from_object: Affine | None, normals: NormalScheme | None) -> Grid:
-    """Prepares `field` for tracing: dense array arithmetic, differentiable in the heights and in the transform.
-
-    Args:
-      field: its x0 and y0 must be 0, see `localise`.
-      world_from_object: None for the identity.
-      normals: the scheme at the vertices; None for none.
-    """
-    heights = jnp.asarray(field.heights)
-    dtype = heights.dtype
-    finite = jnp.isfinite(heights)
-    known = lax.stop_gradient(jnp.where(finite, heights, 0))
-    _, exponent = jnp.frexp(jnp.max(jnp.abs(known)))
-    unit_height = jnp.ldexp(jnp.ones((), dtype), jnp.clip(exponent, -100, 100))  # its reciprocal is normal in float32
-    lowest = jnp.min(jnp.where(finite, known, jnp.inf), initial=jnp.inf)
-    lowest = jnp.where(finite.any(), lowest, 0)
-    z = jnp.where(finite, heights / unit_height - lowest / unit_height, jnp.nan)
-    z_top = jnp.max(lax.stop_gradient(jnp.where(finite, z, 0)))
-
-    cell = jnp.stack([jnp.full((), field.dx, dtype), jnp.full((), field.dy, dtype), unit_height])
-    ground = jnp.stack([jnp.zeros((), dtype), jnp.zeros((), dtype), lowest])
-    if world_from_object is None:
-        world_from_grid = Affine(jnp.diag(cell), ground)
-        grid_from_world = Affine(jnp.diag(1 / cell), -ground / cell)
-        object_from_world = None
-    else:
-        object_from_world = world_from_object.inverse()
-        world_from_grid = Affine(world_from_object.linear * cell[None, :], world_from_object.point(ground))
-        grid_from_world = Affine(object_from_world.linear / cell[:, None], (object_from_world.offset - ground) / cell)
-    at_vertices = None if normals is None else vertex_normals(heights, field.dx, field.dy, normals)
-    return Grid(z, z_top, at_vertices, world_from_grid, grid_from_world, object_from_world)

@@ -11,12 +11,14 @@ from jax import lax
 from jaxtyping import Int
 
 from ._cylinder import Tube, tube_distance
-from ._heightfield import Grid
+from ._grid import Grid, corners, triangle_plane
 from ._ray import Ray
 from ._settings import Settings
-from ._transform import dot, unit
-from ._traverse import CellHit, Departure, Status, corners, distance, first_hit, occluded, triangle_plane
+from ._store import stored
+from ._transform import dot, power_of_two, unit
+from ._traverse import distance, first_hit, occluded
 from ._types import Flag, Index, Point2, Scalar, Vector
+from ._walk import CellHit, Departure, Status
 
 Surface = Grid | Tube
 
@@ -38,7 +40,7 @@ class Hit(eqx.Module):
       cell: (ix, iy).
       triangle: 0 for (00, 10, 11), 1 for (00, 11, 01).
       side: 1 where the ray came from the side that `n` points to, else -1.
-      steps: cells visited on the way; None unless counted.
+      steps: taken by the search; None unless counted.
     """
 
     status: Index
@@ -89,25 +91,47 @@ def intersect(
     origin: Origin | None = None,
     active: Flag | None = None,
     count_steps: bool = False,
+    clear_until: Scalar | None = None,
 ) -> Hit:
     """The first hit of a world-frame ray on one surface.
 
     Args:
       surface: a prepared shape.
-      ray: `d` of length around 1; one that is zero or not finite ends as INVALID.
+      ray: one that is not finite, or whose `d` is zero, ends as INVALID.
       settings: its max_steps counts here.
       origin: None for rays that start in free space.
       active: False spares the ray the search: it ends as a miss.
-      count_steps: whether to count the cells visited.
+      count_steps: whether to count the steps of the search.
+      clear_until: a distance before which the ray is known to be clear of the surface.
     """
     valid = jnp.isfinite(ray.o).all() & jnp.isfinite(ray.d).all()
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
     if isinstance(surface, Tube):
-        return _tube_interaction(surface, ray, origin, active, count_steps)
-    local = surface.grid_from_world.ray(ray)
-    departure = None if origin is None else origin.departure(surface)
-    found = first_hit(surface, local, max_steps=settings.max_steps, active=active, departure=departure, count_steps=count_steps)
-    return surface_interaction(surface, local, found)
+        return stored(_tube_interaction(surface, ray, origin, active, count_steps), surface.sure)
+    local, scale = _in_grid(surface, ray)
+    found = first_hit(
+        surface,
+        local,
+        max_steps=settings.max_steps,
+        active=active,
+        departure=None if origin is None else stored(origin.departure(surface), surface.sure),
+        clear_until=None if clear_until is None else clear_until * scale,
+        count_steps=count_steps,
+    )
+    hit = surface_interaction(surface, local, stored(found, surface.sure))
+    return stored(eqx.tree_at(lambda hit: hit.t, hit, hit.t / scale), surface.sure)
+
+
+def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
+    """The ray in the grid's frame, with a `d` of length around 1, and by how much its t is longer there.
+
+    The factor is a power of two, so that no bit changes; without it t would leave the range in which the walk's
+    distances can be told from infinite ones, where heights and cells differ by many orders of magnitude.
+    """
+    local = grid.grid_from_world.ray(ray)
+    size = jnp.max(jnp.abs(local.d))
+    scale = power_of_two(jnp.where(size > 0, size, 1))
+    return stored((Ray(local.o, local.d / scale), scale), grid.sure)
 
 
 def blocked(
@@ -117,8 +141,9 @@ def blocked(
     if isinstance(surface, Tube):
         t, found = lax.stop_gradient(tube_distance(surface, ray, origin.here))
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
-    local = surface.grid_from_world.ray(ray)
-    departure = origin.departure(surface)
+    local, scale = _in_grid(surface, ray)
+    departure = stored(origin.departure(surface), surface.sure)
+    t_max = None if t_max is None else t_max * scale
     return occluded(surface, local, max_steps=settings.max_steps, active=active, departure=departure, t_max=t_max)
 
 
@@ -182,9 +207,8 @@ def _shading_normal(grid: Grid, found: CellHit, u: Scalar, v: Scalar, n: Vector)
 
 def _orthogonal(per_u: Vector, per_v: Vector, ns: Vector) -> tuple[Vector, Vector]:
     dp_du = per_u - ns * dot(ns, per_u)
-    length = dot(dp_du, dp_du)
-    along = dot(dp_du, per_v) / jnp.where(length > 0, length, 1)
-    return dp_du, per_v - ns * dot(ns, per_v) - dp_du * along
+    along = unit(dp_du)
+    return dp_du, per_v - ns * dot(ns, per_v) - along * dot(along, per_v)
 
 
 def _tube_interaction(tube: Tube, ray: Ray, origin: Origin | None, active: Flag | None, count_steps: bool) -> Hit:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +21,7 @@ from ._ray import Ray
 from ._scene import Scene, localise
 from ._settings import Settings
 from ._shade import Vertex, World, first_vertex, in_shadow, make_surface, make_world, radiance
+from ._store import stored
 
 AOVS = ("depth", "normal", "uv", "status", "object", "cell", "shadow", "steps", "exhausted")
 """Arbitrary output variables, each (h, w) or (h, w, c), of the ray through the pixel's centre:
@@ -61,7 +63,7 @@ def render(
     local = localise(scene)
     outputs = _trace_all(local, settings, aovs) if progress is None else _trace_in_parts(local, settings, aovs, progress)
     image = outputs.pop("image")
-    return (image, outputs) if aovs else image
+    return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
 
 def settle(settings: Settings, scene: Scene) -> Settings:
@@ -148,7 +150,8 @@ def _pixel(world: World, camera: Camera, settings: Settings, x: jax.Array, y: ja
 
     def sample(k, sums):
         dx, dy = sample_offset(k, side, x.dtype)
-        light, exhausted = radiance(world, camera.ray(x + dx, y + dy), settings)
+        ray = stored(camera.ray(x + dx, y + dy), world.surfaces[0].sure)
+        light, exhausted = radiance(world, ray, settings)
         return sums[0] + light, sums[1] + exhausted
 
     sums = (jnp.zeros(3, x.dtype), jnp.zeros((), jnp.int32))
@@ -221,7 +224,7 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings
     o, d = jnp.broadcast_arrays(jnp.asarray(o, dtype), jnp.asarray(d, dtype))
     hit = _cast(Heightfield(heightfield.heights, heightfield.dx, heightfield.dy), o.reshape(-1, 3), d.reshape(-1, 3), settings)
     offset = jnp.asarray(corner, dtype)
-    hit = dataclasses.replace(hit, p=hit.p + jnp.broadcast_to(offset, hit.p.shape))
+    hit = eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(offset, hit.p.shape))
     return jax.tree.map(lambda leaf: leaf.reshape(*o.shape[:-1], *leaf.shape[1:]), hit)
 
 
@@ -230,12 +233,7 @@ def _cast(heightfield: Heightfield, o: Float[jax.Array, "n 3"], d: Float[jax.Arr
     surface = make_surface(heightfield, None, settings)
 
     def one(ray: tuple[jax.Array, jax.Array]) -> Hit:
-        o, d = ray
-        # A power of two brings d near length 1: t neither over- nor underflows on the way, and no bit changes.
-        size = lax.stop_gradient(jnp.max(jnp.abs(d)))
-        _, exponent = jnp.frexp(jnp.where(jnp.isfinite(size), size, 1))
-        hit = intersect(surface, Ray(o, jnp.ldexp(d, -exponent)), settings)
-        return dataclasses.replace(hit, t=jnp.ldexp(hit.t, -exponent))
+        return intersect(surface, Ray(*ray), settings)
 
     chunk = settings.chunk
     count = math.ceil(o.shape[0] / chunk)

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ._camera import Camera
 from ._cylinder import Cylinder
@@ -13,7 +14,7 @@ from ._heightfield import Heightfield
 from ._light import Light, Point, Sky
 from ._material import Material, Matte
 from ._transform import require_invertible, translate
-from ._types import MatrixLeaf, float_leaf
+from ._types import AnyArray, MatrixLeaf, float_leaf
 
 Shape = Heightfield | Cylinder
 
@@ -80,7 +81,7 @@ class Scene(eqx.Module):
         return tuple(obj.shape for obj in self.objects if isinstance(obj.shape, Heightfield))
 
     @property
-    def heights(self) -> jax.Array:
+    def heights(self) -> Float[AnyArray, "ny nx"]:
         """The heights of the first heightfield, shape (ny, nx); ValueError where the scene has none."""
         if not self.heightfields:
             raise ValueError("Scene: there is no heightfield among its objects")

@@ -7,17 +7,19 @@ from jax import lax
 from jaxtyping import Bool
 
 from ._cylinder import make_tube
-from ._heightfield import Heightfield, make_grid
+from ._grid import make_grid
+from ._heightfield import Heightfield
 from ._hit import Hit, Origin, Surface, blocked, intersect
 from ._light import Directional, Light, Point, Sky
 from ._material import Material, Matte, Mirror
 from ._ray import Ray
 from ._scene import Scene, Shape
 from ._settings import Settings
+from ._store import stored
 from ._texture import ImageTexture
 from ._transform import affine, dot, unit
-from ._traverse import Status
 from ._types import Flag, Index, MatrixLeaf, Scalar, Vector
+from ._walk import Status
 
 # A cosine below this is rounded off; 0.6 degrees from the horizon of the shading normal.
 _GRAZING = 0.01
@@ -44,7 +46,8 @@ def make_world(scene: Scene, settings: Settings) -> World:
 def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: Settings) -> Surface:
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
-        return make_grid(shape, world, settings.normals if settings.shading == "smooth" else None)
+        normals = settings.normals if settings.shading == "smooth" else None
+        return make_grid(shape, world, normals, levels=0 if settings.traversal == "dda" else None)
     return make_tube(shape, world)
 
 
@@ -81,7 +84,8 @@ def first_vertex(
     assert nearest is not None
     if count_steps:
         nearest = eqx.tree_at(lambda hit: hit.steps, nearest, steps)
-    return Vertex(nearest, jnp.where(nearest.status == int(Status.HIT), index, -1))
+    vertex = Vertex(nearest, jnp.where(nearest.status == int(Status.HIT), index, -1))
+    return stored(vertex, world.surfaces[0].sure) if len(world.surfaces) > 1 else vertex
 
 
 def radiance(world: World, ray: Ray, settings: Settings) -> tuple[Vector, Index]:
@@ -151,7 +155,7 @@ def _irradiance(world: World, light: Light, vertex: Vertex, active: Flag, settin
     if isinstance(light, Sky):
         cosine = hit.ns[2] * hit.side.astype(hit.ns.dtype)
         return light.radiance * (jnp.pi * (1 + cosine) / 2), jnp.zeros((), jnp.int32)
-    wi, arriving, distance = _towards(light, hit.p)
+    wi, arriving, distance = stored(_towards(light, hit.p), world.surfaces[0].sure)
     lit, exhausted = _visible(world, wi, distance, vertex, active, settings)
     cosine = rounded_abs(dot(wi, hit.ns)) if settings.shading == "smooth" else jnp.abs(dot(wi, hit.ns))
     return jnp.where(lit, arriving * cosine, 0), exhausted

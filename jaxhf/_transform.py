@@ -9,6 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Float
 
 from ._ray import Ray
@@ -25,6 +26,17 @@ def unit(v: Vector) -> Vector:
     zero = largest == 0
     v = v / jnp.where(zero, 1, largest)
     return v / jnp.sqrt(jnp.where(zero, 1, dot(v, v)))
+
+
+def power_of_two(value: Scalar) -> Scalar:
+    """The power of two next below a positive number, clamped to 2^-100..2^100, so that its reciprocal is normal and exact.
+
+    It carries no derivative.
+    """
+    value = jnp.clip(lax.stop_gradient(value), 2.0**-100, 2.0**100)
+    integer, exponent_bits = (jnp.uint32, 0x7F800000) if value.dtype == jnp.float32 else (jnp.uint64, 0x7FF0000000000000)
+    bits = lax.bitcast_convert_type(value, integer) & jnp.asarray(exponent_bits, integer)
+    return lax.bitcast_convert_type(bits, value.dtype)
 
 
 class Affine(eqx.Module):

@@ -43,6 +43,12 @@ def rgb_leaf(value: Any) -> Any:
     return leaf
 
 
+def require_number(place: str, leaf: Any) -> None:
+    """Raises ValueError on anything but a single number."""
+    if leaf.shape != ():
+        raise ValueError(f"{place} must be one number, its shape is {leaf.shape}")
+
+
 def require_finite(place: str, leaf: Any) -> None:
     """Raises ValueError where a value that is known now, not traced, holds a nan or an inf."""
     if isinstance(leaf, np.ndarray) and not np.isfinite(leaf).all():

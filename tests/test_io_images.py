@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from jaxhf.io import load_image, require_writable, save_image
-from jaxhf.io._images import MAX_PIXELS
+from jaxhf.io._files import MAX_PIXELS
 
 
 @pytest.fixture

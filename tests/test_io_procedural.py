@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxhf.io._images import MAX_PIXELS
+from jaxhf.io._files import MAX_PIXELS
 from jaxhf.io._procedural import HEIGHTS, TEXTURES, bumps, checker, fractal, grid, sky, waves
 
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from jaxhf.io import Terrain, jacksboro, load_heights
-from jaxhf.io._images import MAX_PIXELS
+from jaxhf.io._files import MAX_PIXELS
 from jaxhf.io._terrain import metres_per_degree
 
 # What a file with the north first holds: two rows, the northern one 1 2 3.

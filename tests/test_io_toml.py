@@ -1,6 +1,7 @@
 """Scenes in TOML: every feature once, and every mistake with its line, the rule and the value."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -9,9 +10,10 @@ import pytest
 from PIL import Image
 
 from jaxhf import Cylinder, Directional, Heightfield, ImageTexture, Matte, Mirror, Orthographic, Perspective, Point, Sky
-from jaxhf.io import SceneError, load_heights, load_scene
+from jaxhf.io import SceneError, _toml_tables, load_heights, load_scene
 from jaxhf.io._procedural import grid
-from jaxhf.io._toml import _line_numbers
+from jaxhf.io._toml_lines import line_numbers
+from jaxhf.io._toml_values import STEPS
 
 SCENES = sorted((Path(__file__).parents[1] / "scenes").glob("*.toml"))
 
@@ -412,7 +414,33 @@ z = 2
         ("objects", 1, "inner", "z"): 19,
         ("objects", 2): 20,
     }
-    found = _line_numbers(text)
+    found = line_numbers(text)
     assert {where: found.get(where) for where in expected} == expected
     assert ("camera",) not in found
     assert max(found.values()) == 20
+
+
+PAGE = (Path(__file__).parents[1] / "docs" / "scene-files.md").read_text(encoding="utf-8")
+
+
+def words(table):
+    """The keys of a table and of those inside it, and the words that choose between them."""
+    for name, entry in table.items():
+        yield name
+        for inner in entry if isinstance(entry, tuple) else (entry,):
+            yield from words(inner) if isinstance(inner, Mapping) else ()
+
+
+TABLES = {name: set(words(t)) for name, t in vars(_toml_tables).items() if name.isupper() and isinstance(t, Mapping)}
+
+
+@pytest.mark.parametrize("word", sorted({"type", "image", *STEPS}.union(*TABLES.values())))
+def test_the_page_on_scene_files_explains_every_key(word):
+    assert {"SCENE", "CAMERAS", "HEIGHTS", "PLACE"} <= TABLES.keys()
+    assert re.search(rf"^\|.*`{word}`.*\|", PAGE, re.MULTILINE)
+
+
+def test_the_example_on_that_page_is_read(tmp_path):
+    (example,) = re.findall(r"^```toml\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
+    scene = read(tmp_path, example)
+    assert len(scene.objects) == len(scene.lights) == 2

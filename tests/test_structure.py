@@ -8,8 +8,9 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "jaxhf"
 # Along the flow: a module imports only from modules before it.
 FLOW = (
-    "_types", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film", "_heightfield",
-    "_cylinder", "_scene", "_traverse", "_hit", "_shade", "_render", "io", "__init__", "__main__",
+    "_types", "_store", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film",
+    "_heightfield", "_pyramid", "_grid",
+    "_cylinder", "_scene", "_walk", "_traverse", "_hit", "_shade", "_render", "io", "__init__", "__main__",
 )  # fmt: skip
 
 

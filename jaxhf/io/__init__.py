@@ -4,15 +4,10 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from .._scene import Scene
-from ._images import (
-    PathLike,
-    load_image as load_image,
-    require_file,
-    require_writable as require_writable,
-    save_image as save_image,
-)
+from ._files import PathLike, by_ending, require_file
+from ._images import load_image as load_image, require_writable as require_writable, save_image as save_image
 from ._pbrt import load_pbrt
-from ._source import SceneError as SceneError, nearest
+from ._source import SceneError as SceneError
 from ._terrain import Terrain as Terrain, jacksboro as jacksboro, load_heights as load_heights
 from ._toml import load_toml
 
@@ -32,7 +27,4 @@ def load_scene(path: PathLike, dtype: DTypeLike = np.float32) -> Scene:
       SceneError: something is wrong in the file; the message gives its line.
     """
     path = require_file(path)
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise ValueError(f"{path}: cannot read a scene from the ending {path.suffix!r}; {nearest(path.suffix, _READERS)}")
-    return reader(path, dtype)
+    return by_ending(_READERS, path, "read a scene from")(path, dtype)

@@ -4,30 +4,21 @@ In memory every image is linear, shape (h, w, 3), top row first. Sizes that a fi
 length and against `MAX_PIXELS` before anything is decoded.
 """
 
-import contextlib
-import io
-import math
 import os
 import re
-import secrets
-import struct
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, UInt16
+from jaxtyping import Float32
 from PIL import Image
+from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from ._source import nearest
-
-MAX_PIXELS = 2**28  # 16384 x 16384, for images and for grids of heights
-
-PathLike = str | os.PathLike[str]
-Codec = TypeVar("Codec")
+from ._files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_pixels
+from ._png import read_png, samples_16
 
 
 def load_image(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
@@ -42,7 +33,7 @@ def load_image(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
       ValueError: the ending is not known, or the file is not a whole image of that kind.
     """
     path = require_file(path)
-    reader = _lookup(_READERS, path, "read")
+    reader = by_ending(_READERS, path, "read an image with")
     with reading(path):
         image = reader(path)
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
@@ -79,7 +70,7 @@ def require_writable(path: PathLike) -> Path:
       PermissionError: the folder cannot be written to.
     """
     path = Path(path)
-    _lookup(_WRITERS, path, "write")
+    by_ending(_WRITERS, path, "write an image with")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {str(path.parent)!r}")
     if path.is_dir():
@@ -102,162 +93,6 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-# Shared with the readers of heights.
-
-
-def require_file(path: PathLike) -> Path:
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
-    if not path.is_file():
-        raise ValueError(f"{path}: must be a file, it is a folder or a device")
-    return path
-
-
-@contextlib.contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """Puts the file's name in front of whatever goes wrong inside, as one ValueError.
-
-    The decoders raise nearly anything on broken files: OSError, SyntaxError, RuntimeError, EOFError, struct.error.
-    """
-    try:
-        yield
-    except (MemoryError, PermissionError):
-        raise
-    except Exception as error:
-        raise ValueError(f"{path}: {error}") from error
-
-
-@contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong."""
-    path = path.resolve()  # what a link points to is replaced, not the link
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def require_pixels(height: int, width: int) -> None:
-    if height < 1 or width < 1:
-        raise ValueError(f"its size must be positive, it is {width} x {height}")
-    if height * width > MAX_PIXELS:
-        raise ValueError(f"it must hold at most {MAX_PIXELS} pixels, it declares {width} x {height}")
-
-
-def read_npy(file: Any, size: int) -> np.ndarray:
-    """The array of an open .npy file, or member of an archive, of `size` bytes; ValueError where it is not of real numbers.
-
-    np.load trusts the header and asks for all the memory that it names, so its size is compared with the file's first.
-    """
-    version = np.lib.format.read_magic(file)
-    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-    if header is None:
-        raise ValueError(f"its .npy version must be 1.0 or 2.0, it is {version}")
-    shape, _, dtype = header(file)
-    if dtype.kind not in "fiub":
-        raise ValueError(f"its array must hold real numbers, it holds {dtype}")
-    require_pixels(*(*shape, 1, 1)[:2])
-    declared, present = math.prod(shape) * dtype.itemsize, size - file.tell()
-    if declared != present:
-        raise ValueError(f"it is cut off or damaged: its header declares {declared} bytes of data, {present} are there")
-    file.seek(0)
-    return np.lib.format.read_array(file, allow_pickle=False)
-
-
-class Png(NamedTuple):
-    """What a .png declares, and its still filtered rows."""
-
-    width: int
-    height: int
-    depth: int  # bits a sample
-    channels: int
-    interlaced: bool
-    rows: bytes
-
-
-def read_png(path: Path) -> Png:
-    """Reads a .png down to its unpacked rows; ValueError where it is not whole.
-
-    Pillow alone fills missing rows with zeros in silence. The layout is that of the PNG specification (ISO/IEC 15948).
-    """
-    data = path.read_bytes()
-    if not data.startswith(b"\x89PNG\r\n\x1a\n"):
-        raise ValueError("it is not a PNG")
-    header, packed, at = b"", [], 8
-    while True:
-        if len(data) < at + 12:
-            raise ValueError("it is cut off: its end mark is missing")
-        (length,), kind = struct.unpack(">I", data[at : at + 4]), data[at + 4 : at + 8]
-        body, check = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
-        if len(check) < 4:
-            raise ValueError(f"it is cut off inside its part {kind.decode('latin1')!r}")
-        if zlib.crc32(kind + body) != int.from_bytes(check, "big"):
-            raise ValueError(f"it is damaged: the checksum of its part {kind.decode('latin1')!r} is wrong")
-        at += length + 12
-        if kind == b"IHDR":
-            header = body
-        elif kind == b"IDAT":
-            packed.append(body)
-        elif kind == b"IEND":
-            break
-    return _unpacked(header, b"".join(packed))
-
-
-def samples_16(png: Png) -> UInt16[np.ndarray, "h w channels"]:
-    """The samples of a 16-bit .png, uint16, shape (h, w, channels).
-
-    Pillow cuts 16-bit colours down to 8 bits. The filters (PNG specification, section 9) are undone along
-    anti-diagonals: a byte depends only on those left of it, above it, and left above it.
-    """
-    if png.interlaced:
-        raise ValueError("interlaced 16-bit PNG is not read: save it without interlacing")
-    h, w, step = png.height, png.width, 2 * png.channels
-    rows = np.frombuffer(png.rows, np.uint8).reshape(h, 1 + w * step)
-    filters, filtered = rows[:, :1].astype(np.int16), rows[:, 1:].reshape(h, w, step).astype(np.int16)
-    if filters.max() > 4:
-        raise ValueError(f"it is damaged: filters go from 0 to 4, it uses {filters.max()}")
-    out = np.zeros((h + 1, w + 1, step), np.int16)  # one row above and one column to the left, of zeros
-    for diagonal in range(h + w - 1):
-        y = np.arange(max(0, diagonal - w + 1), min(h, diagonal + 1))
-        x = diagonal - y
-        a, b, c = out[y + 1, x], out[y, x + 1], out[y, x]
-        kinds = filters[y]
-        near_a, near_b, near_c = abs(b - c), abs(a - c), abs(a + b - 2 * c)
-        paeth = np.where((near_a <= near_b) & (near_a <= near_c), a, np.where(near_b <= near_c, b, c))
-        predicted = np.choose(kinds, [np.zeros_like(a), a, b, (a + b) // 2, paeth])
-        out[y + 1, x + 1] = (filtered[y, x] + predicted) & 255
-    return out[1:, 1:].astype(np.uint8).reshape(h, w * step).view(">u2").reshape(h, w, png.channels).astype(np.uint16)
-
-
-def _unpacked(header: bytes, packed: bytes) -> Png:
-    if len(header) != 13:
-        raise ValueError("it is damaged: its header is missing")
-    width, height, depth, colour, _, _, interlaced = struct.unpack(">IIBBBBB", header)
-    require_pixels(height, width)
-    channels = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour)
-    if channels is None or depth not in (1, 2, 4, 8, 16):
-        raise ValueError(f"it is damaged: there is no colour type {colour} with {depth} bits")
-    expected = _row_bytes(width, height, depth * channels, interlaced)
-    rows = zlib.decompressobj().decompress(packed, expected + 1)
-    if len(rows) != expected:
-        have = "more" if len(rows) > expected else len(rows)
-        raise ValueError(f"it is cut off or damaged: {width} x {height} pixels take {expected} bytes, it holds {have}")
-    return Png(width, height, depth, channels, bool(interlaced), rows)
-
-
-def _row_bytes(width: int, height: int, bits: int, interlaced: int) -> int:
-    """The length of all rows with their filter bytes; of the seven passes of Adam7 where `interlaced`."""
-    adam7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
-    total = 0
-    for x, y, dx, dy in adam7 if interlaced else ((0, 0, 1, 1),):
-        w, h = max(0, -(-(width - x) // dx)), max(0, -(-(height - y) // dy))
-        total += h * (1 + (w * bits + 7) // 8) if w else 0
-    return total
-
-
 # One reader a format: a path to float32, shape (h, w, 3) or (h, w).
 
 
@@ -265,19 +100,20 @@ def _read_png(path: Path) -> np.ndarray:
     png = read_png(path)
     if png.depth == 16:
         return _decoded(samples_16(png)[:, :, : 3 if png.channels > 2 else 1], 65535)
-    return _read_pillow(PngImageFile(io.BytesIO(path.read_bytes())))
+    return _read_pillow(path, PngImageFile)
 
 
 def _read_jpeg(path: Path) -> np.ndarray:
+    return _read_pillow(path, JpegImageFile)
+
+
+def _read_pillow(path: Path, kind: type[ImageFile]) -> np.ndarray:
+    # The class is called directly: Image.open refuses 16384 x 16384 as an attack, by a limit for the whole process.
     with path.open("rb") as file:
-        return _read_pillow(JpegImageFile(file))
-
-
-def _read_pillow(image: Image.Image) -> np.ndarray:
-    # The classes are called directly: Image.open refuses 16384 x 16384 as an attack, by a limit for the whole process.
-    require_pixels(image.height, image.width)
-    image.info.pop("transparency", None)  # or convert warns that it will be lost
-    return _decoded(np.asarray(image.convert("RGB")), 255)
+        image = kind(file)
+        require_pixels(image.height, image.width)
+        image.info.pop("transparency", None)  # or convert warns that it will be lost
+        return _decoded(np.asarray(image.convert("RGB")), 255)
 
 
 def _decoded(samples: np.ndarray, top: int) -> np.ndarray:
@@ -386,11 +222,3 @@ _WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
     ".pfm": _write_pfm,
     ".npy": _write_npy,
 }
-
-
-def _lookup(table: dict[str, Codec], path: Path, verb: str) -> Codec:
-    found = table.get(path.suffix.lower())
-    if found is None:
-        ending = f"the ending {path.suffix!r}" if path.suffix else "a name without an ending"
-        raise ValueError(f"{path}: cannot {verb} an image with {ending}; {nearest(path.suffix.lower(), table)}")
-    return found

@@ -1,86 +1,27 @@
 """Reads scenes in the format of pbrt-v2, as far as a heightfield renderer needs it.
 
 What pbrt-v2 would silently ignore is an error here: an unknown directive or parameter, a wrong number of values, a picture
-that is not there. What is read means what pbrt-v2 makes of it.
+that is not there. What is read means what pbrt-v2 makes of it, but for the names of files: they are relative to the file in
+which they stand, not to the first one.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import DTypeLike
 
 from .._camera import Perspective
-from .._cylinder import Cylinder
-from .._heightfield import Heightfield
-from .._light import Directional, Light, Point
+from .._light import Light
 from .._material import Material, Matte, Mirror
 from .._scene import Object, Scene
 from .._texture import ImageTexture
-from .._transform import require_invertible, rotate, scale, translate
+from .._transform import require_invertible
 from ._images import load_image
-from ._pbrt_tokens import Arguments, Parameter, Parameters, Statement, Token, located, read_arguments, statements
+from ._pbrt_parts import DEFAULT_SAMPLES, KINDS, LIGHTS, SAMPLERS, SHAPES, TRANSFORMS, Matrix
+from ._pbrt_tokens import Arguments, Statement, Token, located, read_arguments, statements
 from ._source import SceneError, nearest, resolve_inside
-
-Matrix = Float[np.ndarray, "4 4"]
-
-# pbrt-v2's defaults. Depth 5 counts the camera ray: at most four mirrors.
-_DEPTH: Parameters = {"integer maxdepth": Parameter(5)}
-_KINDS: Mapping[str, Mapping[str, Parameters]] = {
-    "Film": {
-        "image": {
-            "string filename": Parameter("pbrt.exr"),
-            "integer xresolution": Parameter(640),
-            "integer yresolution": Parameter(480),
-        }
-    },
-    "Sampler": {
-        "bestcandidate": {"integer pixelsamples": Parameter(4)},
-        "stratified": {
-            "integer xsamples": Parameter(2),
-            "integer ysamples": Parameter(2),
-            "bool jitter": Parameter(True),
-        },
-    },
-    "PixelFilter": {"box": {"float xwidth": Parameter(0.5), "float ywidth": Parameter(0.5)}},
-    "SurfaceIntegrator": {"directlighting": _DEPTH, "whitted": _DEPTH},
-    "Camera": {"perspective": {"float fov": Parameter(90.0)}},
-    "LightSource": {
-        "point": {
-            "color I": Parameter(np.ones(3)),
-            "color scale": Parameter(np.ones(3)),
-            "point from": Parameter(np.zeros(3)),
-        },
-        "distant": {
-            "color L": Parameter(np.ones(3)),
-            "color scale": Parameter(np.ones(3)),
-            "point from": Parameter(np.zeros(3)),
-            "point to": Parameter(np.array([0.0, 0.0, 1.0])),
-        },
-    },
-    "Texture": {"imagemap": {"string filename": Parameter(required=True)}},
-    "Material": {
-        "matte": {"color Kd": Parameter(0.5), "texture Kd": Parameter(), "float sigma": Parameter(0.0)},
-        "mirror": {"color Kr": Parameter(0.9)},
-    },
-    "Shape": {
-        "heightfield": {
-            "integer nu": Parameter(required=True),
-            "integer nv": Parameter(required=True),
-            "float Pz": Parameter(required=True, many=True),
-        },
-        "cylinder": {
-            "float radius": Parameter(1.0),
-            "float zmin": Parameter(-1.0),
-            "float zmax": Parameter(1.0),
-            "float phimax": Parameter(360.0),
-        },
-    },
-}
-_DEFAULT_SAMPLES = 4  # of the "lowdiscrepancy" sampler that pbrt-v2 takes where a scene names none
 
 
 def load_pbrt(path: str | Path, dtype: DTypeLike = np.float32) -> Scene:
@@ -142,7 +83,7 @@ class _Reader:
     images: dict[Path, ImageTexture] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     resolution: tuple[int, int] = (640, 480)
-    samples: int = _DEFAULT_SAMPLES
+    samples: int = DEFAULT_SAMPLES
     camera: Arguments | None = None
     objects: list[Object] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
@@ -224,8 +165,8 @@ class _Reader:
     def _concatenate(self, statement: Statement) -> None:
         word = statement.word
         with np.errstate(all="ignore"), located(word):
-            if word.text in _TRANSFORMS:
-                count, make = _TRANSFORMS[word.text]
+            if word.text in TRANSFORMS:
+                count, make = TRANSFORMS[word.text]
                 matrix = make(*statement.numbers(count))
             else:
                 matrix = statement.matrix()
@@ -252,26 +193,26 @@ class _Reader:
     # The camera and its picture.
 
     def _film(self, statement: Statement) -> None:
-        args = read_arguments(statement, _KINDS["Film"])
+        args = read_arguments(statement, KINDS["Film"])
         for side in ("integer xresolution", "integer yresolution"):
             args.require(side, args[side] >= 1, "be at least 1")
         self.resolution = args["integer xresolution"], args["integer yresolution"]
 
     def _sampler(self, statement: Statement) -> None:
-        args = read_arguments(statement, _KINDS["Sampler"])
-        self.samples = _SAMPLERS[args.kind](args)
+        args = read_arguments(statement, KINDS["Sampler"])
+        self.samples = SAMPLERS[args.kind](args)
 
     def _pixel_filter(self, statement: Statement) -> None:
-        args = read_arguments(statement, _KINDS["PixelFilter"])
+        args = read_arguments(statement, KINDS["PixelFilter"])
         for side in ("float xwidth", "float ywidth"):
             args.require(side, args[side] == 0.5, "be 0.5")
 
     def _integrator(self, statement: Statement) -> None:
-        args = read_arguments(statement, _KINDS["SurfaceIntegrator"])
+        args = read_arguments(statement, KINDS["SurfaceIntegrator"])
         args.require("integer maxdepth", args["integer maxdepth"] == 5, "be 5")
 
     def _camera(self, statement: Statement) -> None:
-        args = read_arguments(statement, _KINDS["Camera"])
+        args = read_arguments(statement, KINDS["Camera"])
         args.require("float fov", 0 < args["float fov"] < 180, "lie between 0 and 180 degrees")
         with located(args.word):
             self.frames["camera"] = np.linalg.inv(self.graphics.world_from_object)
@@ -280,31 +221,31 @@ class _Reader:
     # The world.
 
     def _light_source(self, statement: Statement) -> None:
-        args = read_arguments(statement, _KINDS["LightSource"])
+        args = read_arguments(statement, KINDS["LightSource"])
         with located(args.word):
-            self.lights.append(_LIGHTS[args.kind](args, self.graphics.world_from_object))
+            self.lights.append(LIGHTS[args.kind](args, self.graphics.world_from_object))
 
     def _declare_texture(self, statement: Statement) -> None:
         name, value_type = statement.string(0), statement.string(1)
         if value_type.name() != "color":
             raise value_type.error(f'the type of a Texture must be "color", it is {value_type}')
-        args = read_arguments(statement, _KINDS["Texture"], at=2)
+        args = read_arguments(statement, KINDS["Texture"], at=2)
         place = args.tokens["string filename"]
         with located(place):
             texture = _Texture(resolve_inside(self.root, self.files[-1].parent, args["string filename"]), place)
         self.graphics = replace(self.graphics, textures={**self.graphics.textures, name.name(): texture})
 
     def _set_material(self, statement: Statement) -> None:
-        args = read_arguments(statement, _KINDS["Material"])
+        args = read_arguments(statement, KINDS["Material"])
         if args.kind == "matte":
             args.require("float sigma", args["float sigma"] == 0, "be 0 (rough surfaces are not supported)")
         self.graphics = replace(self.graphics, material=args)
 
     def _shape(self, statement: Statement) -> None:
-        args = read_arguments(statement, _KINDS["Shape"])
+        args = read_arguments(statement, KINDS["Shape"])
         matrix = self.graphics.world_from_object
         with located(args.word):
-            shape = _SHAPES[args.kind](args, self.dtype)
+            shape = SHAPES[args.kind](args, self.dtype)
             self.objects.append(Object(shape, self._material(), None if np.array_equal(matrix, np.eye(4)) else matrix))
 
     def _material(self) -> Material:
@@ -327,67 +268,6 @@ class _Reader:
             with located(texture.place):
                 self.images[texture.path] = ImageTexture(load_image(texture.path))
         return self.images[texture.path]
-
-
-def _look_at(*numbers: float) -> Matrix:
-    """camera_from_world of pbrt-v2: x right, y up, z forward, left-handed in a right-handed world."""
-    eye, target, up = np.reshape(numbers, (3, 3))
-    if not np.any(target - eye):
-        raise ValueError(f"LookAt: the target must differ from the eye, both are {eye.tolist()}")
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(up, forward)
-    length = np.linalg.norm(right)
-    if not length > 1e-9 * np.linalg.norm(up):
-        raise ValueError(f"LookAt: up must not point along the view, it is {up.tolist()} for the view {forward.tolist()}")
-    right = right / length
-    world_from_camera = np.eye(4)
-    world_from_camera[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
-    return np.linalg.inv(world_from_camera)
-
-
-def _bestcandidate(args: Arguments) -> int:
-    args.require("integer pixelsamples", args["integer pixelsamples"] >= 1, "be at least 1")
-    return args["integer pixelsamples"]
-
-
-def _stratified(args: Arguments) -> int:
-    if args["bool jitter"]:
-        raise args.error("bool jitter", 'jitter must be "false": jittered samples, the default, are not supported')
-    side = args["integer xsamples"]
-    args.require("integer xsamples", side >= 1, "be at least 1")
-    args.require("integer ysamples", args["integer ysamples"] == side, f"equal xsamples, {side}")
-    return side * side
-
-
-def _point_light(args: Arguments, world_from_object: Matrix) -> Point:
-    # pbrt-v2 moves the light by "from" after the current transformation, so "from" counts in world units.
-    return Point(world_from_object[:3, 3] + args["point from"], args["color I"] * args["color scale"])
-
-
-def _distant_light(args: Arguments, world_from_object: Matrix) -> Directional:
-    towards = world_from_object[:3, :3] @ (args["point from"] - args["point to"])
-    return Directional(towards, args["color L"] * args["color scale"])
-
-
-def _heightfield(args: Arguments, dtype: np.dtype) -> Heightfield:
-    nu, nv, z = args["integer nu"], args["integer nv"], args["float Pz"]
-    for side in ("integer nu", "integer nv"):
-        args.require(side, args[side] >= 2, "be at least 2")
-    if z.size != nu * nv:
-        raise args.error("float Pz", f"Pz must hold nu * nv = {nu} * {nv} = {nu * nv} heights, it holds {z.size}")
-    with np.errstate(over="ignore"):
-        heights = z.astype(dtype)
-    bad = np.flatnonzero(~np.isfinite(heights))
-    if bad.size:
-        k = int(bad[0])
-        message = f"Pz[{k}] (column {k % nu}, row {k // nu}) must be finite in {dtype}, it is {z[k]}"
-        raise args.error("float Pz", message, k)
-    return Heightfield(heights.reshape(nv, nu))
-
-
-def _cylinder(args: Arguments, dtype: np.dtype) -> Cylinder:
-    args.require("float phimax", args["float phimax"] == 360, "be 360 (parts of a circle are not supported)")
-    return Cylinder(args["float radius"], args["float zmin"], args["float zmax"])
 
 
 @dataclass(frozen=True)
@@ -424,16 +304,4 @@ _DIRECTIVES: Mapping[str, _Directive] = {
     "Translate": _Directive("any", _Reader._concatenate),
     "WorldBegin": _Directive("options", _Reader._world_begin),
     "WorldEnd": _Directive("world", _Reader._world_end),
-}
-_TRANSFORMS: Mapping[str, tuple[int, Callable[..., Any]]] = {
-    "LookAt": (9, _look_at),
-    "Rotate": (4, rotate),
-    "Scale": (3, scale),
-    "Translate": (3, translate),
-}
-_SAMPLERS: Mapping[str, Callable[[Arguments], int]] = {"bestcandidate": _bestcandidate, "stratified": _stratified}
-_LIGHTS: Mapping[str, Callable[[Arguments, Matrix], Light]] = {"point": _point_light, "distant": _distant_light}
-_SHAPES: Mapping[str, Callable[[Arguments, np.dtype], Heightfield | Cylinder]] = {
-    "heightfield": _heightfield,
-    "cylinder": _cylinder,
 }

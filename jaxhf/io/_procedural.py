@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ._images import require_pixels
+from ._files import require_pixels
 
 Pair = Sequence[float]
 Colour = Sequence[float]

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ._images import PathLike, read_npy, read_png, reading, require_file, require_pixels, samples_16
-from ._source import nearest
+from ._files import PathLike, by_ending, read_npy, reading, require_file, require_pixels
+from ._png import read_png, samples_16
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,11 +81,7 @@ def load_heights(
       ValueError: the ending is not known, or the file is not a whole grid of heights.
     """
     path = require_file(path)
-    reader = _READERS.get(path.suffix.lower())
-    if reader is None:
-        raise ValueError(
-            f"{path}: cannot read heights from the ending {path.suffix!r}; {nearest(path.suffix.lower(), _READERS)}"
-        )
+    reader = by_ending(_READERS, path, "read heights from")
     with reading(path):
         if not math.isfinite(z_scale) or z_scale == 0:
             raise ValueError(f"z_scale must be finite and not zero, it is {z_scale}")

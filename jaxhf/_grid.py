@@ -1,0 +1,99 @@
+"""A heightfield made ready for tracing."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Float
+
+from ._heightfield import Heightfield, vertex_normals
+from ._pyramid import Pyramid, make_pyramid
+from ._settings import NormalScheme
+from ._transform import Affine, power_of_two
+from ._types import Flag, Index, Scalar
+
+
+class Grid(eqx.Module):
+    """A heightfield made ready for tracing, in a frame of its own: cells by cells by heights.
+
+    In the grid's frame vertex (ix, iy) stands at x = ix, y = iy, and heights are relative to the lowest and divided by a
+    power of two, so that the walk sees the same bits whatever the offset, and neither over- nor underflows. Where the
+    frame lies (lowest height, scale) is held constant under differentiation, as any choice of it gives the same surface.
+
+    Attributes:
+      z: heights, shape (ny, nx); a hole is nan.
+      z_top: the largest of them.
+      pyramid: bounds over blocks of cells.
+      normals: at the vertices, object frame, shape (ny, nx, 3); None where shading is flat.
+    """
+
+    z: Float[jax.Array, "ny nx"]
+    z_top: Scalar
+    pyramid: Pyramid
+    normals: Float[jax.Array, "ny nx 3"] | None
+    world_from_grid: Affine
+    grid_from_world: Affine
+    object_from_world: Affine | None
+
+    @property
+    def sure(self) -> Flag:
+        """True, but not to the compiler: see `stored`."""
+        return lax.stop_gradient(self.z_top) >= 0
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Cells along x and along y."""
+        ny, nx = self.z.shape
+        return nx - 1, ny - 1
+
+
+def make_grid(
+    field: Heightfield, world_from_object: Affine | None, normals: NormalScheme | None, levels: int | None = None
+) -> Grid:
+    """Prepares `field` for tracing: dense array arithmetic, differentiable in the heights and in the transform.
+
+    Args:
+      field: its x0 and y0 must be 0, see `localise`.
+      world_from_object: None for the identity.
+      normals: the scheme at the vertices; None for none.
+      levels: of the pyramid, above its finest; None for all.
+    """
+    heights = jnp.asarray(field.heights)
+    dtype = heights.dtype
+    finite = jnp.isfinite(heights)
+    known = lax.stop_gradient(jnp.where(finite, heights, 0))
+    largest = jnp.max(jnp.abs(known))
+    unit_height = power_of_two(jnp.where(largest > 0, largest, 1))
+    lowest = jnp.min(jnp.where(finite, known, jnp.inf), initial=jnp.inf)
+    lowest = jnp.where(finite.any(), lowest, 0)
+    z = jnp.where(finite, heights / unit_height - lowest / unit_height, jnp.nan)
+    z_top = jnp.max(lax.stop_gradient(jnp.where(finite, z, 0)))
+
+    cell = jnp.stack([jnp.full((), field.dx, dtype), jnp.full((), field.dy, dtype), unit_height])
+    ground = jnp.stack([jnp.zeros((), dtype), jnp.zeros((), dtype), lowest])
+    if world_from_object is None:
+        world_from_grid = Affine(jnp.diag(cell), ground)
+        grid_from_world = Affine(jnp.diag(1 / cell), -ground / cell)
+        object_from_world = None
+    else:
+        object_from_world = world_from_object.inverse()
+        world_from_grid = Affine(world_from_object.linear * cell[None, :], world_from_object.point(ground))
+        grid_from_world = Affine(object_from_world.linear / cell[:, None], (object_from_world.offset - ground) / cell)
+    at_vertices = None if normals is None else vertex_normals(heights, field.dx, field.dy, normals)
+    pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels)
+    return Grid(z, z_top, pyramid, at_vertices, world_from_grid, grid_from_world, object_from_world)
+
+
+def corners(values: Float[jax.Array, "ny nx *rest"], ix: Index, iy: Index) -> tuple[jax.Array, ...]:
+    """What stands at the vertices 00, 10, 01, 11 of a cell that is in range."""
+
+    def at(column, row):
+        return values.at[row, column].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+    return at(ix, iy), at(ix + 1, iy), at(ix, iy + 1), at(ix + 1, iy + 1)
+
+
+def triangle_plane(z: Float[jax.Array, "ny nx"], ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
+    """(a, b, c) of the triangle's plane c + a u + b v, with u and v from the cell's vertex 00; finite in a hole too."""
+    z00, z10, z01, z11 = (jnp.where(jnp.isfinite(value), value, 0) for value in corners(z, ix, iy))
+    return jnp.where(upper, z11 - z01, z10 - z00), jnp.where(upper, z01 - z00, z11 - z10), z00

@@ -1,0 +1,89 @@
+"""What the readers of scenes, heights and images share: which files there are, and how errors name them."""
+
+import contextlib
+import math
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ._source import nearest
+
+MAX_PIXELS = 2**28  # 16384 x 16384, for images and for grids of heights
+
+PathLike = str | os.PathLike[str]
+Codec = TypeVar("Codec")
+
+
+def by_ending(codecs: Mapping[str, Codec], path: Path, task: str) -> Codec:
+    """What does `task` for the ending of `path`; ValueError where nothing does."""
+    ending = path.suffix.lower()
+    if ending not in codecs:
+        named = f"the ending {path.suffix!r}" if ending else "a name without an ending"
+        raise ValueError(f"{path}: cannot {task} {named}; {nearest(ending, codecs)}")
+    return codecs[ending]
+
+
+def require_file(path: PathLike) -> Path:
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    if not path.is_file():
+        raise ValueError(f"{path}: must be a file, it is a folder or a device")
+    return path
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Puts the file's name in front of whatever goes wrong inside, as one ValueError.
+
+    The decoders raise nearly anything on broken files: OSError, SyntaxError, RuntimeError, EOFError, struct.error.
+    """
+    try:
+        yield
+    except (MemoryError, PermissionError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong."""
+    path = path.resolve()  # what a link points to is replaced, not the link
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def require_pixels(height: int, width: int) -> None:
+    if height < 1 or width < 1:
+        raise ValueError(f"its size must be positive, it is {width} x {height}")
+    if height * width > MAX_PIXELS:
+        raise ValueError(f"it must hold at most {MAX_PIXELS} pixels, it declares {width} x {height}")
+
+
+def read_npy(file: Any, size: int) -> np.ndarray:
+    """The array of an open .npy file, or member of an archive, of `size` bytes; ValueError where it is not of real numbers.
+
+    np.load trusts the header and asks for all the memory that it names, so its size is compared with the file's first.
+    """
+    version = np.lib.format.read_magic(file)
+    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if header is None:
+        raise ValueError(f"its .npy version must be 1.0 or 2.0, it is {version}")
+    shape, _, dtype = header(file)
+    if dtype.kind not in "fiub":
+        raise ValueError(f"its array must hold real numbers, it holds {dtype}")
+    require_pixels(*(*shape, 1, 1)[:2])
+    declared, present = math.prod(shape) * dtype.itemsize, size - file.tell()
+    if declared != present:
+        raise ValueError(f"it is cut off or damaged: its header declares {declared} bytes of data, {present} are there")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
