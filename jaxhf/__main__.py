@@ -54,6 +54,9 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--max-depth", type=int, metavar="N", help="mirror bounces [4]")
     render.add_argument("--max-steps", type=int, metavar="N", help="step budget of a walk [as many as any ray needs]")
     render.add_argument("--chunk", type=int, metavar="RAYS", help="rays traced together [4096]")
+    render.add_argument(
+        "--devices", type=int, metavar="N", help="cores that share the work, each with a copy [all, at most 16]"
+    )
     render.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
     render.set_defaults(run=_render)
 
@@ -68,14 +71,23 @@ def _render(options: argparse.Namespace) -> None:
 
     require_writable(options.output)
     settings = _settings(options)
-    if options.precision == "float64":
-        import jax
-
-        jax.config.update("jax_enable_x64", True)
+    _set_up_jax(options.precision, options.devices)
     scene = _resized(_load(options.scene, options.precision), options.width, options.height)
     image, report = _timed_render(scene, settings)
     save_image(options.output, image)
     print(f"{options.output}: {report}")
+
+
+def _set_up_jax(precision: str, devices: int | None) -> None:
+    """What can only be said before JAX is first used."""
+    import os
+
+    import jax
+
+    if devices is not None and devices < 1:
+        raise ValueError(f"--devices must be a whole number from 1 on, it is {devices}")
+    jax.config.update("jax_enable_x64", precision == "float64")
+    jax.config.update("jax_num_cpu_devices", devices or min(len(os.sched_getaffinity(0)), 16))
 
 
 def _settings(options: argparse.Namespace) -> "Settings":
@@ -125,7 +137,8 @@ def _timed_render(scene: "Scene", settings: "Settings") -> tuple[Any, str]:
     return image, (
         f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), "
         f"{seconds:.3g} s + {compiling.seconds:.3g} s compiling, "
-        f"{jax.devices()[0].device_kind}, {rays / seconds:.3g} rays/s, {int(np.sum(aovs['exhausted']))} rays exhausted"
+        f"{jax.local_device_count()} x {jax.devices()[0].device_kind}, {rays / seconds:.3g} rays/s, "
+        f"{int(np.sum(aovs['exhausted']))} rays exhausted"
     )
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 from jaxtyping import Float, Int
 
 from ._camera import Camera
@@ -42,6 +43,10 @@ def render(
 ) -> Any:
     """Renders a picture.
 
+    Its tiles are dealt out to all devices of this process, each of which holds a copy of the scene; the picture has the
+    same bits on any number of them. JAX takes the cores of a CPU for one device, unless
+    `jax.config.update("jax_num_cpu_devices", n)` says otherwise before it is first used.
+
     Args:
       scene: what to see. Values that are NumPy or Python numbers keep double precision until the origin has been moved to
         the terrain; the rest is computed in the precision of the (first) heightfield's heights.
@@ -60,7 +65,7 @@ def render(
         if name not in AOVS:
             raise ValueError(f"render: aovs must be among {', '.join(AOVS)}; one is {name!r}")
     settings = settle(settings, scene)
-    local = localise(scene)
+    local = _on_every_device(localise(scene))
     outputs = _trace_all(local, settings, aovs) if progress is None else _trace_in_parts(local, settings, aovs, progress)
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
@@ -95,15 +100,51 @@ class _Tiling:
 def _trace_all(scene: Scene, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
     tiling = _Tiling(scene.camera, settings)
     world = make_world(scene, settings)
-    tiles = lax.map(
-        lambda tile: _trace_tile(world, scene.camera, settings, aovs, tile), jnp.arange(tiling.count, dtype=jnp.int32)
-    )
+    tiles = _over_devices(world, scene.camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
     return jax.tree.map(tiling.assemble, tiles)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "aovs"))
 def _trace_tiles(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]):
-    return lax.map(lambda tile: _trace_tile(world, camera, settings, aovs, tile), tiles)
+    return _over_devices(world, camera, settings, aovs, tiles)
+
+
+def _mesh() -> Mesh:
+    devices = jax.local_devices()
+    return jax.make_mesh((len(devices),), ("tiles",), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def _on_every_device(scene: Scene) -> Scene:
+    """Copies the scene to each device of this process, wherever the caller has put it."""
+    return scene if jax.local_device_count() == 1 else jax.device_put(scene, NamedSharding(_mesh(), P()))
+
+
+def _over_devices(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]):
+    """Traces tiles one after the other, dealt out in turn to the devices of this process."""
+
+    def trace(world: World, camera: Camera, tiles: jax.Array):
+        return lax.map(lambda tile: _trace_tile(world, camera, settings, aovs, tile), tiles)
+
+    devices = jax.local_device_count()
+    if devices == 1:
+        return trace(world, camera, tiles)
+    mesh = _mesh()
+    count = math.ceil(tiles.shape[0] / devices)
+    dealt = jnp.pad(tiles, (0, count * devices - tiles.shape[0]), mode="edge").reshape(count, devices).T
+    over = jax.shard_map(
+        lambda world, camera, tiles: trace(world, camera, tiles[0]),
+        mesh=mesh,
+        in_specs=(P(), P(), P("tiles")),
+        out_specs=P("tiles"),
+        check_vma=False,
+    )
+    traced = over(world, camera, dealt)
+
+    def in_order(values: jax.Array) -> jax.Array:
+        tail = values.shape[1:]
+        return values.reshape(devices, count, *tail).swapaxes(0, 1).reshape(devices * count, *tail)[: tiles.shape[0]]
+
+    return jax.tree.map(in_order, traced)
 
 
 _make_world = jax.jit(make_world, static_argnames=("settings",))

@@ -333,7 +333,7 @@ MISTAKES = [
     (
         view('type = "orthographic"\neye = [0, 1, 1]\ntarget = [0, 0, 0]\nextent = 0'),
         9,
-        "camera.extent must be positive, it is 0.0",
+        "camera.extent must be positive and finite, it is 0.0",
     ),
     (light('type = "directional"\ntowards = [0, 0, 0]'), 12, "lights[0].towards must not be zero"),
     (light('type = "directional"\ntowards = [0, 0, 1]\nazimuth = 3'), 12, "towards must stand without azimuth and altitude"),

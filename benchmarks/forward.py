@@ -1,0 +1,129 @@
+"""Times one frame, from changed heights to image: 512 x 512 pixels, one sample, smooth normals, a light with shadows.
+
+The variants are run in turn, several times, so that a machine whose speed drifts does not favour one; medians are printed,
+and the ratio to the first variant, pair by pair. With `--mitsuba` (pip install mitsuba; it needs LLVM's library, see
+DRJIT_LIBLLVM_PATH) the same terrain is also rendered by Mitsuba 3's `direct` integrator.
+"""
+
+import argparse
+import importlib
+import os
+import time
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+import jaxhf
+from jaxhf.io._procedural import fractal
+
+CAMERAS = {  # eye, target, field of view: a fifth of the picture covered, all of it covered
+    "A": ((1.2, -0.9, 0.7), (0.5, 0.5, 0.05), 45.0),
+    "B": ((0.5, -0.1, 0.75), (0.5, 0.5, 0.05), 34.0),
+}
+LIGHTS = {"A": (0.5, -0.3, 0.6), "B": (0.8, 0.1, 0.3)}
+PIXELS = 512
+
+
+def terrain(size: int) -> np.ndarray:
+    return fractal([size, size], seed=0, exponent=2.2, range=(0.0, 0.25)).astype(np.float32)
+
+
+def scene(heights: np.ndarray, camera: str) -> jaxhf.Scene:
+    eye, target, fov = CAMERAS[camera]
+    return jaxhf.Scene(
+        objects=[jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(0.7))],
+        camera=jaxhf.Perspective.look_at(eye, target, fov=fov, width=PIXELS, height=PIXELS),
+        lights=[jaxhf.Directional(LIGHTS[camera])],
+    )
+
+
+def ours(heights: np.ndarray, camera: str, settings: jaxhf.Settings) -> Callable[[], object]:
+    base = scene(heights, camera)
+    return lambda: jax.block_until_ready(jaxhf.render(base, settings))
+
+
+def mitsuba(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]:
+    dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")  # optional: not in any extra
+    mi.set_variant("llvm_ad_rgb")
+    size = len(heights)
+    x, y = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
+    corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
+    faces = np.concatenate(
+        [np.stack([corner, corner + 1, corner + size + 1], 1), np.stack([corner, corner + size + 1, corner + size], 1)]
+    )
+    mesh = mi.Mesh("terrain", size * size, len(faces), has_vertex_normals=True)
+    parameters = mi.traverse(mesh)
+    positions = np.stack([x, y, heights], -1).astype(np.float32).ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
+    parameters["vertex_positions"] = positions
+    parameters.update()
+    eye, target, fov = CAMERAS[camera]
+    loaded = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "terrain": mesh,
+            "light": {"type": "directional", "direction": [-v for v in LIGHTS[camera]], "irradiance": np.pi},
+            "sensor": {
+                "type": "perspective",
+                "fov": fov,
+                "to_world": mi.ScalarTransform4f().look_at(origin=eye, target=target, up=(0, 0, 1)),
+                "film": {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}},
+                "sampler": {"type": "independent", "sample_count": 1},
+            },
+        }
+    )
+    scene_parameters = mi.traverse(loaded)
+
+    def frame():
+        dr.eval(mi.render(loaded, spp=1))
+        dr.sync_thread()
+
+    def rebuild():
+        scene_parameters["terrain.vertex_positions"] = positions
+        scene_parameters.update()
+        frame()
+
+    return {"mitsuba": frame, "mitsuba, new heights": rebuild}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256, 1024], help="vertices a side")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="cores that share the work")
+    parser.add_argument("--mitsuba", action="store_true")
+    options = parser.parse_args()
+    jax.config.update("jax_num_cpu_devices", options.devices)
+    for size in options.sizes:
+        for camera in CAMERAS:
+            heights = terrain(size)
+            variants = {
+                "pyramid": ours(heights, camera, jaxhf.Settings()),
+                "pyramid, no shadows": ours(heights, camera, jaxhf.Settings(shadows=False)),
+                "dda": ours(heights, camera, jaxhf.Settings(traversal="dda")),
+            }
+            if options.mitsuba:
+                variants |= mitsuba(heights, camera)
+            report(f"{size}² heights, camera {camera}", variants, options.repeats)
+
+
+def report(title: str, variants: dict[str, Callable[[], object]], repeats: int) -> None:
+    times: dict[str, list[float]] = {name: [] for name in variants}
+    for variant in variants.values():
+        variant()
+    for _ in range(repeats):
+        for name, variant in variants.items():
+            begin = time.perf_counter()
+            variant()
+            times[name].append(time.perf_counter() - begin)
+    print(title)
+    first = np.array(next(iter(times.values())))
+    for name, seconds in times.items():
+        ratio = np.median(np.array(seconds) / first)
+        print(f"  {name:22s} {1e3 * np.median(seconds):8.1f} ms   {ratio:6.2f} of the first", flush=True)
+
+
+if __name__ == "__main__":
+    main()
