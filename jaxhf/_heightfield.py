@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._settings import NormalScheme
+from ._store import stored
 from ._types import AnyArray
 
 
@@ -107,28 +108,30 @@ def _central(heights, dx, dy):
 
 
 def _fan_mean(heights, dx, dy, fan, weight):
+    """The components stay apart until the end: arrays whose last axis has length 3 take several times as long."""
     at = _neighbours(heights)
     here, here_present = at(0, 0)
-    total = jnp.zeros((*here.shape, 3), here.dtype)
+    total_x = total_y = total_z = jnp.zeros_like(here)
+    sure = jnp.sum(here_present, dtype=jnp.int32) >= 0
     for (ax, ay), (bx, by) in zip(fan, fan[1:] + fan[:1], strict=True):
         (a, a_present), (b, b_present) = at(ax, ay), at(bx, by)
         present = here_present & a_present & b_present
         az, bz = jnp.where(present, a - here, 0), jnp.where(present, b - here, 0)
-        normal = jnp.stack(
-            [(ay * bz - by * az) * dy, (bx * az - ax * bz) * dx, jnp.full_like(az, (ax * by - ay * bx) * dx * dy)], -1
-        )
-        length = _length(normal)
+        x, y = (ay * bz - by * az) * dy, (bx * az - ax * bz) * dx
+        z = jnp.where(present, (ax * by - ay * bx) * dx * dy, 0)  # x and y are zero where there is no triangle
         if weight != "area":
-            normal = normal / length[..., None]
-        if weight == "angle":
-            along = ax * bx * dx * dx + ay * by * dy * dy + az * bz
-            normal = normal * jnp.atan2(length, along)[..., None]
-        total = total + jnp.where(present[..., None], normal, 0)
-    alone = (total[..., 2] == 0)[..., None]
-    return jnp.where(alone, jnp.array([0, 0, 1], here.dtype), total)
+            length = _length(x, y, jnp.where(present, z, 1))
+            share = 1 / length
+            if weight == "angle":
+                share = share * jnp.atan2(length, ax * bx * dx * dx + ay * by * dy * dy + az * bz)
+            share = stored(share, sure)
+            x, y, z = x * share, y * share, z * share
+        total_x, total_y, total_z = total_x + x, total_y + y, total_z + z
+    return jnp.stack([total_x, total_y, jnp.where(total_z == 0, 1, total_z)], axis=-1)
 
 
-def _length(v):
-    """Length of nonzero vectors along the last axis, without overflow."""
-    largest = jnp.max(jnp.abs(v), axis=-1)
-    return largest * jnp.sqrt(jnp.sum((v / largest[..., None]) ** 2, axis=-1))
+def _length(x, y, z):
+    """The length of nonzero vectors, without overflow."""
+    largest = jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z))
+    x, y, z = x / largest, y / largest, z / largest
+    return largest * jnp.sqrt(x * x + y * y + z * z)

@@ -3,8 +3,7 @@
 A ray may end in another way than the oracle says only where a rounding decides. How far rounding goes is `SLACK`, the shift
 of a ray against the surface relative to the largest lengths that occur (see `oracle.OracleHit`). Behind a height over the
 surface stand about a dozen operations, each rounded to half of `eps`: into the frame of the grid, to the box, along the ray,
-along an edge. Half of `SLACK` is enough for all of 7200 rays on each of 12 fields. In double precision the oracle
-itself takes part of it.
+along an edge. In double precision the oracle's own rounding is part of it.
 """
 
 import dataclasses
@@ -335,8 +334,7 @@ def test_invalid_rays(dtype):
         assert np.all(np.isposinf(value[:19]) if name == "t" else np.isfinite(value)), name
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_a_hole_lets_rays_through(dtype):
+def test_a_hole_lets_rays_through():
     heights = np.zeros((4, 5))
     heights[1, 2], heights[:, 3:] = np.nan, 2.0
     x, y = np.meshgrid(np.arange(4) + 0.5, np.arange(3) + 0.25)
@@ -344,10 +342,10 @@ def test_a_hole_lets_rays_through(dtype):
     # Across the hole, over and under the sheet behind it: the side on which the ray stands is found anew.
     across = np.array([[0.5, 0.5, 2.75], [0.5, 0.5, 0.5]]), np.array([[1.0, 0.0, -0.25], [1.0, 0.0, 0.0]])
     o, d = np.concatenate([o, across[0]]), np.concatenate([d, across[1]])
-    hit = jaxhf.cast(jaxhf.Heightfield(heights.astype(dtype), 1.0), o, d)
+    hit = jaxhf.cast(jaxhf.Heightfield(heights.astype(np.float32), 1.0), o, d)
     np.testing.assert_array_equal(hit.status[:12].reshape(3, 4), [[1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]])
     np.testing.assert_array_equal(hit.status[12:], [jaxhf.Status.HIT, jaxhf.Status.MISS])
-    np.testing.assert_allclose(hit.t[12], 3, rtol=4 * float(np.finfo(dtype).eps))
+    np.testing.assert_allclose(hit.t[12], 3, rtol=4 * float(np.finfo(np.float32).eps))
 
 
 def test_nothing_but_holes_is_never_hit():
