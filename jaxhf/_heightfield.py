@@ -67,12 +67,12 @@ def vertex_normals(
 ) -> Float[jax.Array, "ny nx 3"]:
     """Normals at the vertices, on the +z side, object frame; their lengths are the weights of the interpolation.
 
-    "central": central differences, one-sided at the border. "four": mean of the unit normals of the triangles
+    "central": central differences, one-sided at the border. "four": the sum of the unit normals of the triangles
     right-up, up-left, left-down, down-right. "six": of the six triangles that touch the vertex, weighted by area, so
     that it commutes with affine maps (the sum that the seed's pbrt shape takes). "six-equal": the six unit normals with
     equal weights (Gouraud 1971). "six-angle": weighted by the angle at the vertex (Thürmer and Wüthrich 1998), as
-    Mitsuba does. What lies beyond the border or touches a hole takes no part; a vertex with no triangle at all
-    gets (0, 0, 1).
+    Mitsuba does. What lies beyond the border or touches a hole takes no part, so that a vertex there weighs less in the
+    interpolation; one with no triangle at all gets (0, 0, 1).
     """
     if scheme == "central":
         return _central(heights, dx, dy)

@@ -91,7 +91,6 @@ def intersect(
     origin: Origin | None = None,
     active: Flag | None = None,
     count_steps: bool = False,
-    clear_until: Scalar | None = None,
 ) -> Hit:
     """The first hit of a world-frame ray on one surface.
 
@@ -102,7 +101,6 @@ def intersect(
       origin: None for rays that start in free space.
       active: False spares the ray the search: it ends as a miss.
       count_steps: whether to count the steps of the search.
-      clear_until: a distance before which the ray is known to be clear of the surface.
     """
     valid = jnp.isfinite(ray.o).all() & jnp.isfinite(ray.d).all()
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
@@ -115,7 +113,6 @@ def intersect(
         max_steps=settings.max_steps,
         active=active,
         departure=None if origin is None else stored(origin.departure(surface), surface.sure),
-        clear_until=None if clear_until is None else clear_until * scale,
         count_steps=count_steps,
     )
     hit = surface_interaction(surface, local, stored(found, surface.sure))

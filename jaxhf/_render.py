@@ -29,7 +29,7 @@ AOVS = ("depth", "normal", "uv", "status", "object", "cell", "shadow", "steps", 
 
 depth: distance to the hit, infinite where there is none. normal: shading normal, world frame. uv: place in the
 footprint. status: see `Status`. object: its number in the scene, -1 for none. cell: (ix, iy), -1 for none. shadow: for each
-light but the sky, whether it fails to reach the hit (blocked, or behind the surface). steps: cells visited by the ray,
+light but the sky, whether it fails to reach the hit (blocked, or behind the surface). steps: taken by the search for the hit,
 over all objects. exhausted: walks that ran out of steps, over all samples of the pixel, shadow and mirrored rays included.
 """
 

@@ -22,7 +22,6 @@ def first_hit(
     active: Flag | None = None,
     departure: Departure | None = None,
     t_max: Scalar | None = None,
-    clear_until: Scalar | None = None,
     count_steps: bool = False,
 ) -> CellHit:
     """Finds the first triangle in which `ray` meets the surface.
@@ -39,10 +38,9 @@ def first_hit(
       active: False spares a ray the walk: it ends as a miss.
       departure: for rays that leave this surface.
       t_max: where to give up; a hit beyond it may or may not be reported.
-      clear_until: a distance before which the ray is known to be clear of the surface.
       count_steps: whether to count the steps.
     """
-    grid, ray, departure, t_max, clear_until = lax.stop_gradient((grid, ray, departure, t_max, clear_until))
+    grid, ray, departure, t_max = lax.stop_gradient((grid, ray, departure, t_max))
     walk = Walk(grid, ray, departure, t_max)
     bound = enough_steps(grid)
     budget = bound if max_steps is None else min(max_steps, bound)
@@ -59,7 +57,7 @@ def first_hit(
         return step + 1, walk.visit(state), steps
 
     none = jnp.zeros((), jnp.int32)
-    _, state, steps = lax.while_loop(going, advance, (none, walk.start(active, clear_until), none if count_steps else None))
+    _, state, steps = lax.while_loop(going, advance, (none, walk.start(active), none if count_steps else None))
     return walk.finish(state, steps)
 
 

@@ -121,8 +121,7 @@ class Walk:
         near_z, far_z = _slab(o[2], self.inv_z, grid.z_top)
         start = jnp.maximum(jnp.maximum(near_x, near_y), jnp.maximum(near_z, 0))
         wide = 1 + 8 * jnp.finfo(o.dtype).eps
-        self.t_far = jnp.minimum(jnp.minimum(far_x, far_y), far_z) * wide
-        self.enters = self.valid & (start <= self.t_far)
+        self.enters = self.valid & (start <= jnp.minimum(jnp.minimum(far_x, far_y), far_z) * wide)
         start = jnp.where(self.enters, start, 0)
         # An ulp inside the far border, so that a ray which stands still on it is in the last cell.
         inside = 1 - jnp.finfo(o.dtype).epsneg
@@ -141,22 +140,22 @@ class Walk:
             self.z_ray = jnp.where(away, height, self.z_ray)
         self.t_start = start
 
-    def start(self, active: Flag | None, clear_until: Scalar | None) -> jax.Array:
-        """The state in which the walk begins.
+    def start(self, active: Flag | None) -> jax.Array:
+        """The state in which the walk begins; `active` False: it does not begin at all.
 
-        Args:
-          active: False: it does not begin at all.
-          clear_until: a distance before which the ray is known to be clear of the surface.
+        By the rule of the walk, planes in x count as crossed at their own distance and planes in y just behind it, so that
+        at a vertex x is crossed first.
         """
-        t = jnp.zeros_like(self.x) if clear_until is None else jnp.maximum(clear_until - self.t_start, 0)
-        ix, iy = self._cell_at(t)
-        u, v = self.x + t * self.dx - ix.astype(t.dtype), self.y + t * self.dy - iy.astype(t.dtype)
+        column = jnp.where(self.forward_x, jnp.floor(self.x), jnp.ceil(self.x) - 1)
+        row = jnp.where(self.forward_y, jnp.ceil(self.y) - 1, jnp.floor(self.y))
+        ix = jnp.clip(column.astype(jnp.int32), 0, self.cells_x - 1)
+        iy = jnp.clip(row.astype(jnp.int32), 0, self.cells_y - 1)
+        u, v = self.x - ix.astype(self.x.dtype), self.y - iy.astype(self.y.dtype)
         a, b, c = triangle_plane(self.z, ix, iy, v > u)
-        gap = self.z_ray + t * self.dz - (c + a * u + b * v)
+        gap = self.z_ray - (c + a * u + b * v)
         gap = jnp.where(gap == 0, self.dz - a * self.dx - b * self.dy, gap)  # on the surface: where it goes
-        above = jnp.where(self.through_end & (t == 0), self.dz < 0, gap >= 0)
+        above = jnp.where(self.through_end, self.dz < 0, gap >= 0)
         going = self.enters if active is None else self.enters & active
-        going = going if clear_until is None else going & (clear_until <= self.t_far)
         status = jnp.where(going, _WALKING, _MISS)
         if self.departure is not None:
             away, at = self.departure.active, self.departure
@@ -164,26 +163,6 @@ class Walk:
             above = jnp.where(away, at.side > 0, above)
             status = jnp.where(going & away, _LEAVING, status)
         return self._pack(status, above, 2 * ix + 1, iy)
-
-    def _cell_at(self, t: Scalar) -> tuple[Index, Index]:
-        """The cell that the ray is in at `t`, by the rule of the walk: planes in x count as crossed at their own distance,
-        planes in y just behind it, so that at a vertex x is crossed first.
-        """
-        ix = jnp.clip(jnp.floor(self.x + t * self.dx).astype(jnp.int32), 0, self.cells_x - 1)
-        iy = jnp.clip(jnp.floor(self.y + t * self.dy).astype(jnp.int32), 0, self.cells_y - 1)
-        # Rounding may have put the point into a neighbour: the planes before and behind the cell decide.
-        entry_x, exit_x = self._ordered(self.forward_x, ix, 1)
-        entry_y, exit_y = self._ordered(self.forward_y, iy, 1)
-        behind_x = (self._distance_x(exit_x) <= t).astype(jnp.int32) - (self._distance_x(entry_x) > t).astype(jnp.int32)
-        behind_y = (self._distance_y(exit_y) < t).astype(jnp.int32) - (self._distance_y(entry_y) >= t).astype(jnp.int32)
-        ix = ix + jnp.where(self.forward_x, behind_x, -behind_x)
-        iy = iy + jnp.where(self.forward_y, behind_y, -behind_y)
-        return jnp.clip(ix, 0, self.cells_x - 1), jnp.clip(iy, 0, self.cells_y - 1)
-
-    def _ordered(self, forward: Flag, low: Index, size: Index | int) -> tuple[Index, Index]:
-        """The planes through which the ray enters and leaves a block that begins at `low`, along one axis."""
-        high = low + size
-        return jnp.where(forward, low, high), jnp.where(forward, high, low)
 
     def _distance_x(self, plane: Index) -> Scalar:
         return (plane.astype(self.x.dtype) - self.x) * self.inv_x
@@ -304,14 +283,12 @@ class Walk:
         iy = jnp.where(met, (state >> (3 + self.bits_x)).astype(jnp.int32), 0)
         near, out_x, out_y = self._passage(ix, iy, jnp.ones_like(ix))
         far = jnp.maximum(jnp.minimum(jnp.minimum(out_x, out_y), self.t_end), near)
-        # The hit lies within its triangle, that is, on its side of the diagonal, as far as rounding lets that be known: a
-        # ray that runs along the diagonal may cross it anywhere.
+        # Within its triangle, that is, on its side of the diagonal where that is crossed: a ray that grazes the triangle's
+        # plane could otherwise be anywhere in the cell.
         upper = code & 1 != 0
         _, diagonal = self._diagonal(ix, iy)
-        rounding = 8 * jnp.finfo(near.dtype).eps * (self.cells_x + self.cells_y) * jnp.abs(self.inv_rate)
-        before = upper == (self.inv_rate > 0)
-        first, second = jnp.clip(diagonal - rounding, near, far), jnp.clip(diagonal + rounding, near, far)
-        near, far = jnp.where(before, near, first), jnp.where(before, second, far)
+        crosses, before = (near < diagonal) & (diagonal < far), upper == (self.rate > 0)
+        near, far = jnp.where(crosses & ~before, diagonal, near), jnp.where(crosses & before, diagonal, far)
         ended = jnp.where(walking(state), _WALKING, (state & 3).astype(jnp.int32))
         return CellHit(
             status=jnp.where(self.valid, ended, int(Status.INVALID)).astype(jnp.int32),

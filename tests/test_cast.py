@@ -18,7 +18,7 @@ import pytest
 import jaxhf
 
 DTYPES = [np.float32, np.float64]
-SLACK = {np.float32: 16 * 2.0**-24, np.float64: 16 * 2.0**-53}
+SLACK = {np.float32: 8 * 2.0**-24, np.float64: 8 * 2.0**-53}
 SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
 DOWN = np.array([0.0, 0.0, -1.0])
 # One size of field and of batch for many tests: each other one is compiled anew.
