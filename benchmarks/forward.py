@@ -122,7 +122,7 @@ def report(title: str, variants: dict[str, Callable[[], object]], repeats: int) 
     first = np.array(next(iter(times.values())))
     for name, seconds in times.items():
         ratio = np.median(np.array(seconds) / first)
-        print(f"  {name:22s} {1e3 * np.median(seconds):8.1f} ms   {ratio:6.2f} of the first", flush=True)
+        print(f"  {name:28s} {1e3 * np.median(seconds):8.1f} ms   {ratio:6.2f} of the first", flush=True)
 
 
 if __name__ == "__main__":
