@@ -77,8 +77,8 @@ def distance(grid: Grid, ray: Ray, found: CellHit) -> Scalar:
     """t at which `ray` (in the grid's frame) meets the plane of the triangle that was found.
 
     Plain arithmetic that is differentiable in the heights and in the ray. It starts at the cell, as the subtraction
-    of far heights would cancel; the rounding of t is clamped to the cell, without touching its derivative. A ray that
-    lies in the plane meets it all along: then t is that of the cell, with the derivative zero.
+    of far heights would cancel; t is clamped to the part of the ray over the triangle, without touching its derivative. A
+    ray that lies in the plane meets it all along: then t is that of the cell, with the derivative zero.
     """
     a, b, c = triangle_plane(grid.z, found.ix, found.iy, found.upper)
     o, d = ray(found.t_near), ray.d
