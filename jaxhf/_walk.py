@@ -176,11 +176,16 @@ class Walk:
 
         return bits(status, 0) | bits(above, 2) | bits(code_x, 3) | bits(iy, 3 + self.bits_x)
 
+    def _fields(self, state: jax.Array) -> tuple[Flag, Index, Index]:
+        """What `_pack` took besides the status."""
+        code = (state >> 3).astype(jnp.int32) & ((1 << self.bits_x) - 1)
+        return (state & 4) != 0, code, (state >> (3 + self.bits_x)).astype(jnp.int32)
+
     def _unpack(self, state: jax.Array) -> tuple[Flag, Index, Index, Index]:
         """Whether the ray is above the surface, and its block's first cell and size."""
-        code = (state >> 3).astype(jnp.int32) & ((1 << self.bits_x) - 1)
+        above, code, iy = self._fields(state)
         size = code & -code
-        return (state & 4) != 0, (code - size) >> 1, (state >> (3 + self.bits_x)).astype(jnp.int32), size
+        return above, (code - size) >> 1, iy, size
 
     def _passage(self, ix: Index, iy: Index, size: Index) -> tuple[Scalar, Scalar, Scalar]:
         """Distances at which the ray enters the block, and at which it reaches its far planes in x and in y."""
@@ -278,9 +283,8 @@ class Walk:
 
     def finish(self, state: jax.Array, steps: Index | None) -> CellHit:
         met = (state & 3) == _HIT
-        code = (state >> 3).astype(jnp.int32) & ((1 << self.bits_x) - 1)
-        ix = jnp.where(met, code >> 1, 0)
-        iy = jnp.where(met, (state >> (3 + self.bits_x)).astype(jnp.int32), 0)
+        above, code, iy = self._fields(state)
+        ix, iy = jnp.where(met, code >> 1, 0), jnp.where(met, iy, 0)
         near, out_x, out_y = self._passage(ix, iy, jnp.ones_like(ix))
         far = jnp.maximum(jnp.minimum(jnp.minimum(out_x, out_y), self.t_end), near)
         # Within its triangle, that is, on its side of the diagonal where that is crossed: a ray that grazes the triangle's
@@ -295,7 +299,7 @@ class Walk:
             ix=ix,
             iy=iy,
             upper=met & upper,
-            side=jnp.where(state & 4 != 0, 1, -1).astype(jnp.int32),
+            side=jnp.where(above, 1, -1).astype(jnp.int32),
             t_near=jnp.where(met, self.t_start + near, 0),
             t_far=jnp.where(met, self.t_start + far, 0),
             steps=steps,
