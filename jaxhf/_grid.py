@@ -87,10 +87,14 @@ def make_grid(
 def corners(values: Float[jax.Array, "ny nx *rest"], ix: Index, iy: Index) -> tuple[jax.Array, ...]:
     """What stands at the vertices 00, 10, 01, 11 of a cell that is in range."""
 
-    def at(column, row):
-        return values.at[row, column].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    ny, nx = values.shape[:2]
+    flat = values.reshape(ny * nx, *values.shape[2:])
+    first = iy * nx + ix
 
-    return at(ix, iy), at(ix + 1, iy), at(ix, iy + 1), at(ix + 1, iy + 1)
+    def at(place):
+        return flat.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+    return at(first), at(first + 1), at(first + nx), at(first + nx + 1)
 
 
 def triangle_plane(z: Float[jax.Array, "ny nx"], ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:

@@ -4,21 +4,25 @@ The walk has said which triangle; the hit is computed again from that triangle's
 arithmetic, so the derivative costs no memory a step and works in forward and in reverse mode.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int
 
+from ._begin import Departure
 from ._cylinder import Tube, tube_distance
 from ._grid import Grid, corners, triangle_plane
+from ._lanes import only_where
 from ._ray import Ray
 from ._settings import Settings
 from ._store import stored
-from ._transform import dot, power_of_two, unit
+from ._transform import dot, finite, largest_component, power_of_two, unit
 from ._traverse import distance, first_hit, occluded
 from ._types import Flag, Index, Point2, Scalar, Vector
-from ._walk import CellHit, Departure, Status
+from ._walk import CellHit, Status
 
 Surface = Grid | Tube
 
@@ -102,7 +106,7 @@ def intersect(
       active: False spares the ray the search: it ends as a miss.
       count_steps: whether to count the steps of the search.
     """
-    valid = jnp.isfinite(ray.o).all() & jnp.isfinite(ray.d).all()
+    valid = finite(ray.o) & finite(ray.d)
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
     if isinstance(surface, Tube):
         return stored(_tube_interaction(surface, ray, origin, active, count_steps), surface.sure)
@@ -115,8 +119,12 @@ def intersect(
         departure=None if origin is None else stored(origin.departure(surface), surface.sure),
         count_steps=count_steps,
     )
-    hit = surface_interaction(surface, local, stored(found, surface.sure))
-    return stored(eqx.tree_at(lambda hit: hit.t, hit, hit.t / scale), surface.sure)
+    found = stored(found, surface.sure)
+    met = found.status == int(Status.HIT)
+    hit = only_where(met, surface_interaction, surface, local, found)
+    t = jnp.where(met, hit.t / scale, jnp.inf)
+    hit = dataclasses.replace(hit, t=t, status=found.status, steps=found.steps)
+    return stored(hit, surface.sure)
 
 
 def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
@@ -126,7 +134,7 @@ def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
     distances can be told from infinite ones, where heights and cells differ by many orders of magnitude.
     """
     local = grid.grid_from_world.ray(ray)
-    size = jnp.max(jnp.abs(local.d))
+    size = largest_component(local.d)
     scale = power_of_two(jnp.where(size > 0, size, 1))
     return stored((Ray(local.o, local.d / scale), scale), grid.sure)
 
@@ -189,7 +197,7 @@ def _shading_normal(grid: Grid, found: CellHit, u: Scalar, v: Scalar, n: Vector)
     mean = n00 + u * per_u + v * per_v
     if grid.object_from_world is not None:
         mean, per_u, per_v = (grid.object_from_world.covector(normal) for normal in (mean, per_u, per_v))
-    largest = lax.stop_gradient(jnp.max(jnp.abs(mean)))
+    largest = lax.stop_gradient(largest_component(mean))
     largest = jnp.where(largest > 0, largest, 1)
     ns = unit(mean)
     length = dot(mean / largest, ns)
@@ -211,7 +219,7 @@ def _orthogonal(per_u: Vector, per_v: Vector, ns: Vector) -> tuple[Vector, Vecto
 def _tube_interaction(tube: Tube, ray: Ray, origin: Origin | None, active: Flag | None, count_steps: bool) -> Hit:
     t, found = tube_distance(tube, ray, None if origin is None else origin.here)
     found = found if active is None else found & active
-    valid = (ray.d != 0).any()
+    valid = largest_component(ray.d) > 0
     t = jnp.where(found, t, 0)
     p = ray(t)
     local = tube.object_from_world.point(p)

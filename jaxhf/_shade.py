@@ -1,5 +1,7 @@
 """Radiance along one ray: direct light, shadows, mirrors."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ from ._cylinder import make_tube
 from ._grid import make_grid
 from ._heightfield import Heightfield
 from ._hit import Hit, Origin, Surface, blocked, intersect
+from ._lanes import only_where
 from ._light import Directional, Light, Point, Sky
 from ._material import Material, Matte, Mirror
 from ._ray import Ray
@@ -140,7 +143,7 @@ def _outgoing(world: World, ray: Ray, vertex: Vertex, active: Flag, settings: Se
     if albedo is not None:
         matte = hit & _is(world, vertex, Matte)
         for light in world.lights:
-            irradiance, more = _irradiance(world, light, vertex, matte, settings)
+            irradiance, more = only_where(matte, functools.partial(_irradiance, settings), world, light, vertex, matte)
             total, exhausted = total + irradiance, exhausted + more
         total = jnp.where(matte, albedo / jnp.pi * total, 0)
     for light in world.lights:
@@ -149,7 +152,7 @@ def _outgoing(world: World, ray: Ray, vertex: Vertex, active: Flag, settings: Se
     return total, exhausted
 
 
-def _irradiance(world: World, light: Light, vertex: Vertex, active: Flag, settings: Settings) -> tuple[Vector, Index]:
+def _irradiance(settings: Settings, world: World, light: Light, vertex: Vertex, active: Flag) -> tuple[Vector, Index]:
     """What arrives at the side of the surface that the ray came from."""
     hit = vertex.hit
     if isinstance(light, Sky):

@@ -5,13 +5,12 @@ import math
 import jax.numpy as jnp
 from jax import lax
 
+from ._begin import Departure, begin
 from ._grid import Grid, triangle_plane
+from ._march import march
 from ._ray import Ray
 from ._types import Flag, Scalar
-from ._walk import CellHit, Departure, Status, Walk, walking
-
-# Blocks that are looked at between two visits to cells.
-_SKIPS = 2
+from ._walk import CellHit, Status
 
 
 def first_hit(
@@ -41,24 +40,10 @@ def first_hit(
       count_steps: whether to count the steps.
     """
     grid, ray, departure, t_max = lax.stop_gradient((grid, ray, departure, t_max))
-    walk = Walk(grid, ray, departure, t_max)
+    walk, state, valid = begin(grid, ray, departure, t_max, active)
     bound = enough_steps(grid)
-    budget = bound if max_steps is None else min(max_steps, bound)
-
-    def going(carry):
-        step, state, _ = carry
-        return (step < budget) & walking(state)
-
-    def advance(carry):
-        step, state, steps = carry
-        if steps is not None:
-            steps = steps + walking(state).astype(jnp.int32)
-        state = lax.fori_loop(0, _SKIPS, lambda _, state: walk.skip(state), state)
-        return step + 1, walk.visit(state), steps
-
-    none = jnp.zeros((), jnp.int32)
-    _, state, steps = lax.while_loop(going, advance, (none, walk.start(active), none if count_steps else None))
-    return walk.finish(state, steps)
+    state, steps = march(walk, state, bound if max_steps is None else min(max_steps, bound), count_steps)
+    return walk.finish(state, valid, steps)
 
 
 def enough_steps(grid: Grid) -> int:

@@ -17,14 +17,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Bool, Float, UInt32
 
-from ._grid import Grid, corners, triangle_plane
-from ._ray import Ray
+from ._grid import corners
+from ._pyramid import Pyramid
+from ._transform import greater, lesser
 from ._types import Flag, Index, Scalar
 
-# Along an axis in which it moves less than 1 / _FAR, a ray counts as standing still; its distance to the next plane there is
+# Along an axis in which it moves less than 1 / FAR, a ray counts as standing still; its distance to the next plane there is
 # then large, but finite in single precision whatever it is multiplied with later.
-_FAR = 1e30
+FAR = 1e30
 
 
 class Status(enum.IntEnum):
@@ -40,28 +42,9 @@ class Status(enum.IntEnum):
 # kernel of its own. From its lowest bit on: the status (2 bits); whether the ray is above the surface; x, with the size of
 # the block; y. The code of x is 2 x + size: the lowest bit that is set in it tells the size, as x is a multiple of it. After
 # a hit, when the size is known to be one cell, that bit says whether it was the upper triangle.
-_MISS, _HIT = int(Status.MISS), int(Status.HIT)
-_WALKING = int(Status.EXHAUSTED)  # what a walk that still goes on ends with when its budget runs out
-_LEAVING = 3  # still in the triangle that the ray starts from
-
-
-class Departure(eqx.Module):
-    """The place on a surface that a ray leaves, so that it cannot meet the same triangle again.
-
-    Attributes:
-      active: False for a ray that starts anywhere else.
-      ix, iy, upper: the triangle.
-      x, y: the point in grid coordinates.
-      side: 1 where the ray leaves on the +z side, else -1.
-    """
-
-    active: Flag
-    ix: Index
-    iy: Index
-    upper: Flag
-    x: Scalar
-    y: Scalar
-    side: Index
+MISS, HIT = int(Status.MISS), int(Status.HIT)
+WALKING = int(Status.EXHAUSTED)  # what a walk that still goes on ends with when its budget runs out
+LEAVING = 3  # still in the triangle that the ray starts from
 
 
 class CellHit(eqx.Module):
@@ -86,91 +69,68 @@ class CellHit(eqx.Module):
     steps: Index | None
 
 
-def walking(state: jax.Array) -> Flag:
-    return (state & 3) >= _WALKING
+def walking(state: UInt32[jax.Array, "*lanes"]) -> Bool[jax.Array, "*lanes"]:
+    """Whether the walk goes on; of one ray or of several."""
+    return (state & 3) >= WALKING
 
 
-class Walk:
-    """The constants of one ray's walk, in the grid's frame, and the steps that it takes."""
+class Walk(eqx.Module):
+    """The constants of one ray's walk and the steps that it takes.
 
-    def __init__(self, grid: Grid, ray: Ray, departure: Departure | None, t_max: Scalar | None):
-        self.z, self.pyramid, self.departure = grid.z, grid.pyramid, departure
-        self.cells_x, self.cells_y = grid.cells
-        self.bits_x = self.pyramid.width.bit_length()  # one more than x needs: for the size
-        if 3 + self.bits_x + (self.pyramid.height - 1).bit_length() > 32:
-            raise ValueError(f"Heightfield: at most 2**28 cells can be traced, heights have shape {grid.z.shape}")
-        o, d = ray.o, ray.d
-        self.valid = jnp.isfinite(o).all() & jnp.isfinite(d).all() & (d != 0).any()
-        self.dx, self.dy, self.dz = d[0], d[1], d[2]
-        self.inv_x, self.inv_y, self.inv_z = _reciprocal(self.dx), _reciprocal(self.dy), _reciprocal(self.dz)
-        self.forward_x, self.forward_y = self.inv_x > 0, self.inv_y > 0
-        self.rate = self.dx - self.dy
-        self.inv_rate = _reciprocal(self.rate)
-        self._enter(grid, o)
-        self.t_end = jnp.where(self.inv_z > 0, grid.z_top - self.z_ray, -self.z_ray) * self.inv_z
-        self.t_max = None if t_max is None else t_max - self.t_start
+    The walk has a frame of its own: the grid's, mirrored so that the ray moves towards +x and +y. As it is mirrored
+    within a width that is a power of two (that of the pyramid), a block stays a block.
 
-    def _enter(self, grid: Grid, o: jax.Array) -> None:
-        """Moves the origin to where the ray enters the surface's box, or to the point that it departs from.
+    Attributes:
+      z, pyramid: the grid's.
+      x, y, z_ray: where the walk begins.
+      dx, dy, dz: the ray's direction.
+      inv_x, inv_y: 1 / dx and 1 / dy, see `reciprocal`.
+      back_x, back_y: whether the axis is mirrored.
+      along_diagonals: the quantity that is constant on a diagonal, at the origin.
+      rate, inv_rate: how fast it changes along the ray.
+      t_start: the ray's t where the walk begins; the walk's own distances count from there.
+      t_end: where the ray leaves the grid's floor or ceiling.
+      t_stop: where it leaves the box, or what it is asked for.
+      ahead: for a ray that departs from a triangle, whether the cell's diagonal may lie before it; None where none does.
+    """
 
-        The far distances are widened by the rounding of the operations behind them, so that no ray along a face is lost
-        (Ize, Robust BVH ray traversal, JCGT 2(2), 2013).
-        """
-        near_x, far_x = _slab(o[0], self.inv_x, self.cells_x)
-        near_y, far_y = _slab(o[1], self.inv_y, self.cells_y)
-        near_z, far_z = _slab(o[2], self.inv_z, grid.z_top)
-        start = jnp.maximum(jnp.maximum(near_x, near_y), jnp.maximum(near_z, 0))
-        wide = 1 + 8 * jnp.finfo(o.dtype).eps
-        self.enters = self.valid & (start <= jnp.minimum(jnp.minimum(far_x, far_y), far_z) * wide)
-        start = jnp.where(self.enters, start, 0)
-        # An ulp inside the far border, so that a ray which stands still on it is in the last cell.
-        inside = 1 - jnp.finfo(o.dtype).epsneg
-        self.x = jnp.clip(o[0] + start * self.dx, 0, self.cells_x * inside)
-        self.y = jnp.clip(o[1] + start * self.dy, 0, self.cells_y * inside)
-        self.z_ray = jnp.clip(o[2] + start * self.dz, 0, grid.z_top)
-        # Came through floor or ceiling: the side is known, whatever the rounding of the height there.
-        self.through_end = ((o[2] < 0) | (o[2] > grid.z_top)) & (start == near_z)
-        if self.departure is not None:
-            away, at = self.departure.active, self.departure
-            a, b, c = triangle_plane(grid.z, at.ix, at.iy, at.upper)
-            height = c + a * (at.x - at.ix.astype(o.dtype)) + b * (at.y - at.iy.astype(o.dtype))
-            self.enters = self.enters | away
-            start = jnp.where(away, 0, start)
-            self.x, self.y = jnp.where(away, at.x, self.x), jnp.where(away, at.y, self.y)
-            self.z_ray = jnp.where(away, height, self.z_ray)
-        self.t_start = start
+    z: Float[jax.Array, "ny nx"]
+    pyramid: Pyramid
+    x: Scalar
+    y: Scalar
+    z_ray: Scalar
+    dx: Scalar
+    dy: Scalar
+    dz: Scalar
+    inv_x: Scalar
+    inv_y: Scalar
+    back_x: Flag
+    back_y: Flag
+    along_diagonals: Scalar
+    rate: Scalar
+    inv_rate: Scalar
+    t_start: Scalar
+    t_end: Scalar
+    t_stop: Scalar
+    ahead: Flag | None
 
-    def start(self, active: Flag | None) -> jax.Array:
-        """The state in which the walk begins; `active` False: it does not begin at all.
+    @property
+    def bits_x(self) -> int:
+        """That x takes in the state: one more than its largest value needs, for the size."""
+        return self.pyramid.width.bit_length()
 
-        By the rule of the walk, planes in x count as crossed at their own distance and planes in y just behind it, so that
-        at a vertex x is crossed first.
-        """
-        column = jnp.where(self.forward_x, jnp.floor(self.x), jnp.ceil(self.x) - 1)
-        row = jnp.where(self.forward_y, jnp.ceil(self.y) - 1, jnp.floor(self.y))
-        ix = jnp.clip(column.astype(jnp.int32), 0, self.cells_x - 1)
-        iy = jnp.clip(row.astype(jnp.int32), 0, self.cells_y - 1)
-        u, v = self.x - ix.astype(self.x.dtype), self.y - iy.astype(self.y.dtype)
-        a, b, c = triangle_plane(self.z, ix, iy, v > u)
-        gap = self.z_ray - (c + a * u + b * v)
-        gap = jnp.where(gap == 0, self.dz - a * self.dx - b * self.dy, gap)  # on the surface: where it goes
-        above = jnp.where(self.through_end, self.dz < 0, gap >= 0)
-        going = self.enters if active is None else self.enters & active
-        status = jnp.where(going, _WALKING, _MISS)
-        if self.departure is not None:
-            away, at = self.departure.active, self.departure
-            ix, iy = jnp.where(away, at.ix, ix), jnp.where(away, at.iy, iy)
-            above = jnp.where(away, at.side > 0, above)
-            status = jnp.where(going & away, _LEAVING, status)
-        return self._pack(status, above, 2 * ix + 1, iy)
+    @property
+    def flip(self) -> tuple[Index, Index]:
+        """A column or row of cells is mirrored by flipping all bits of its number."""
+        return jnp.where(self.back_x, self.pyramid.width - 1, 0), jnp.where(self.back_y, self.pyramid.height - 1, 0)
 
-    def _distance_x(self, plane: Index) -> Scalar:
+    def distance_x(self, plane: Index) -> Scalar:
         return (plane.astype(self.x.dtype) - self.x) * self.inv_x
 
-    def _distance_y(self, plane: Index) -> Scalar:
+    def distance_y(self, plane: Index) -> Scalar:
         return (plane.astype(self.y.dtype) - self.y) * self.inv_y
 
-    def _pack(self, status: jax.Array | int, above: jax.Array, code_x: jax.Array, iy: jax.Array) -> jax.Array:
+    def pack(self, status: jax.Array | int, above: jax.Array, code_x: jax.Array, iy: jax.Array) -> jax.Array:
         def bits(value: jax.Array | int, shift: int) -> jax.Array:
             return jnp.asarray(value).astype(jnp.uint32) << shift
 
@@ -189,9 +149,8 @@ class Walk:
 
     def _passage(self, ix: Index, iy: Index, size: Index) -> tuple[Scalar, Scalar, Scalar]:
         """Distances at which the ray enters the block, and at which it reaches its far planes in x and in y."""
-        x0, x1, y0, y1 = self._distance_x(ix), self._distance_x(ix + size), self._distance_y(iy), self._distance_y(iy + size)
-        near = jnp.maximum(jnp.maximum(jnp.minimum(x0, x1), jnp.minimum(y0, y1)), 0)
-        return near, jnp.maximum(x0, x1), jnp.maximum(y0, y1)
+        near = greater(greater(self.distance_x(ix), self.distance_y(iy)), jnp.zeros_like(self.x))
+        return near, self.distance_x(ix + size), self.distance_y(iy + size)
 
     def skip(self, state: jax.Array) -> jax.Array:
         """One block: passes it where the ray is clear of it, else goes down to the part of it that the ray is in.
@@ -200,104 +159,116 @@ class Walk:
         """
         above, ix, iy, size = self._unpack(state)
         near, out_x, out_y = self._passage(ix, iy, size)
-        out = jnp.minimum(jnp.minimum(out_x, out_y), self.t_end)
-        towards = jnp.where(above, self.dz < 0, self.dz > 0)  # nearest to the surface where it leaves, else where it enters
-        height = self.z_ray + jnp.where(towards, out, near) * self.dz
-        level = 31 - lax.clz(size)
-        clear = jnp.where(above, height, -height) > self.pyramid.bound(above, level, ix, iy)
+        out = lesser(lesser(out_x, out_y), self.t_stop)
+        # If it moves towards the surface, it is nearest to it where it leaves the block, else where it enters.
+        height = self.z_ray + jnp.where(above == (self.dz < 0), out, near) * self.dz
+        flip_x, flip_y = self.flip
+        bound = self.pyramid.bound(above, 31 - lax.clz(size), ix ^ flip_x, iy ^ flip_y)
+        clear = jnp.where(above, height, -height) > bound
         onwards = self._onwards(above, ix, iy, size, out_x, out_y)
         inside = state
         if self.pyramid.levels:
             half = size >> 1
-            far_x = (self._distance_x(ix + half) <= near) == self.forward_x
-            far_y = (self._distance_y(iy + half) < near) == self.forward_y
-            part_x, part_y = ix + jnp.where(far_x, half, 0), iy + jnp.where(far_y, half, 0)
-            # A part beyond the border is entered only by a ray that has left the footprint.
-            gone = (part_x >= self.cells_x) | (part_y >= self.cells_y)
-            part = self._pack(jnp.where(gone, _MISS, _WALKING), above, 2 * part_x + half, part_y)
+            part_x = jnp.where(self.distance_x(ix + half) <= near, ix + half, ix)
+            part_y = jnp.where(self.distance_y(iy + half) < near, iy + half, iy)
+            part = self.pack(WALKING, above, 2 * part_x + half, part_y)
             inside = jnp.where(size > 1, part, state)
-        return jnp.where((state & 3) == _WALKING, jnp.where(clear, onwards, inside), state)
+        return jnp.where((state & 3) == WALKING, jnp.where(clear, onwards, inside), state)
 
     def visit(self, state: jax.Array) -> jax.Array:
         """One cell: looks for a change of sign at its diagonal and at its exit, else moves on; larger blocks are left alone."""
         above, ix, iy, size = self._unpack(state)
         near, out_x, out_y = self._passage(ix, iy, size)
-        x, y = ix.astype(self.x.dtype), iy.astype(self.y.dtype)
-        z00, z10, z01, z11 = corners(self.z, jnp.minimum(ix, self.cells_x - 1), jnp.minimum(iy, self.cells_y - 1))
+        flip_x, flip_y = self.flip
+        z00, z10, z01, z11 = corners(self.z, ix ^ flip_x, iy ^ flip_y)
         whole = jnp.isfinite(z00 + z10 + z01 + z11)
         through_x = out_x <= out_y
-        out = jnp.minimum(out_x, out_y)
+        out = lesser(out_x, out_y)
         last = self.t_end <= out
-        out = jnp.minimum(out, self.t_end)
+        out = lesser(out, self.t_end)
         across, diagonal = self._diagonal(ix, iy)
         crosses = (near < diagonal) & (diagonal < out)
         on_own, skip_out = jnp.zeros((), bool), jnp.zeros((), bool)
-        if self.departure is not None:
-            leaving = (state & 3) == _LEAVING
-            ahead = jnp.where(self.departure.upper, self.rate > 0, self.rate < 0) & (diagonal < out)
-            crosses = jnp.where(leaving, ahead, crosses)
+        if self.ahead is not None:
+            leaving = (state & 3) == LEAVING
+            crosses = jnp.where(leaving, self.ahead & (diagonal < out), crosses)
             on_own, skip_out = leaving & crosses, leaving & ~crosses
 
-        # The edge of the exit: its lower and upper end, and how far along the ray crosses it.
-        low = jnp.where(through_x, jnp.where(self.forward_x, z10, z00), jnp.where(self.forward_y, z01, z00))
-        high = jnp.where(through_x, jnp.where(self.forward_x, z11, z01), jnp.where(self.forward_y, z11, z10))
-        along = jnp.where(through_x, self.y + out * self.dy - y, self.x + out * self.dx - x)
-        gap_out = self._gap(out, low, high, along)
+        def along(t: Scalar) -> tuple[Scalar, Scalar]:
+            """Where the ray is in the cell, in the grid's frame."""
+            u = self.x + t * self.dx - ix.astype(self.x.dtype)
+            v = self.y + t * self.dy - iy.astype(self.y.dtype)
+            return jnp.where(self.back_x, 1 - u, u), jnp.where(self.back_y, 1 - v, v)
+
+        # The edge of the exit: its ends, and how far along the ray crosses it.
+        u, v = along(out)
+        low = jnp.where(through_x, jnp.where(self.back_x, z00, z10), jnp.where(self.back_y, z00, z01))
+        high = jnp.where(through_x, jnp.where(self.back_x, z01, z11), jnp.where(self.back_y, z10, z11))
+        gap_out = self._gap(out, low, high, jnp.where(through_x, v, u))
         gap_out = jnp.where(last, self.dz, gap_out)  # below the lowest height or above the highest: no rounding can hide it
-        gap_diagonal = self._gap(diagonal, z00, z11, self.x + diagonal * self.dx - x)
+        gap_diagonal = self._gap(diagonal, z00, z11, along(diagonal)[0])
         met_first = crosses & ~on_own & _opposite(above, gap_diagonal)
         met = whole & (met_first | (~skip_out & _opposite(above, gap_out)))
-        above_diagonal = (near + out) / 2 * self.rate < across
-        upper = jnp.where(crosses, jnp.where(met_first, self.rate > 0, self.rate < 0), above_diagonal)
+        # A diagonal that is not crossed: which side of it the ray is on.
+        before = (near + out) / 2 * self.rate < across
+        upper = jnp.where(crosses, met_first == (self.rate > 0), before) != self.back_x
 
         above = jnp.where(whole, above, gap_out >= 0)  # behind a hole the side is found anew
         onwards = self._onwards(above, ix, iy, size, out_x, out_y)
-        hit = self._pack(_HIT, above, 2 * ix + upper.astype(jnp.int32), iy)
+        hit = self.pack(HIT, above, 2 * ix + upper.astype(jnp.int32), iy)
         return jnp.where(walking(state) & (size == 1), jnp.where(met, hit, onwards), state)
+
+    @property
+    def begins_upper(self) -> Flag:
+        """Whether the ray goes from the upper to the lower triangle where it crosses a diagonal."""
+        return (self.rate > 0) != self.back_x
 
     def _onwards(self, above: Flag, ix: Index, iy: Index, size: Index, out_x: Scalar, out_y: Scalar) -> jax.Array:
         """The state in the next block; in one of twice the size where the ray also leaves this block's parent."""
         through_x = out_x <= out_y
-        next_x = ix + jnp.where(through_x, jnp.where(self.forward_x, size, -size), 0)
-        next_y = iy + jnp.where(through_x, 0, jnp.where(self.forward_y, size, -size))
-        out = jnp.minimum(out_x, out_y)
-        leaves = (self.t_end <= out) | (next_x < 0) | (next_x >= self.cells_x) | (next_y < 0) | (next_y >= self.cells_y)
-        if self.t_max is not None:
-            leaves = leaves | (out > self.t_max)
+        next_x, next_y = jnp.where(through_x, ix + size, ix), jnp.where(through_x, iy, iy + size)
+        leaves = self.t_stop <= lesser(out_x, out_y)
         if self.pyramid.levels:
-            plane = jnp.where(through_x, jnp.where(self.forward_x, next_x, ix), jnp.where(self.forward_y, next_y, iy))
+            plane = jnp.where(through_x, next_x, next_y)
             grows = ((plane & size) == 0) & (size < (1 << self.pyramid.levels))
             size = jnp.where(grows, 2 * size, size)
             next_x, next_y = next_x & -size, next_y & -size
-        code, row = jnp.where(leaves, 1, 2 * next_x + size), jnp.where(leaves, 0, next_y)
-        return self._pack(jnp.where(leaves, _MISS, _WALKING), above, code, row)
+        return jnp.where(
+            leaves,
+            self.pack(MISS, above, jnp.ones_like(ix), jnp.zeros_like(iy)),
+            self.pack(WALKING, above, 2 * next_x + size, next_y),
+        )
 
     def _diagonal(self, ix: Index, iy: Index) -> tuple[Scalar, Scalar]:
-        """How far the cell's diagonal lies from the origin along x - y, and the distance at which the ray crosses it."""
-        across = (ix - iy).astype(self.x.dtype) - (self.x - self.y)
+        """How far the cell's diagonal lies from the origin, and the distance at which the ray crosses it."""
+        turned = jnp.where(self.back_x != self.back_y, -1, 0)
+        line = ix - (iy ^ turned)  # x - y = ix - iy, or x + y = ix + iy + 1
+        across = line.astype(self.x.dtype) - self.along_diagonals
         return across, across * self.inv_rate
 
     def _gap(self, t: Scalar, low: Scalar, high: Scalar, along: Scalar) -> Scalar:
         """g at the crossing of an edge; relative to the ray's own height first, so that a flat surface leaves no rounding."""
-        return t * self.dz - ((low - self.z_ray) + jnp.clip(along, 0, 1) * (high - low))
+        along = lesser(greater(along, jnp.zeros_like(along)), jnp.ones_like(along))
+        return t * self.dz - ((low - self.z_ray) + along * (high - low))
 
-    def finish(self, state: jax.Array, steps: Index | None) -> CellHit:
-        met = (state & 3) == _HIT
+    def finish(self, state: jax.Array, valid: Flag, steps: Index | None) -> CellHit:
+        met = (state & 3) == HIT
         above, code, iy = self._fields(state)
         ix, iy = jnp.where(met, code >> 1, 0), jnp.where(met, iy, 0)
         near, out_x, out_y = self._passage(ix, iy, jnp.ones_like(ix))
-        far = jnp.maximum(jnp.minimum(jnp.minimum(out_x, out_y), self.t_end), near)
+        far = greater(lesser(lesser(out_x, out_y), self.t_end), near)
         # Within its triangle, that is, on its side of the diagonal where that is crossed: a ray that grazes the triangle's
         # plane could otherwise be anywhere in the cell.
         upper = code & 1 != 0
         _, diagonal = self._diagonal(ix, iy)
-        crosses, before = (near < diagonal) & (diagonal < far), upper == (self.rate > 0)
+        crosses, before = (near < diagonal) & (diagonal < far), upper == self.begins_upper
         near, far = jnp.where(crosses & ~before, diagonal, near), jnp.where(crosses & before, diagonal, far)
-        ended = jnp.where(walking(state), _WALKING, (state & 3).astype(jnp.int32))
+        ended = jnp.where(walking(state), WALKING, (state & 3).astype(jnp.int32))
+        flip_x, flip_y = self.flip
         return CellHit(
-            status=jnp.where(self.valid, ended, int(Status.INVALID)).astype(jnp.int32),
-            ix=ix,
-            iy=iy,
+            status=jnp.where(valid, ended, int(Status.INVALID)).astype(jnp.int32),
+            ix=jnp.where(met, ix ^ flip_x, 0),
+            iy=jnp.where(met, iy ^ flip_y, 0),
             upper=met & upper,
             side=jnp.where(above, 1, -1).astype(jnp.int32),
             t_near=jnp.where(met, self.t_start + near, 0),
@@ -311,15 +282,6 @@ def _opposite(above: Flag, gap: Scalar) -> Flag:
     return jnp.where(above, gap < 0, gap > 0)
 
 
-def _reciprocal(d: Scalar) -> Scalar:
-    still = jnp.abs(d) < 1 / _FAR
-    return jnp.where(still, _FAR, 1 / jnp.where(still, 1, d))
-
-
-def _slab(o: Scalar, inverse: Scalar, high: Scalar | int) -> tuple[Scalar, Scalar]:
-    """Distances between which a ray is in 0 <= coordinate <= high; (inf, -inf) where it never is."""
-    a, b = -o * inverse, (high - o) * inverse
-    still, inside = inverse == _FAR, (o >= 0) & (o <= high)
-    near = jnp.where(still, jnp.where(inside, -jnp.inf, jnp.inf), jnp.minimum(a, b))
-    far = jnp.where(still, jnp.where(inside, jnp.inf, -jnp.inf), jnp.maximum(a, b))
-    return near, far
+def reciprocal(d: Scalar) -> Scalar:
+    still = jnp.abs(d) < 1 / FAR
+    return jnp.where(still, FAR, 1 / jnp.where(still, 1, d))

@@ -8,9 +8,9 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "jaxhf"
 # Along the flow: a module imports only from modules before it.
 FLOW = (
-    "_types", "_store", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film",
+    "_types", "_store", "_lanes", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film",
     "_heightfield", "_pyramid", "_grid",
-    "_cylinder", "_scene", "_walk", "_traverse", "_hit", "_shade", "_render", "io", "__init__", "__main__",
+    "_cylinder", "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade", "_render", "io", "__init__", "__main__",
 )  # fmt: skip
 
 
@@ -42,8 +42,11 @@ def test_imports_follow_the_flow(path):
 
 
 def test_rays_are_batched_and_compiled_in_one_place():
+    """Besides, two modules say what `vmap` is to make of a function of one ray."""
+    rules = ("_lanes", "_march")
     for path in PACKAGE.rglob("*.py"):
         if _stage(path) != "_render":
             text = path.read_text()
-            for word in ("jax.vmap", "jax.jit", "lax.map(", "shard_map"):
+            assert ("custom_vmap" in text) == (_stage(path) in rules)
+            for word in ("jax.jit", "shard_map") if _stage(path) in rules else ("jax.vmap", "jax.jit", "lax.map(", "shard_map"):
                 assert word not in text, f"{path.name} has {word}"
