@@ -4,7 +4,7 @@ from ._heightfield import Heightfield as Heightfield, vertex_normals as vertex_n
 from ._hit import Hit as Hit
 from ._light import Directional as Directional, Point as Point, Sky as Sky
 from ._material import Matte as Matte, Mirror as Mirror
-from ._render import AOVS as AOVS, cast as cast, render as render
+from ._render import AOVS as AOVS, Prepared as Prepared, cast as cast, prepare as prepare, render as render
 from ._scene import Object as Object, Scene as Scene
 from ._settings import Settings as Settings
 from ._texture import ImageTexture as ImageTexture

@@ -19,7 +19,7 @@ from ._film import grid_side, sample_offset
 from ._heightfield import Heightfield
 from ._hit import Hit, intersect
 from ._ray import Ray
-from ._scene import Scene, localise
+from ._scene import Scene, localise, localise_camera
 from ._settings import Settings
 from ._shade import Vertex, World, first_vertex, in_shadow, make_surface, make_world, radiance
 from ._store import stored
@@ -34,8 +34,31 @@ over all objects. exhausted: walks that ran out of steps, over all samples of th
 """
 
 
+class Prepared(eqx.Module):
+    """A scene of which all is done that does not depend on the camera; `prepare` makes it, `render` takes it.
+
+    Attributes:
+      scene: as it was given, with the camera that is to see it.
+      settings: those for which it was prepared.
+    """
+
+    scene: Scene
+    settings: Settings = eqx.field(static=True)
+    _world: World
+
+    def with_camera(self, camera: Camera) -> "Prepared":
+        """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, camera=camera))
+
+
+def prepare(scene: Scene, settings: Settings = Settings()) -> Prepared:
+    """Takes the normals and the bounds of the heights once, for many pictures of the same terrain in the same light."""
+    settings = settle(settings, scene)
+    return Prepared(scene, settings, _make_world(_on_every_device(localise(scene)), settings=settings))
+
+
 def render(
-    scene: Scene,
+    scene: Scene | Prepared,
     settings: Settings = Settings(),
     *,
     aovs: Sequence[str] = (),
@@ -50,7 +73,7 @@ def render(
     Args:
       scene: what to see. Values that are NumPy or Python numbers keep double precision until the origin has been moved to
         the terrain; the rest is computed in the precision of the (first) heightfield's heights.
-      settings: the knobs.
+      settings: the knobs; those of a `Prepared` scene stay what they are.
       aovs: names out of `AOVS`.
       progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
 
@@ -58,15 +81,25 @@ def render(
       Linear radiance, shape (h, w, 3), top row first; with `aovs` that and a dict of them.
 
     Raises:
-      ValueError: an unknown AOV.
+      ValueError: an unknown AOV, or settings for a scene that was prepared with others.
     """
     aovs = tuple(aovs)
     for name in aovs:
         if name not in AOVS:
             raise ValueError(f"render: aovs must be among {', '.join(AOVS)}; one is {name!r}")
-    settings = settle(settings, scene)
-    local = _on_every_device(localise(scene))
-    outputs = _trace_all(local, settings, aovs) if progress is None else _trace_in_parts(local, settings, aovs, progress)
+    if not isinstance(scene, Prepared) and progress is not None:
+        scene, settings = prepare(scene, settings), Settings()
+    if isinstance(scene, Prepared):
+        if settings != Settings() and settle(settings, scene.scene) != scene.settings:
+            raise ValueError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
+        settings, world = scene.settings, scene._world
+        camera = _on_every_device(localise_camera(scene.scene.camera, scene.scene))
+        if progress is None:
+            outputs = _trace_prepared(world, camera, settings, aovs)
+        else:
+            outputs = _trace_in_parts(world, camera, settings, aovs, progress)
+    else:
+        outputs = _trace_all(_on_every_device(localise(scene)), settle(settings, scene), aovs)
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -98,10 +131,16 @@ class _Tiling:
 
 @functools.partial(jax.jit, static_argnames=("settings", "aovs"))
 def _trace_all(scene: Scene, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
-    tiling = _Tiling(scene.camera, settings)
-    world = make_world(scene, settings)
-    tiles = _over_devices(world, scene.camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
+    return _trace_world(make_world(scene, settings), scene.camera, settings, aovs)
+
+
+def _trace_world(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
+    tiling = _Tiling(camera, settings)
+    tiles = _over_devices(world, camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
     return jax.tree.map(tiling.assemble, tiles)
+
+
+_trace_prepared = jax.jit(_trace_world, static_argnames=("settings", "aovs"))
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "aovs"))
@@ -114,9 +153,9 @@ def _mesh() -> Mesh:
     return jax.make_mesh((len(devices),), ("tiles",), axis_types=(AxisType.Auto,), devices=devices)
 
 
-def _on_every_device(scene: Scene) -> Scene:
-    """Copies the scene to each device of this process, wherever the caller has put it."""
-    return scene if jax.local_device_count() == 1 else jax.device_put(scene, NamedSharding(_mesh(), P()))
+def _on_every_device(tree: Any) -> Any:
+    """Copies a scene or a part of it to each device of this process, wherever the caller has put it."""
+    return tree if jax.local_device_count() == 1 else jax.device_put(tree, NamedSharding(_mesh(), P()))
 
 
 def _over_devices(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]):
@@ -150,16 +189,17 @@ def _over_devices(world: World, camera: Camera, settings: Settings, aovs: tuple[
 _make_world = jax.jit(make_world, static_argnames=("settings",))
 
 
-def _trace_in_parts(scene: Scene, settings: Settings, aovs: tuple[str, ...], progress: Callable[[int, int], None]):
+def _trace_in_parts(
+    world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], progress: Callable[[int, int], None]
+):
     """As `_trace_all`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
-    tiling = _Tiling(scene.camera, settings)
-    world = _make_world(scene, settings=settings)
+    tiling = _Tiling(camera, settings)
     size = math.ceil(tiling.count / 64)
     pixels = tiling.width * tiling.height
     parts = []
     for first in range(0, tiling.count, size):
         tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
-        parts.append(jax.device_get(_trace_tiles(world, scene.camera, settings, aovs, jnp.asarray(tiles, jnp.int32))))
+        parts.append(jax.device_get(_trace_tiles(world, camera, settings, aovs, jnp.asarray(tiles, jnp.int32))))
         progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
     return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)
 

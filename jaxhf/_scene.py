@@ -117,13 +117,21 @@ def localise(scene: Scene) -> Scene:
     def moved_light(light: Light) -> Light:
         return Point(light.p - _like(light.p, anchor), light.intensity) if isinstance(light, Point) else light
 
-    camera_matrix = _shifted(scene.camera.world_from_camera, -_like(scene.camera.world_from_camera, anchor))
     moved = Scene(
         objects=tuple(moved_object(obj) for obj in scene.objects),
-        camera=eqx.tree_at(lambda camera: camera.world_from_camera, scene.camera, camera_matrix),
+        camera=scene.camera,
         lights=tuple(moved_light(light) for light in scene.lights),
         samples=scene.samples,
     )
+    dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
+    moved = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), moved)
+    return eqx.tree_at(lambda moved: moved.camera, moved, localise_camera(scene.camera, scene))
+
+
+def localise_camera(camera: Camera, scene: Scene) -> Camera:
+    """A camera for `localise(scene)`."""
+    matrix = camera.world_from_camera
+    moved = eqx.tree_at(lambda camera: camera.world_from_camera, camera, _shifted(matrix, -_like(matrix, _anchor(scene))))
     dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), moved)
 
