@@ -100,18 +100,9 @@ def radiance(world: World, ray: Ray, settings: Settings) -> tuple[Vector, Index]
 
     def bounce(carry, _):
         ray, origin, throughput, total, active, exhausted = carry
-        vertex = first_vertex(world, ray, settings, origin, active)
-        out_of_steps = active & (vertex.hit.status == int(Status.EXHAUSTED))
-        light, more = _outgoing(world, ray, vertex, active & ~out_of_steps, settings)
-        mirrored, reflectance = _mirrored(world, vertex)
-        carry = (
-            Ray(vertex.hit.p, _reflect(ray.d, vertex.hit)),
-            vertex,
-            throughput * reflectance,
-            total + throughput * light,
-            active & mirrored,
-            exhausted + more + _count(out_of_steps),
-        )
+        reached = only_where(active, functools.partial(_bounce, settings), world, ray, origin, active)
+        mirrored_ray, vertex, reflectance, light, goes_on, more = reached
+        carry = mirrored_ray, vertex, throughput * reflectance, total + throughput * light, goes_on, exhausted + more
         return carry, None
 
     dtype = ray.d.dtype
@@ -119,6 +110,23 @@ def radiance(world: World, ray: Ray, settings: Settings) -> tuple[Vector, Index]
     init = (ray, _nowhere(dtype), jnp.ones(3, dtype), jnp.zeros(3, dtype), jnp.ones((), bool), none)
     (_, _, _, total, _, exhausted), _ = lax.scan(bounce, init, length=settings.max_depth + 1)
     return total, exhausted
+
+
+def _bounce(
+    settings: Settings, world: World, ray: Ray, origin: Vertex, active: Flag
+) -> tuple[Ray, Vertex, Vector, Vector, Flag, Index]:
+    """Follows `ray` to where it arrives.
+
+    Returns:
+      The mirrored ray, where it starts, and by how much it weighs less; the light from there; whether to go on; how many
+      walks ran out of steps.
+    """
+    vertex = first_vertex(world, ray, settings, origin, active)
+    out_of_steps = active & (vertex.hit.status == int(Status.EXHAUSTED))
+    light, exhausted = _outgoing(world, ray, vertex, active & ~out_of_steps, settings)
+    mirrored, reflectance = _mirrored(world, vertex)
+    onwards = Ray(vertex.hit.p, _reflect(ray.d, vertex.hit))
+    return onwards, vertex, reflectance, light, active & mirrored, exhausted + _count(out_of_steps)
 
 
 def _count(flag: Flag) -> Index:

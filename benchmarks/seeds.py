@@ -1,0 +1,89 @@
+"""Times the seed scenes at their own sample counts, on one core and on all, against stock pbrt-v2 where its program is given.
+
+The scenes lie in a folder of .pbrt files. `--pbrt` names the program of pbrt-v2 (github.com/mmp/pbrt-v2, built with OpenEXR);
+it then renders each scene in the same run, in turn with ours, on the same cores. Its time is what it says of its
+rendering phase, without reading the scene and building its hierarchy; ours is a warm frame with the normals and bounds of
+the heights in it. Ours is also shown with what comes before the first frame: reading and compiling.
+"""
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+SCENES = ("hftest", "landsea-0", "landsea-1", "landsea-2", "texture", "landsea-big")
+
+
+def serve(folder: Path, name: str, devices: int) -> None:
+    """Renders a frame for every line that is read, and prints its seconds; the first line printed is the first frame's."""
+    import jax
+
+    import jaxhf
+
+    jax.config.update("jax_num_cpu_devices", devices)
+    begin = time.perf_counter()
+    scene = jaxhf.load_scene(folder / f"{name}.pbrt")
+    jax.block_until_ready(jaxhf.render(scene))
+    print(time.perf_counter() - begin, flush=True)
+    for _ in sys.stdin:
+        begin = time.perf_counter()
+        jax.block_until_ready(jaxhf.render(scene))
+        print(time.perf_counter() - begin, flush=True)
+
+
+def pbrt(program: str, scene: Path, cores: set[int]) -> float:
+    """Seconds that pbrt-v2 takes to render, by its own progress line, which has one decimal."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [program, "--ncores", str(len(cores)), "--outfile", f"{folder}/out.tga", str(scene.resolve())]
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=True, cwd=folder, preexec_fn=lambda: os.sched_setaffinity(0, cores)
+        )
+    said = re.findall(r"Rendering: \[\++\]\s+\(([\d.]+)s\)", done.stdout)
+    assert said, f"{scene.name}: pbrt gave no time: {done.stdout[-300:]}{done.stderr[-300:]}"
+    return float(said[-1])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="where the .pbrt scenes lie")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--pbrt", help="the program of pbrt-v2")
+    parser.add_argument("--serve", metavar="SCENE", help=argparse.SUPPRESS)
+    parser.add_argument("--devices", type=int, default=1, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.serve:
+        serve(options.folder, options.serve, options.devices)
+        return
+    everything = os.sched_getaffinity(0)
+    for name in options.scenes:
+        for cores in ({min(everything)}, everything):
+            command = [sys.executable, __file__, str(options.folder), "--serve", name, "--devices", str(len(cores))]
+            with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as ours:
+                assert ours.stdin is not None
+                assert ours.stdout is not None
+                os.sched_setaffinity(ours.pid, cores)
+                first = float(ours.stdout.readline())
+                times, theirs = [], []
+                for _ in range(options.repeats):
+                    ours.stdin.write("\n")
+                    ours.stdin.flush()
+                    times.append(float(ours.stdout.readline()))
+                    if options.pbrt:
+                        theirs.append(pbrt(options.pbrt, options.folder / f"{name}.pbrt", cores))
+                ours.stdin.close()
+            line = f"{name:12s} {len(cores)} cores   first {first:5.1f} s   frame {np.median(times):6.3f} s"
+            if theirs:
+                ratio = np.median(np.array(times) / np.array(theirs))
+                line += f"   pbrt-v2 {np.median(theirs):5.2f} s   ratio {ratio:5.2f}"
+            print(line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
