@@ -15,6 +15,17 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 from jaxtyping import Float, Int
 
 from ._camera import Camera
+from ._edges import (
+    EdgePoint,
+    cast_shadow,
+    draw,
+    make_crossing,
+    make_lottery,
+    picture_point,
+    plain_weights,
+    sources,
+    with_tangent,
+)  # fmt: skip
 from ._film import grid_side, sample_offset
 from ._heightfield import Heightfield
 from ._hit import Hit, intersect
@@ -40,6 +51,7 @@ def render(
     *,
     aovs: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
+    key: jax.Array | None = None,
 ) -> Any:
     """Renders a picture.
 
@@ -53,6 +65,8 @@ def render(
       settings: the knobs.
       aovs: names out of `AOVS`.
       progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
+      key: of JAX's random numbers, for what is sampled: the points on edges, if the settings ask for them. The same key
+        gives the same derivative; None stands for a fixed one.
 
     Returns:
       Linear radiance, shape (h, w, 3), top row first; with `aovs` that and a dict of them.
@@ -66,7 +80,11 @@ def render(
             raise ValueError(f"render: aovs must be among {', '.join(AOVS)}; one is {name!r}")
     settings = settle(settings, scene)
     local = _on_every_device(localise(scene))
-    outputs = _trace_all(local, settings, aovs) if progress is None else _trace_in_parts(local, settings, aovs, progress)
+    if progress is None:
+        key = (jax.random.key(0) if key is None else key) if settings.edge_samples else None
+        outputs = _trace_all(local, settings, aovs, key)
+    else:
+        outputs = _trace_in_parts(local, settings, aovs, progress)
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -97,11 +115,48 @@ class _Tiling:
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "aovs"))
-def _trace_all(scene: Scene, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
+def _trace_all(scene: Scene, settings: Settings, aovs: tuple[str, ...], key: jax.Array | None = None) -> dict[str, jax.Array]:
     tiling = _Tiling(scene.camera, settings)
     world = make_world(scene, settings)
     tiles = _over_devices(world, scene.camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
-    return jax.tree.map(tiling.assemble, tiles)
+    outputs = jax.tree.map(tiling.assemble, tiles)
+    if key is not None and sources(world, settings):
+        outputs["image"] = with_tangent(outputs["image"], _boundaries(world, scene.camera, settings, key))
+    return outputs
+
+
+def _boundaries(world: World, camera: Camera, settings: Settings, key: jax.Array) -> Float[jax.Array, "h w 3"]:
+    """An image that means nothing, but whose derivative is that which moving boundaries add to the picture's."""
+    still_world, still_camera = lax.stop_gradient((world, camera))
+    weights = plain_weights(still_world, still_camera, settings)
+    draws = settings.edge_samples
+    lottery = make_lottery(weights, draws)
+
+    def one(k: jax.Array, u: jax.Array):
+        point = cast_shadow(still_world, draw(still_world, still_camera, settings, lottery, k, u), settings)
+        return point, make_crossing(still_world, still_camera, settings, point)
+
+    @jax.checkpoint
+    def carry(world: World, camera: Camera, point: EdgePoint, flow: jax.Array):
+        x, _ = picture_point(world, camera, settings, point, point.s)
+        return flow[:, 0] * x[0] + flow[:, 1] * x[1]
+
+    size = min(settings.chunk, draws)
+
+    def chunk(number: jax.Array):
+        u = jax.random.uniform(jax.random.fold_in(key, number), (size, 2), still_camera.world_from_camera.dtype)
+        k = number * size + jnp.arange(size, dtype=jnp.int32)
+        point, crossing = jax.vmap(one)(k, u)
+        light, _ = jax.vmap(jax.vmap(lambda ray: radiance(still_world, ray, settings)))(crossing.rays)
+        jump = light[:, 0] - light[:, 1]
+        flow = jnp.where(crossing.valid, point.measure, 0)[:, None, None] * jump[:, :, None] * crossing.across[:, None, :]
+        column, row = (crossing.x[:, axis].astype(jnp.int32) for axis in (0, 1))
+        pixel = row * camera.width + column
+        return pixel, jax.vmap(carry, in_axes=(None, None, 0, 0))(world, camera, point, lax.stop_gradient(flow))
+
+    pixel, light = lax.map(chunk, jnp.arange(math.ceil(draws / size), dtype=jnp.int32))
+    image = jnp.zeros((camera.height * camera.width, 3), light.dtype)
+    return image.at[pixel.ravel()].add(light.reshape(-1, 3)).reshape(camera.height, camera.width, 3)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "aovs"))

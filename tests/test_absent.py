@@ -125,7 +125,7 @@ FEATURES: dict[str, tuple[Case, Case, list[Change]]] = {
     "mirror": (
         PLAIN,
         Case(scene(jaxhf.Object(FIELD, jaxhf.Mirror()))),
-        [fails_everywhere(_shade._reflect), fails_everywhere(_shade._mirrored), fails_everywhere(_shade._nowhere)],
+        [fails_everywhere(_shade._reflect), fails_everywhere(_shade._mirrored), fails_everywhere(_shade.nowhere)],
     ),
     "cylinder": (
         PLAIN,

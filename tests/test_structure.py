@@ -10,7 +10,8 @@ PACKAGE = Path(__file__).parents[1] / "jaxhf"
 FLOW = (
     "_types", "_store", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film",
     "_heightfield", "_pyramid", "_grid",
-    "_cylinder", "_scene", "_walk", "_traverse", "_hit", "_shade", "_render", "io", "__init__", "__main__",
+    "_cylinder", "_scene", "_walk", "_traverse", "_hit", "_shade",
+    "_silhouette", "_edges", "_render", "io", "__init__", "__main__",
 )  # fmt: skip
 
 
