@@ -65,7 +65,9 @@ def sources(world: World, settings: Settings) -> tuple[Source, ...]:
     found, first = [], 0
     casting = [number for number, light in enumerate(world.lights) if not isinstance(light, Sky)] if settings.shadows else []
     for k, surface in enumerate(world.surfaces):
-        for light in (None, *casting) if isinstance(surface, Grid) else ():
+        if not isinstance(surface, Grid):
+            continue
+        for light in (None, *casting):
             ny, nx = surface.z.shape
             found.append(Source(k, light, first, ny, nx))
             first = found[-1].end
@@ -317,8 +319,8 @@ def _between_ends(point: EdgePoint, s: Scalar) -> tuple[Scalar, Scalar]:
     return a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1])
 
 
-def _on_edge(world: World, point: EdgePoint, s: Scalar) -> Vector:
-    """World frame; differentiable in the heights and in the transform."""
+def _on_edge(world: World, point: EdgePoint, s: Scalar, lift: Scalar | None = None) -> Vector:
+    """World frame, `lift` above the edge (in the grid's frame); differentiable in the heights and in the transform."""
     chosen = None
     for k, grid in enumerate(world.surfaces):
         if isinstance(grid, Grid):
@@ -329,7 +331,8 @@ def _on_edge(world: World, point: EdgePoint, s: Scalar) -> Vector:
 
             x, y = _between_ends(point, s)
             z0, z1 = height(point.start), height(point.end)
-            p = grid.world_from_grid.point(jnp.stack([x, y, z0 + s * (z1 - z0)]))
+            z = z0 + s * (z1 - z0)
+            p = grid.world_from_grid.point(jnp.stack([x, y, z if lift is None else z + lift]))
             chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
     assert chosen is not None
     return chosen
@@ -367,12 +370,14 @@ def _fallen(world: World, point: EdgePoint, p: Vector) -> Vector:
     return landed
 
 
-def picture_point(world: World, camera: Camera, settings: Settings, point: EdgePoint, s: Scalar) -> tuple[Point2, Flag]:
+def picture_point(
+    world: World, camera: Camera, settings: Settings, point: EdgePoint, s: Scalar, lift: Scalar | None = None
+) -> tuple[Point2, Flag]:
     """Where the point, or its shadow, is in the picture, and whether within its frame; differentiable.
 
     In every leaf of the scene, and in s while the shadow stays in its triangle.
     """
-    p = _on_edge(world, point, s)
+    p = _on_edge(world, point, s, lift)
     if any(source.light is not None for source in sources(world, settings)):
         p = jnp.where(point.light >= 0, _fallen(world, point, p), p)
     at = camera.film_from_world()(p)
@@ -390,12 +395,14 @@ class Crossing(eqx.Module):
       x: pixels from the top left corner.
       across: normal to the boundary, of the length by which the place moves with s.
       sides: the places x - eps n and x + eps n, n being the unit normal.
+      speed: at which the boundary moves in the picture as the edge is lifted, pixels by the grid's unit of height.
     """
 
     valid: Flag
     x: Point2
     across: Point2
     sides: Float[jax.Array, "2 2"]
+    speed: Scalar
 
 
 def make_crossing(world: World, camera: Camera, settings: Settings, point: EdgePoint) -> Crossing:
@@ -407,8 +414,15 @@ def make_crossing(world: World, camera: Camera, settings: Settings, point: EdgeP
     valid = valid & (length > 0) & jnp.isfinite(length)
     x = jnp.where(valid, x, 0)
     across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
-    step = across / jnp.where(valid, length, 1) * side_step(camera, x.dtype)
-    return Crossing(valid, x, across, jnp.stack([x - step, x + step]))
+    n = across / jnp.where(valid, length, 1)
+    step = n * side_step(camera, x.dtype)
+
+    def lifted(lift: Scalar) -> Point2:
+        return picture_point(world, camera, settings, point, point.s, lift)[0]
+
+    _, motion = jax.jvp(lifted, (jnp.zeros_like(point.s),), (jnp.ones_like(point.s),))
+    speed = jnp.abs(n[0] * motion[0] + n[1] * motion[1])
+    return Crossing(valid, x, across, jnp.stack([x - step, x + step]), jnp.where(valid & jnp.isfinite(speed), speed, 0))
 
 
 def side_ray(camera: Camera, crossing: Crossing, side: Point2) -> Ray:

@@ -182,8 +182,12 @@ def _draw_edges(world: World, camera: Camera, settings: Settings, key: jax.Array
         drawn = lax.map(lambda each: chunk(lottery, *each), (keys, firsts))
 
         def refined(weights: jax.Array) -> jax.Array:
-            points, _, flows = drawn
+            points, crossings, flows = drawn
             sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(2, 3)))
+            # By how much the pixel changes as the edge is lifted; and, for what moves it otherwise, as if all had one speed.
+            total = jnp.sum(sizes)
+            mean_speed = jnp.sum(sizes * crossings.speed) / jnp.where(total > 0, total, 1)
+            sizes = sizes * (crossings.speed + mean_speed)
             return refined_weights(world, settings, weights, points.edge.ravel(), sizes.ravel())
 
         return lax.cond(number == 0, refined, lambda weights: weights, weights), drawn

@@ -163,7 +163,7 @@ def whole_scene(kind: str) -> jaxhf.Scene:
     return jax.tree.map(jnp.asarray, scene)
 
 
-def moved(leaf: Callable[[jaxhf.Scene], jax.Array], change: Any) -> Callable[[jaxhf.Scene], jaxhf.Scene]:
+def moved(leaf: Callable[[Any], Any], change: Any) -> Callable[[jaxhf.Scene], jaxhf.Scene]:
     """The direction in which one leaf changes and all others stand."""
 
     def direction(scene: jaxhf.Scene) -> jaxhf.Scene:
