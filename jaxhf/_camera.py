@@ -3,12 +3,38 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ._ray import Ray
-from ._transform import affine, require_invertible, unit
-from ._types import MatrixLeaf, Scalar, ScalarLeaf, float_leaf, require_finite, require_number
+from ._transform import Affine, affine, require_invertible, unit
+from ._types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
+
+
+class Projection(eqx.Module):
+    """p -> linear @ p + offset, four numbers (X, Y, W, depth): the point is seen at (X / W, Y / W), if its depth is positive.
+
+    Homogeneous coordinates (Riesenfeld, IEEE CG&A 1981): what is linear in p can be cut at the picture's border before
+    the division.
+    """
+
+    linear: Float[jax.Array, "4 3"]
+    offset: Float[jax.Array, "4"]
+
+    def __call__(self, p: Vector) -> Float[jax.Array, "4"]:
+        return self.linear[:, 0] * p[0] + self.linear[:, 1] * p[1] + self.linear[:, 2] * p[2] + self.offset
+
+    def of(self, world: Affine) -> "Projection":
+        """The same for points in another frame, from which `world` leads to the world's."""
+        columns = [
+            self.linear[:, 0] * world.linear[0, k]
+            + self.linear[:, 1] * world.linear[1, k]
+            + self.linear[:, 2] * world.linear[2, k]
+            for k in range(3)
+        ]
+        return Projection(jnp.stack(columns, axis=1), self(world.offset))
 
 
 class Perspective(eqx.Module):
@@ -44,6 +70,15 @@ class Perspective(eqx.Module):
         sx, sy = _screen(self, x, y)
         half = jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2)
         return Ray(world.offset, unit(world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))))
+
+    def film_from_world(self) -> Projection:
+        """The inverse of `ray`: where in the picture a point is seen."""
+        camera = affine(jnp.asarray(self.world_from_camera)).inverse()
+        return _film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
+
+    def viewpoint(self) -> tuple[Vector, bool]:
+        """The eye, and that it is at a place."""
+        return affine(jnp.asarray(self.world_from_camera)).offset, True
 
 
 class Orthographic(eqx.Module):
@@ -81,6 +116,16 @@ class Orthographic(eqx.Module):
         origin = world.point(jnp.stack([sx * half, sy * half, jnp.zeros_like(half)]))
         return Ray(origin, unit(world.linear[:, 2]))
 
+    def film_from_world(self) -> Projection:
+        """The inverse of `ray`: where in the picture a point is seen."""
+        camera = affine(jnp.asarray(self.world_from_camera)).inverse()
+        half = jnp.asarray(self.extent) / 2
+        return _film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
+
+    def viewpoint(self) -> tuple[Vector, bool]:
+        """The direction towards the eye, and that it is infinitely far away."""
+        return -affine(jnp.asarray(self.world_from_camera)).linear[:, 2], False
+
 
 Camera = Perspective | Orthographic
 
@@ -89,6 +134,23 @@ def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
     """Pixels to the screen on which the shorter side runs from -1 to 1, x right, y up."""
     short = min(camera.width, camera.height)
     return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
+
+
+def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
+    """`_screen` undone: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
+    scale = min(camera.width, camera.height) / (2 * half)
+    linear, offset = camera_from_world.linear, camera_from_world.offset
+    return Projection(
+        jnp.stack([linear[0] * scale + w * (camera.width / 2), -linear[1] * scale + w * (camera.height / 2), w, linear[2]]),
+        jnp.stack(
+            [
+                offset[0] * scale + w_offset * (camera.width / 2),
+                -offset[1] * scale + w_offset * (camera.height / 2),
+                w_offset,
+                offset[2],
+            ]
+        ),
+    )
 
 
 def _look_at(eye: Any, target: Any, up: Any) -> Any:

@@ -14,7 +14,9 @@ from jax import lax
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 from jaxtyping import Float, Int
 
+from ._boundaries import moving_boundaries
 from ._camera import Camera
+from ._edges import sources, with_tangent
 from ._film import grid_side, sample_offset
 from ._heightfield import Heightfield
 from ._hit import Hit, intersect
@@ -63,6 +65,7 @@ def render(
     *,
     aovs: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
+    key: jax.Array | None = None,
 ) -> Any:
     """Renders a picture.
 
@@ -76,6 +79,8 @@ def render(
       settings: the knobs; those of a `Prepared` scene stay what they are.
       aovs: names out of `AOVS`.
       progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
+      key: of JAX's random numbers, for what is sampled: the points on edges, if the settings ask for them. The same key
+        gives the same derivative; None stands for a fixed one.
 
     Returns:
       Linear radiance, shape (h, w, 3), top row first; with `aovs` that and a dict of them.
@@ -95,11 +100,12 @@ def render(
         settings, world = scene.settings, scene._world
         camera = _on_every_device(localise_camera(scene.scene.camera, scene.scene))
         if progress is None:
-            outputs = _trace_prepared(world, camera, settings, aovs)
+            outputs = _trace_prepared(world, camera, settings, aovs, _settled_key(key, settings))
         else:
             outputs = _trace_in_parts(world, camera, settings, aovs, progress)
     else:
-        outputs = _trace_all(_on_every_device(localise(scene)), settle(settings, scene), aovs)
+        settings = settle(settings, scene)
+        outputs = _trace_all(_on_every_device(localise(scene)), settings, aovs, _settled_key(key, settings))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -108,6 +114,10 @@ def settle(settings: Settings, scene: Scene) -> Settings:
     """The settings with what they leave to the scene filled in."""
     samples = scene.samples if settings.samples is None else settings.samples
     return dataclasses.replace(settings, samples=grid_side(samples) ** 2)
+
+
+def _settled_key(key: jax.Array | None, settings: Settings) -> jax.Array | None:
+    return (jax.random.key(0) if key is None else key) if settings.edge_samples else None
 
 
 class _Tiling:
@@ -130,14 +140,19 @@ class _Tiling:
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "aovs"))
-def _trace_all(scene: Scene, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
-    return _trace_world(make_world(scene, settings), scene.camera, settings, aovs)
+def _trace_all(scene: Scene, settings: Settings, aovs: tuple[str, ...], key: jax.Array | None = None) -> dict[str, jax.Array]:
+    return _trace_world(make_world(scene, settings), scene.camera, settings, aovs, key)
 
 
-def _trace_world(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
+def _trace_world(
+    world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], key: jax.Array | None
+) -> dict[str, jax.Array]:
     tiling = _Tiling(camera, settings)
     tiles = _over_devices(world, camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
-    return jax.tree.map(tiling.assemble, tiles)
+    outputs = jax.tree.map(tiling.assemble, tiles)
+    if key is not None and sources(world, settings):
+        outputs["image"] = with_tangent(outputs["image"], moving_boundaries(world, camera, settings, key))
+    return outputs
 
 
 _trace_prepared = jax.jit(_trace_world, static_argnames=("settings", "aovs"))

@@ -24,6 +24,9 @@ class Settings:
       samples: rays a pixel, a square number: the centres of a regular n x n grid. None: what the scene says, rounded up
         to a square.
       max_depth: how often a ray may be mirrored before the rest counts as black.
+      edge_samples: points on edges of the terrain, in all, at which the derivative of moving silhouettes and shadow
+        boundaries is taken, see docs/gradients.md; 0: the derivative that each sample has by itself, no more. The
+        picture is the same.
       chunk: rays that are traced together; rounded down to a square of 8 x 8, 16 x 16, ... pixels.
     """
 
@@ -34,6 +37,7 @@ class Settings:
     shadows: bool = True
     samples: int | None = None
     max_depth: int = 4
+    edge_samples: int = 0
     chunk: int = 4096
 
     def __post_init__(self):
@@ -42,7 +46,7 @@ class Settings:
                 raise ValueError(f"Settings: {name} must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}")
         if not isinstance(self.shadows, bool):
             raise ValueError(f"Settings: shadows must be True or False, it is {self.shadows!r}")
-        for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("chunk", 64)):
+        for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("edge_samples", 0), ("chunk", 64)):
             value = getattr(self, name)
             if value is None and name in ("max_steps", "samples"):
                 continue

@@ -107,7 +107,7 @@ def radiance(world: World, ray: Ray, settings: Settings) -> tuple[Vector, Index]
 
     dtype = ray.d.dtype
     none = jnp.zeros((), jnp.int32)
-    init = (ray, _nowhere(dtype), jnp.ones(3, dtype), jnp.zeros(3, dtype), jnp.ones((), bool), none)
+    init = (ray, nowhere(dtype), jnp.ones(3, dtype), jnp.zeros(3, dtype), jnp.ones((), bool), none)
     (_, _, _, total, _, exhausted), _ = lax.scan(bounce, init, length=settings.max_depth + 1)
     return total, exhausted
 
@@ -133,7 +133,7 @@ def _count(flag: Flag) -> Index:
     return flag.astype(jnp.int32)
 
 
-def _nowhere(dtype) -> Vertex:
+def nowhere(dtype) -> Vertex:
     """The origin of a camera ray, in the form of those of mirrored rays."""
     zero, up, whole = jnp.zeros(3, dtype), jnp.array([0, 0, 1], dtype), jnp.zeros((), jnp.int32)
     hit = Hit(

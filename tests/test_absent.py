@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf import _heightfield, _hit, _render, _scene, _shade, _transform
+from jaxhf import _edges, _heightfield, _hit, _render, _scene, _shade, _transform
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
@@ -125,7 +125,7 @@ FEATURES: dict[str, tuple[Case, Case, list[Change]]] = {
     "mirror": (
         PLAIN,
         Case(scene(jaxhf.Object(FIELD, jaxhf.Mirror()))),
-        [fails_everywhere(_shade._reflect), fails_everywhere(_shade._mirrored), fails_everywhere(_shade._nowhere)],
+        [fails_everywhere(_shade._reflect), fails_everywhere(_shade._mirrored), fails_everywhere(_shade.nowhere)],
     ),
     "cylinder": (
         PLAIN,
@@ -157,6 +157,11 @@ FEATURES: dict[str, tuple[Case, Case, list[Change]]] = {
         PLAIN,
         Case(scene(world=TILTED)),
         [fails_in(_shade, "affine"), fails_in(_transform.Affine, "inverse")],
+    ),
+    "edge samples": (
+        PLAIN,
+        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, edge_samples=64)),
+        [fails_everywhere(_edges.draw), fails_everywhere(_edges.plain_weights), fails_everywhere(_edges.with_tangent)],
     ),
     "AOVs": (PLAIN, DEPTH, [fails_everywhere(_render._observe)]),
     "step counting": (

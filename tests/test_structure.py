@@ -10,7 +10,8 @@ PACKAGE = Path(__file__).parents[1] / "jaxhf"
 FLOW = (
     "_types", "_store", "_lanes", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film",
     "_heightfield", "_pyramid", "_grid",
-    "_cylinder", "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade", "_render", "io", "__init__", "__main__",
+    "_cylinder", "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade",
+    "_silhouette", "_edges", "_boundaries", "_render", "io", "__init__", "__main__",
 )  # fmt: skip
 
 
@@ -41,12 +42,11 @@ def test_imports_follow_the_flow(path):
         assert FLOW.index(name) < here or name == _stage(path) == "io", f"{path.name} imports {name}, which comes after it"
 
 
-def test_rays_are_batched_and_compiled_in_one_place():
-    """Besides, two modules say what `vmap` is to make of a function of one ray."""
-    rules = ("_lanes", "_march")
+def test_rays_are_batched_in_two_places_and_compiled_in_one():
+    """Pixels in one, points on edges in the other; besides, two modules say what `vmap` is to make of a function of one ray."""
+    batching, rules = ("_render", "_boundaries"), ("_lanes", "_march")
     for path in PACKAGE.rglob("*.py"):
-        if _stage(path) != "_render":
-            text = path.read_text()
-            assert ("custom_vmap" in text) == (_stage(path) in rules)
-            for word in ("jax.jit", "shard_map") if _stage(path) in rules else ("jax.vmap", "jax.jit", "lax.map(", "shard_map"):
-                assert word not in text, f"{path.name} has {word}"
+        text, stage = path.read_text(), _stage(path)
+        assert ("custom_vmap" in text) == (stage in rules), path.name
+        assert stage in (*batching, *rules) or not ("jax.vmap" in text or "lax.map(" in text), f"{path.name} batches rays"
+        assert stage == "_render" or not ("jax.jit" in text or "shard_map" in text), f"{path.name} compiles"

@@ -1,0 +1,94 @@
+"""The derivative that moving boundaries add to a picture: many points on edges, drawn, followed and summed."""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Float
+
+from ._camera import Camera
+from ._edges import (
+    Crossing,
+    EdgePoint,
+    Lottery,
+    cast_shadow,
+    draw,
+    make_crossing,
+    make_lottery,
+    picture_point,
+    plain_weights,
+    refined_weights,
+    side_ray,
+)
+from ._settings import Settings
+from ._shade import World, radiance
+from ._store import stored
+
+# Of this many rounds of points on edges, the first finds out which edges count.
+_ROUNDS = 4
+
+
+def moving_boundaries(world: World, camera: Camera, settings: Settings, key: jax.Array) -> Float[jax.Array, "h w 3"]:
+    """An image that means nothing, but whose derivative is that which moving boundaries add to the picture's."""
+    chunks = math.ceil(settings.edge_samples / (_ROUNDS * settings.chunk))
+    size = math.ceil(settings.edge_samples / (_ROUNDS * chunks))
+    points, crossings, flows = lax.stop_gradient(_draw_edges(world, camera, settings, key, chunks, size))
+
+    @jax.checkpoint
+    def carry(world: World, camera: Camera, point: EdgePoint, flow: jax.Array):
+        x, _ = picture_point(world, camera, settings, point, point.s)
+        return flow[:, 0] * x[0] + flow[:, 1] * x[1]
+
+    def chunk(drawn: tuple[EdgePoint, jax.Array]):
+        return jax.vmap(carry, in_axes=(None, None, 0, 0))(world, camera, *drawn)
+
+    light = lax.map(chunk, (points, flows)).reshape(-1, 3)
+    column, row = (crossings.x[..., axis].astype(jnp.int32).ravel() for axis in (0, 1))
+    image = jnp.zeros((camera.height * camera.width, 3), light.dtype)
+    return image.at[row * camera.width + column].add(light).reshape(camera.height, camera.width, 3)
+
+
+def _draw_edges(world: World, camera: Camera, settings: Settings, key: jax.Array, chunks: int, size: int):
+    """Points on edges, in chunks: the points, their places in the picture, and for each by how much the light that leaves
+    its pixel changes with its place, shape (3, 2)."""
+    world, camera = lax.stop_gradient((world, camera))
+
+    def one(lottery: Lottery, k: jax.Array, u: jax.Array):
+        sure = world.surfaces[0].sure
+        point = stored(draw(world, camera, settings, lottery, k, u), sure)
+        point = stored(cast_shadow(world, point, settings), sure)
+        return stored((point, make_crossing(world, camera, settings, point)), sure)
+
+    def beside(crossing: Crossing, side: jax.Array) -> jax.Array:
+        return radiance(world, stored(side_ray(camera, crossing, side), world.surfaces[0].sure), settings)[0]
+
+    def chunk(lottery: Lottery, key: jax.Array, first: jax.Array):
+        u = jax.random.uniform(key, (size, 2), camera.world_from_camera.dtype)
+        points, crossings = jax.vmap(functools.partial(one, lottery))(first + jnp.arange(size, dtype=jnp.int32), u)
+        light = jax.vmap(lambda crossing: jax.vmap(functools.partial(beside, crossing))(crossing.sides))(crossings)
+        jump = (light[:, 0] - light[:, 1]) * jnp.where(crossings.valid, points.measure, 0)[:, None]
+        return points, crossings, jump[:, :, None] * crossings.across[:, None, :]
+
+    def in_round(weights: jax.Array, number: jax.Array):
+        per_round = chunks * size
+        lottery = make_lottery(weights, jnp.where(number == 0, per_round, (_ROUNDS - 1) * per_round))
+        firsts = jnp.maximum(number - 1, 0) * per_round + jnp.arange(chunks, dtype=jnp.int32) * size
+        keys = jax.random.split(jax.random.fold_in(key, number), chunks)
+        drawn = lax.map(lambda each: chunk(lottery, *each), (keys, firsts))
+
+        def refined(weights: jax.Array) -> jax.Array:
+            points, crossings, flows = drawn
+            sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(2, 3)))
+            # By how much the pixel changes as the edge is lifted; and, for what moves it otherwise, as if all had one speed.
+            total = jnp.sum(sizes)
+            mean_speed = jnp.sum(sizes * crossings.speed) / jnp.where(total > 0, total, 1)
+            sizes = sizes * (crossings.speed + mean_speed)
+            return refined_weights(world, settings, weights, points.edge.ravel(), sizes.ravel())
+
+        return lax.cond(number == 0, refined, lambda weights: weights, weights), drawn
+
+    weights = plain_weights(world, camera, settings)
+    _, drawn = lax.scan(in_round, weights, jnp.arange(_ROUNDS, dtype=jnp.int32))
+    return jax.tree.map(lambda leaf: leaf[1:].reshape(-1, *leaf.shape[2:]), drawn)

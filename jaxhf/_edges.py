@@ -1,0 +1,455 @@
+"""The part of the picture's derivative that comes from moving silhouettes, terminators and shadow boundaries.
+
+Where a boundary sweeps over a pixel, the pixel changes although the radiance along each of its rays does not. That part
+is an integral along the boundaries in the picture (Li et al., Differentiable Monte Carlo ray tracing through edge
+sampling, SIGGRAPH Asia 2018, equation 5; for shadows Zhang et al., Path-space differentiable rendering, SIGGRAPH 2020):
+
+    d pixel = integral of (L(x - eps n) - L(x + eps n)) (n . dx) dl
+
+On a heightfield every boundary is the image of edges: of those that separate triangles facing the eye or a light from
+triangles facing away, where they stand; and of the latter's shadows. A point is drawn on such an edge and followed to its
+place x in the picture by plain arithmetic, which carries the derivative; all else is discrete or held constant.
+docs/gradients.md derives this.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float, Int
+
+from ._camera import Camera
+from ._cylinder import tube_distance
+from ._grid import Grid, triangle_plane
+from ._light import Directional, Point, Sky
+from ._ray import Ray
+from ._settings import Settings
+from ._shade import Vertex, World, first_vertex, nowhere
+from ._silhouette import (
+    STEPS,
+    EdgeFlags,
+    Viewpoint,
+    all_edges,
+    framed_part,
+    lit_lengths,
+    seen_lengths,
+    silhouettes,
+)
+from ._transform import unit
+from ._types import Flag, Index, Point2, Scalar, Vector
+from ._walk import Status
+
+# The sum of the whole numbers that edges are drawn by: below 2^31 with room for rounding up.
+_TICKETS = 2**30
+# Vertices along the side of the blocks over which a first round of draws is averaged.
+_BLOCK = 8
+
+
+class Source(NamedTuple):
+    """The edges of one surface, where they stand (`light` None) or cast by a light; `first` is the number of its first."""
+
+    surface: int
+    light: int | None
+    first: int
+    ny: int
+    nx: int
+
+    @property
+    def end(self) -> int:
+        return self.first + 3 * self.ny * self.nx
+
+
+def sources(world: World, settings: Settings) -> tuple[Source, ...]:
+    """All edges of the scene that may bound something, in one numbering. A cylinder has none."""
+    found, first = [], 0
+    casting = [number for number, light in enumerate(world.lights) if not isinstance(light, Sky)] if settings.shadows else []
+    for k, surface in enumerate(world.surfaces):
+        if not isinstance(surface, Grid):
+            continue
+        for light in (None, *casting):
+            ny, nx = surface.z.shape
+            found.append(Source(k, light, first, ny, nx))
+            first = found[-1].end
+    return tuple(found)
+
+
+def plain_weights(world: World, camera: Camera, settings: Settings) -> Float[jax.Array, " edges"]:
+    """How much each edge may count, as far as can be told without a ray; those of a source sum to one, or are zero."""
+    weights = []
+    for source in sources(world, settings):
+        surface = world.surfaces[source.surface]
+        assert isinstance(surface, Grid)
+        lights = {number: _viewpoint(light) for number, light in enumerate(world.lights) if not isinstance(light, Sky)}
+        if source.light is None:
+            flags = _standing(surface, camera, list(lights.values()), settings)
+            lengths = seen_lengths(surface, camera)
+        else:
+            flags = silhouettes(surface, lights[source.light])
+            lengths = lit_lengths(surface, lights[source.light])
+        lengths = jnp.where(flags, lengths, 0).ravel()
+        largest = jnp.max(lengths)
+        lengths = lengths / jnp.where(largest > 0, largest, 1)
+        total = jnp.sum(lengths)
+        weights.append(lengths / jnp.where(total > 0, total, 1))
+    return jnp.concatenate(weights)
+
+
+def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], settings: Settings) -> EdgeFlags:
+    """Edges across which what is seen jumps at the edge itself; one that is a silhouette for several counts once."""
+    if settings.shading == "flat":
+        return all_edges(grid)
+    flags = silhouettes(grid, Viewpoint(*camera.viewpoint()))
+    for light in lights:
+        flags = flags | silhouettes(grid, light)
+    return flags
+
+
+def _viewpoint(light: Directional | Point) -> Viewpoint:
+    return Viewpoint(light.p, True) if isinstance(light, Point) else Viewpoint(unit(light.towards), False)
+
+
+class Lottery(eqx.Module):
+    """Edges to be drawn in proportion to whole numbers, their tickets.
+
+    A running sum of a million weights loses small ones in single precision; one of whole numbers is exact, and so is the
+    chance that follows from it.
+
+    Attributes:
+      cumulative: the number of tickets up to and with each edge.
+      stratum: tickets in each of the strata, of which every draw takes one.
+    """
+
+    cumulative: Int[jax.Array, " edges"]
+    stratum: Index
+
+
+def make_lottery(weights: Float[jax.Array, " edges"], draws: Index) -> Lottery:
+    """Every edge with a weight gets a ticket at least."""
+    count = weights.shape[0]
+    if count >= _TICKETS // 2:
+        raise ValueError(f"Settings: edge_samples works for fewer than {_TICKETS // 2} edges, the scene has {count}")
+    total = jnp.sum(weights)
+    tickets = jnp.ceil(weights / jnp.where(total > 0, total, 1) * (_TICKETS - count)).astype(jnp.int32)
+    cumulative = jnp.cumsum(tickets, dtype=jnp.int32)
+    return Lottery(cumulative, jnp.maximum((cumulative[-1] + draws - 1) // draws, 1))
+
+
+def refined_weights(
+    world: World,
+    settings: Settings,
+    weights: Float[jax.Array, " edges"],
+    edge: Int[jax.Array, " n"],
+    found: Float[jax.Array, " n"],
+) -> Float[jax.Array, " edges"]:
+    """The weights times what a first round of draws from them has found on each edge, by `made_of`.
+
+    Where an edge has few draws, the mean over its block of cells counts, and where that has few, the mean over all: as if each
+    edge had one draw more, with the mean of its block. No edge that may count loses all its weight, so nothing is biased.
+
+    Args:
+      world, settings: for `sources`.
+      weights: `plain_weights`.
+      edge, found: of each draw, its edge and the change that it stands for.
+    """
+    none = jnp.zeros_like(weights)
+    draws, sums = none.at[edge].add(1), none.at[edge].add(found)
+    everywhere = jnp.mean(found)
+    refined = []
+    for source in sources(world, settings):
+        n, total = (value[source.first : source.end].reshape(3, source.ny, source.nx) for value in (draws, sums))
+        n_block, total_block = _over_blocks(n), _over_blocks(total)
+        mean = (jnp.sum(total) + everywhere) / (jnp.sum(n) + 1)
+        mean = (total_block + mean) / (n_block + 1)
+        refined.append(((total + mean[None].repeat(3, axis=0)) / (n + 1)).ravel())
+    return weights * jnp.concatenate(refined)
+
+
+def _over_blocks(values: Float[jax.Array, "3 ny nx"]) -> Float[jax.Array, "ny nx"]:
+    """At each vertex, the sum over all edges that begin in its block."""
+    _, ny, nx = values.shape
+    rows, columns = -(-ny // _BLOCK), -(-nx // _BLOCK)
+    padded = jnp.pad(values, ((0, 0), (0, rows * _BLOCK - ny), (0, columns * _BLOCK - nx)))
+    blocks = padded.reshape(3, rows, _BLOCK, columns, _BLOCK).sum((0, 2, 4))
+    return blocks.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:ny, :nx]
+
+
+class EdgePoint(eqx.Module):
+    """A point on an edge, and where its shadow falls. Discrete, but for its place along the edge.
+
+    Attributes:
+      valid: whether there is such a point, and it can be seen in the picture but for what hides it.
+      edge: its number, see `sources`.
+      surface: whose edge it is.
+      light: by which it is cast; -1: it is seen where it stands.
+      start, end: the edge's vertices, (ix, iy).
+      s: the place between them, 0..1.
+      measure: of s for which this point stands: one over the density with which it was drawn.
+      chance: that a draw takes its edge.
+      receiver: the surface on which its shadow falls.
+      cell, upper: the triangle there.
+      t: how far away that is.
+    """
+
+    valid: Flag
+    edge: Index
+    surface: Index
+    light: Index
+    start: Int[jax.Array, "2"]
+    end: Int[jax.Array, "2"]
+    s: Scalar
+    measure: Scalar
+    receiver: Index
+    cell: Int[jax.Array, "2"]
+    upper: Flag
+    t: Scalar
+
+
+def draw(world: World, camera: Camera, settings: Settings, lottery: Lottery, k: Index, u: Point2) -> EdgePoint:
+    """The k-th stratum's point; `u` are two numbers in 0..1 that choose its ticket and its place in the ticket's part."""
+    dtype = u.dtype
+    ticket = jnp.minimum((u[0] * lottery.stratum.astype(dtype)).astype(jnp.int32), lottery.stratum - 1)
+    ticket = ticket + k * lottery.stratum
+    cumulative = lottery.cumulative
+    edge = jnp.searchsorted(cumulative, ticket, side="right").astype(jnp.int32)
+    valid = ticket < cumulative[-1]
+    edge = jnp.minimum(edge, cumulative.shape[0] - 1)
+    before = jnp.where(edge > 0, cumulative[jnp.maximum(edge - 1, 0)], 0)
+    held = jnp.maximum(cumulative[edge] - before, 1)
+    s = ((ticket - before).astype(dtype) + u[1]) / held.astype(dtype)
+    measure = lottery.stratum.astype(dtype) / held.astype(dtype)
+
+    none = jnp.zeros((), jnp.int32)
+    surface, light, kind, ix, iy = none, none - 1, none, none, none
+    for source in sources(world, settings):
+        here = (edge >= source.first) & (edge < source.end)
+        local, area = edge - source.first, source.ny * source.nx
+        surface = jnp.where(here, source.surface, surface)
+        light = jnp.where(here, -1 if source.light is None else source.light, light)
+        kind = jnp.where(here, local // area, kind)
+        ix, iy = jnp.where(here, local % source.nx, ix), jnp.where(here, local % area // source.nx, iy)
+    steps = jnp.array(STEPS, jnp.int32)
+    start = jnp.stack([ix, iy])
+    point = EdgePoint(
+        valid=valid, edge=edge, surface=surface, light=light, start=start, end=start + steps[kind], s=s, measure=measure,
+        receiver=none, cell=jnp.zeros(2, jnp.int32), upper=jnp.zeros((), bool), t=jnp.zeros((), dtype),
+    )  # fmt: skip
+    # Of an edge that is seen where it stands, only the part in the frame is drawn from.
+    film = camera.film_from_world()
+    a, b = (film(_on_edge(world, point, jnp.full((), end, dtype))) for end in (0, 1))
+    first, last = framed_part(camera, a, b)
+    stands = light < 0
+    first, last = jnp.where(stands, first, 0), jnp.where(stands, last, 1)
+    return eqx.tree_at(
+        lambda point: (point.valid, point.s, point.measure),
+        point,
+        (valid & (last > first), first + s * (last - first), measure * (last - first)),
+    )
+
+
+def cast_shadow(world: World, point: EdgePoint, settings: Settings) -> EdgePoint:
+    """Follows the light past the point to what its shadow falls on. No derivative."""
+    p = _on_edge(world, point, point.s)
+    away = _away_from_light(world, point, p)
+    origin = _departure(world, point, away)
+    casts = point.valid & (point.light >= 0)
+    vertex = first_vertex(world, Ray(p, away), settings, origin, casts)
+    met = vertex.hit.status == int(Status.HIT)
+    return eqx.tree_at(
+        lambda point: (point.valid, point.receiver, point.cell, point.upper, point.t),
+        point,
+        (
+            point.valid & (met | (point.light < 0)),
+            jnp.maximum(vertex.index, 0),
+            vertex.hit.cell,
+            vertex.hit.triangle == 1,
+            jnp.where(met, vertex.hit.t, 0),
+        ),
+    )
+
+
+def _departure(world: World, point: EdgePoint, away: Vector) -> Vertex:
+    """The edge's triangle over which the light goes on, as what it leaves: it cannot be met again.
+
+    On an edge with exactly one triangle facing the light, the light passes both on the same side.
+    """
+    origin = nowhere(away.dtype)
+    ix, iy = point.start[0], point.start[1]
+    along_x, along_y = point.end[1] == iy, point.end[0] == ix
+    for k, grid in enumerate(world.surfaces):
+        if not isinstance(grid, Grid):
+            continue
+        local = grid.grid_from_world.vector(away)
+        # The triangles to the left of the edge (above it, where it runs along x) and to its right.
+        left_x, left_y, left_upper = jnp.where(along_y, ix - 1, ix), iy, ~along_x & ~along_y
+        right_x, right_y, right_upper = ix, jnp.where(along_x, iy - 1, iy), along_x | along_y
+        leftwards = jnp.where(along_x, local[1] > 0, jnp.where(along_y, local[0] < 0, local[1] > local[0]))
+        left = (_has_cell(grid, left_x, left_y) & leftwards) | ~_has_cell(grid, right_x, right_y)
+        cell_x, cell_y = jnp.where(left, left_x, right_x), jnp.where(left, left_y, right_y)
+        cell_x, cell_y = jnp.clip(cell_x, 0, grid.cells[0] - 1), jnp.clip(cell_y, 0, grid.cells[1] - 1)
+        upper = jnp.where(left, left_upper, right_upper)
+        a, b, _ = triangle_plane(grid.z, cell_x, cell_y, upper)
+        side = jnp.where(local[2] - a * local[0] - b * local[1] >= 0, 1, -1).astype(jnp.int32)
+        x, y = _between_ends(point, point.s)
+        cells_x, cells_y = grid.cells
+        here = eqx.tree_at(
+            lambda vertex: (vertex.hit.cell, vertex.hit.triangle, vertex.hit.side, vertex.hit.uv, vertex.index),
+            origin,
+            (
+                jnp.stack([cell_x, cell_y]),
+                upper.astype(jnp.int32),
+                side,
+                jnp.stack([x / cells_x, y / cells_y]),
+                jnp.full((), k, jnp.int32),
+            ),
+        )
+        origin = jax.tree.map(lambda new, old, k=k: jnp.where(point.surface == k, new, old), here, origin)
+    return origin
+
+
+def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
+    """Whether there is such a cell, with all its vertices."""
+    x, y = jnp.clip(ix, 0, grid.cells[0] - 1), jnp.clip(iy, 0, grid.cells[1] - 1)
+    z = grid.z
+    return (x == ix) & (y == iy) & jnp.isfinite(z[y, x] + z[y, x + 1] + z[y + 1, x] + z[y + 1, x + 1])
+
+
+def _between_ends(point: EdgePoint, s: Scalar) -> tuple[Scalar, Scalar]:
+    a, b = point.start.astype(s.dtype), point.end.astype(s.dtype)
+    return a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1])
+
+
+def _on_edge(world: World, point: EdgePoint, s: Scalar, lift: Scalar | None = None) -> Vector:
+    """World frame, `lift` above the edge (in the grid's frame); differentiable in the heights and in the transform."""
+    chosen = None
+    for k, grid in enumerate(world.surfaces):
+        if isinstance(grid, Grid):
+
+            def height(vertex: jax.Array, grid: Grid = grid) -> Scalar:
+                z = grid.z.at[vertex[1], vertex[0]].get(mode="clip")
+                return jnp.where(jnp.isfinite(z), z, 0)
+
+            x, y = _between_ends(point, s)
+            z0, z1 = height(point.start), height(point.end)
+            z = z0 + s * (z1 - z0)
+            p = grid.world_from_grid.point(jnp.stack([x, y, z if lift is None else z + lift]))
+            chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
+    assert chosen is not None
+    return chosen
+
+
+def _away_from_light(world: World, point: EdgePoint, p: Vector) -> Vector:
+    """The unit direction in which light goes on past p."""
+    chosen = jnp.zeros_like(p)
+    for number, light in enumerate(world.lights):
+        if not isinstance(light, Sky):
+            away = unit(p - light.p) if isinstance(light, Point) else -unit(light.towards)
+            chosen = jnp.where(point.light == number, away, chosen)
+    return chosen
+
+
+def _fallen(world: World, point: EdgePoint, p: Vector) -> Vector:
+    """Where the light past p meets the triangle that was found; differentiable."""
+    away = _away_from_light(world, point, p)
+    near = p + point.t * away
+    landed = near
+    for k, surface in enumerate(world.surfaces):
+        if isinstance(surface, Grid):
+            # From `near` on, which lies there but for its derivative: far distances would cancel.
+            local = surface.grid_from_world.ray(Ray(near, away))
+            cell = jnp.clip(point.cell, 0, jnp.array(surface.cells, jnp.int32) - 1)
+            a, b, c = triangle_plane(surface.z, cell[0], cell[1], point.upper)
+            u, v = local.o[0] - cell[0].astype(p.dtype), local.o[1] - cell[1].astype(p.dtype)
+            slope = local.d[2] - a * local.d[0] - b * local.d[1]
+            grazing = slope == 0
+            step = jnp.where(grazing, 0, (c + a * u + b * v - local.o[2]) / jnp.where(grazing, 1, slope))
+            landed = jnp.where(point.receiver == k, near + step * away, landed)
+        else:
+            t, found = tube_distance(surface, Ray(p, away), None)
+            landed = jnp.where(point.receiver == k, p + jnp.where(found, t, point.t) * away, landed)
+    return landed
+
+
+def picture_point(
+    world: World, camera: Camera, settings: Settings, point: EdgePoint, s: Scalar, lift: Scalar | None = None
+) -> tuple[Point2, Flag]:
+    """Where the point, or its shadow, is in the picture, and whether within its frame; differentiable.
+
+    In every leaf of the scene, and in s while the shadow stays in its triangle.
+    """
+    p = _on_edge(world, point, s, lift)
+    if any(source.light is not None for source in sources(world, settings)):
+        p = jnp.where(point.light >= 0, _fallen(world, point, p), p)
+    at = camera.film_from_world()(p)
+    before = (at[2] > 0) & (at[3] > 0)
+    x = at[:2] / jnp.where(before, at[2], 1)
+    size = jnp.array([camera.width, camera.height], x.dtype)
+    return x, point.valid & before & (x >= 0).all() & (x < size).all()
+
+
+class Crossing(eqx.Module):
+    """A point's place in the picture.
+
+    Attributes:
+      valid: whether it has one.
+      x: pixels from the top left corner.
+      across: normal to the boundary, of the length by which the place moves with s.
+      sides: the places x - eps n and x + eps n, n being the unit normal.
+      speed: at which the boundary moves in the picture as the edge is lifted, pixels by the grid's unit of height.
+    """
+
+    valid: Flag
+    x: Point2
+    across: Point2
+    sides: Float[jax.Array, "2 2"]
+    speed: Scalar
+
+
+def make_crossing(world: World, camera: Camera, settings: Settings, point: EdgePoint) -> Crossing:
+    def place(s: Scalar) -> tuple[Point2, Flag]:
+        return picture_point(world, camera, settings, point, s)
+
+    x, along, valid = jax.jvp(place, (point.s,), (jnp.ones_like(point.s),), has_aux=True)
+    length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
+    valid = valid & (length > 0) & jnp.isfinite(length)
+    x = jnp.where(valid, x, 0)
+    across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
+    n = across / jnp.where(valid, length, 1)
+    step = n * side_step(camera, x.dtype)
+
+    def lifted(lift: Scalar) -> Point2:
+        return picture_point(world, camera, settings, point, point.s, lift)[0]
+
+    _, motion = jax.jvp(lifted, (jnp.zeros_like(point.s),), (jnp.ones_like(point.s),))
+    speed = jnp.abs(n[0] * motion[0] + n[1] * motion[1])
+    return Crossing(valid, x, across, jnp.stack([x - step, x + step]), jnp.where(valid & jnp.isfinite(speed), speed, 0))
+
+
+def side_ray(camera: Camera, crossing: Crossing, side: Point2) -> Ray:
+    """The camera's ray beside a boundary; one that goes nowhere, and costs nothing, where there is no crossing."""
+    ray = camera.ray(side[0], side[1])
+    return Ray(ray.o, jnp.where(crossing.valid, ray.d, 0))
+
+
+def side_step(camera: Camera, dtype) -> float:
+    """How far to either side of a boundary the radiance is taken, in pixels.
+
+    Larger than the rounding of x, that is of some hundred ulps at the picture's size, and else as small as can be: a second
+    boundary between the two rays would be taken for a part of the first.
+    """
+    return max(camera.width, camera.height) * float(jnp.finfo(dtype).eps) ** 0.5 / 4
+
+
+@jax.custom_jvp
+def with_tangent(value: jax.Array, carrier: jax.Array) -> jax.Array:
+    """`value`, with the derivative of value + carrier.
+
+    Adding carrier - stop_gradient(carrier) would need exact cancellation, which fused multiply-adds break; and where
+    nothing is differentiated, this way the carrier is never computed.
+    """
+    return value
+
+
+@with_tangent.defjvp
+def _with_tangent_jvp(primals, tangents):
+    return primals[0], tangents[0] + tangents[1]
