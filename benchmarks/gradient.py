@@ -1,13 +1,21 @@
 """Accuracy and time of the picture's derivative with respect to heights, with and without moving boundaries.
 
-The common work of `--peers` (a folder with common_work.py and gradient_B_low.npz, or `--reference`, an npz of the same
-form for another camera and light): relative error and cosine against central differences, the median over directions; and
-the noise of the edge points alone, from two keys.
+Accuracy: on the common work of `--peers` (a folder with common_work.py), 64 x 64 bumps, 128 x 128 pixels. For camera B in low
+light its gradient_B_low.npz is the reference, central differences of another renderer; for other views it is made here, by
+central differences of our own picture with `--fine` samples a pixel, at two steps whose difference is printed as its error.
+Medians over the directions: cosine and relative error, and the noise of the edge points alone, from two keys.
+
+Cost: `--cost` heights a side and as many pixels, value and gradient of a loss against the plain frame, interleaved.
+
+With `--mitsuba` (pip install mitsuba; see DRJIT_LIBLLVM_PATH) its `direct_projective` integrator is held against the same
+reference, and timed.
 """
 
 import argparse
+import importlib
 import importlib.util
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxhf
+
+PIXELS, VERTICES = 128, 64
 
 
 def common_work(peers: Path) -> Any:
@@ -27,53 +37,189 @@ def common_work(peers: Path) -> Any:
     return work
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--peers", type=Path, required=True)
-    parser.add_argument("--reference", type=Path)
-    parser.add_argument("--camera", default="B")
-    parser.add_argument("--light", default="low")
-    parser.add_argument("--samples", type=int, default=16)
-    parser.add_argument("--edge-samples", type=int, nargs="*", default=[0, 10000, 100000])
-    options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
-    work = common_work(options.peers)
-    reference = np.load(options.reference or options.peers / "gradient_B_low.npz")
-    heights, directions = work.bumps(64)
-    names = [name for name in directions if name in reference]
-    eye, target, fov = work.CAMERAS[options.camera]
-    scene = jaxhf.Scene(
+def make_scene(work: Any, heights: Any, camera: str, light: str, pixels: int) -> jaxhf.Scene:
+    eye, target, fov = work.CAMERAS[camera]
+    return jaxhf.Scene(
         [jaxhf.Object(jaxhf.Heightfield(jnp.asarray(heights)), jaxhf.Matte(work.ALBEDO))],
-        jaxhf.Perspective.look_at(eye, target, fov=fov, width=128, height=128),
-        [jaxhf.Directional(work.light(options.light))],
+        jaxhf.Perspective.look_at(eye, target, fov=fov, width=pixels, height=pixels),
+        [jaxhf.Directional(work.light(light))],
     )
-    print(f"{'points':>8} {'cosine':>8} {'error':>8} {'noise':>8} {'value and gradient, ms':>24}")
-    for count in options.edge_samples:
-        settings = jaxhf.Settings(normals="six-angle", samples=options.samples, edge_samples=count)
 
-        def picture(heights: jax.Array, key: jax.Array, settings: jaxhf.Settings = settings) -> jax.Array:
-            return jaxhf.render(scene.with_heights(heights), settings, key=key)[..., 0]
 
-        @jax.jit
-        def along(direction: jax.Array, key: jax.Array, picture: Any = picture) -> jax.Array:
-            return jax.jvp(lambda heights: picture(heights, key), (jnp.asarray(heights),), (direction,))[1]
+def median_ms(function: Callable[[int], object], repeats: int = 5) -> float:
+    times = []
+    for k in range(repeats + 1):
+        begin = time.perf_counter()
+        jax.block_until_ready(function(k))
+        times.append(time.perf_counter() - begin)
+    return 1e3 * float(np.median(times[1:]))
 
-        gradient = jax.jit(jax.value_and_grad(lambda heights, key, picture=picture: jnp.sum(picture(heights, key) ** 2)))
-        errors, cosines, noises = [], [], []
-        for name in names:
-            expected = np.asarray(reference[name], float)
-            one, two = (np.asarray(along(jnp.asarray(directions[name]), jax.random.key(k))) for k in (0, 1))
-            size = np.linalg.norm(expected)
-            errors.append(np.linalg.norm(one - expected) / size)
-            cosines.append(np.vdot(one, expected) / np.linalg.norm(one) / size)
-            noises.append(np.linalg.norm(one - two) / np.sqrt(2) / size)
-        times = []
-        for k in range(6):
-            start = time.perf_counter()
-            jax.block_until_ready(gradient(jnp.asarray(heights), jax.random.key(k)))
-            times.append(time.perf_counter() - start)
-        summary = [np.median(values) for values in (cosines, errors, noises)]
-        print(f"{count:8} {summary[0]:8.4f} {summary[1]:8.4f} {summary[2]:8.4f} {1e3 * np.median(times[1:]):24.0f}", flush=True)
+
+def central_differences(scene: jaxhf.Scene, directions: dict[str, np.ndarray], fine: int, step: float) -> dict[str, np.ndarray]:
+    """d picture / d direction at one step."""
+    settings = jaxhf.Settings(normals="six-angle", samples=fine)
+
+    def at(heights: Any) -> np.ndarray:
+        return np.asarray(jaxhf.render(scene.with_heights(heights), settings)[..., 0])
+
+    return {
+        name: (at(scene.heights + step * direction) - at(scene.heights - step * direction)) / (2 * step)
+        for name, direction in directions.items()
+    }
+
+
+def compare(rows: list[np.ndarray], reference: list[np.ndarray]) -> tuple[float, float]:
+    """Median cosine and relative error."""
+    cosines = [np.vdot(a, b) / np.linalg.norm(a) / np.linalg.norm(b) for a, b in zip(rows, reference, strict=True)]
+    errors = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(rows, reference, strict=True)]
+    return float(np.median(cosines)), float(np.median(errors))
+
+
+def accuracy(work: Any, options: argparse.Namespace, camera: str, light: str) -> None:
+    heights, directions = work.bumps(VERTICES)
+    npz = options.peers / f"gradient_{camera}_{light}.npz"
+    stored = np.load(npz) if npz.exists() else None
+    names = [name for name in directions if name in np.load(options.peers / "gradient_B_low.npz")]
+    directions = {name: directions[name] for name in names}
+    scene = make_scene(work, heights, camera, light, PIXELS)
+    if stored is None:
+        wide, narrow = (central_differences(scene, directions, options.fine, step) for step in (0.01, 0.005))
+        reference = [narrow[name] for name in names]
+        _, doubt = compare([wide[name] for name in names], reference)
+        origin = f"central differences, {options.fine} samples a pixel; a step twice as long differs by {doubt:.3f}"
+    else:
+        reference, origin = [np.asarray(stored[name], float) for name in names], npz.name
+    print(f"\ncamera {camera}, {light} light, against {origin}")
+    print(f"{'samples':>24} {'points':>8} {'cosine':>8} {'error':>8} {'noise':>8} {'value and gradient, ms':>24}")
+    for samples in options.samples:
+        for count in options.edge_samples:
+            settings = jaxhf.Settings(normals="six-angle", samples=samples, edge_samples=count)
+
+            def picture(heights: jax.Array, key: jax.Array, settings: jaxhf.Settings = settings) -> jax.Array:
+                return jaxhf.render(scene.with_heights(heights), settings, key=key)[..., 0]
+
+            @jax.jit
+            def along(direction: jax.Array, key: jax.Array, picture: Any = picture) -> jax.Array:
+                return jax.jvp(lambda heights: picture(heights, key), (scene.heights,), (direction,))[1]
+
+            gradient = jax.jit(jax.value_and_grad(lambda heights, key, picture=picture: jnp.sum(picture(heights, key) ** 2)))
+            one, two = ([np.asarray(along(d, jax.random.key(k))) for d in directions.values()] for k in (0, 1))
+            cosine, error = compare(one, reference)
+            noise = np.median([np.linalg.norm(a - b) / np.linalg.norm(b) / np.sqrt(2) for a, b in zip(one, two, strict=True)])
+            ms = median_ms(lambda k, gradient=gradient: gradient(scene.heights, jax.random.key(k)))
+            print(f"{samples:24} {count:8} {cosine:8.4f} {error:8.4f} {noise:8.4f} {ms:24.0f}", flush=True)
+    if options.mitsuba:
+        rows, ms = mitsuba(work, heights, directions, camera, light, options.mitsuba)
+        cosine, error = compare(rows, reference)
+        print(f"{f'Mitsuba, {options.mitsuba}':>24} {'':8} {cosine:8.4f} {error:8.4f} {'':8} {ms:24.0f}", flush=True)
+
+
+def mitsuba(
+    work: Any, heights: np.ndarray, directions: dict[str, np.ndarray], camera: str, light: str, samples: int
+) -> tuple[list[np.ndarray], float]:
+    """Its derivatives by `direct_projective`, and the time of one step: new heights, picture, gradient of a loss."""
+    dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")  # optional: not in any extra
+    mi.set_variant("llvm_ad_rgb")
+    size = len(heights)
+    x, y = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
+    corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
+    faces = np.concatenate(
+        [np.stack([corner, corner + 1, corner + size + 1], 1), np.stack([corner, corner + size + 1, corner + size], 1)]
+    )
+    mesh = mi.Mesh("terrain", size * size, len(faces), has_vertex_normals=True)
+    mesh_parameters = mi.traverse(mesh)
+    mesh_parameters["faces"] = faces.astype(np.uint32).ravel()
+    mesh_parameters["vertex_positions"] = np.stack([x, y, heights], -1).astype(np.float32).ravel()
+    mesh_parameters.update()
+    mesh.set_bsdf(mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": work.ALBEDO}}))
+    eye, target, fov = work.CAMERAS[camera]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct_projective"},
+            "terrain": mesh,
+            "light": {"type": "directional", "direction": [float(-v) for v in work.light(light)], "irradiance": np.pi},
+            "sensor": {
+                "type": "perspective",
+                "fov": fov,
+                "to_world": mi.ScalarTransform4f().look_at(origin=list(eye), target=list(target), up=[0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}},
+                "sampler": {"type": "independent", "sample_count": samples},
+            },
+        }
+    )
+    parameters = mi.traverse(scene)
+    place = "terrain.vertex_positions"
+    base = np.stack([x, y, heights], -1).astype(np.float32).ravel()
+
+    rows = []
+    for direction in directions.values():
+        z = mi.Float(0.0)
+        dr.enable_grad(z)
+        offset = np.zeros((size * size, 3), np.float32)
+        offset[:, 2] = direction.ravel()
+        parameters[place] = mi.Float(base) + z * mi.Float(offset.ravel())
+        parameters.update()
+        image = mi.render(scene, parameters, spp=samples)
+        dr.forward(z)
+        rows.append(np.array(dr.grad(image))[..., 0].astype(float))
+
+    def step(seed: int) -> None:
+        positions = mi.Float(base)
+        dr.enable_grad(positions)
+        parameters[place] = positions
+        parameters.update()
+        image = mi.render(scene, parameters, spp=samples, seed=seed)
+        dr.backward(dr.sum(image * image, axis=None))
+        dr.eval(dr.grad(positions))
+        dr.sync_thread()
+
+    return rows, median_ms(step)
+
+
+def cost(work: Any, side: int, edge_samples: list[int]) -> None:
+    heights = work.bumps(side)[0].astype(np.float32)
+    scene = make_scene(work, heights, "B", "low", side)
+
+    def loss(heights: jax.Array, key: jax.Array, settings: jaxhf.Settings) -> jax.Array:
+        return jnp.sum(jaxhf.render(scene.with_heights(heights), settings, key=key) ** 2)
+
+    key = jax.random.key(0)
+    frame = jax.jit(lambda heights: jaxhf.render(scene.with_heights(heights), jaxhf.Settings()))
+    variants: dict[str, Callable[[], object]] = {"frame": lambda: frame(scene.heights)}
+    for count in edge_samples:
+        step = jax.jit(jax.value_and_grad(lambda heights, key, s=jaxhf.Settings(edge_samples=count): loss(heights, key, s)))
+        variants[f"value and gradient, {count} points"] = lambda step=step: step(scene.heights, key)
+    times: dict[str, list[float]] = {name: [] for name in variants}
+    for variant in variants.values():
+        jax.block_until_ready(variant())
+    for _ in range(9):
+        for name, variant in variants.items():
+            begin = time.perf_counter()
+            jax.block_until_ready(variant())
+            times[name].append(time.perf_counter() - begin)
+    print(f"\n{side} x {side} heights and pixels, camera B, low light, float32, one sample")
+    for name, seconds in times.items():
+        ratio = np.median(np.array(seconds) / np.array(times["frame"]))
+        print(f"  {name:34s} {1e3 * np.median(seconds):8.1f} ms   {ratio:6.2f} of the frame", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--peers", type=Path, required=True)
+    parser.add_argument("--views", nargs="*", default=["B-low", "A-low", "A-std"], help="camera and light")
+    parser.add_argument("--samples", type=int, nargs="*", default=[16], help="of the picture, a pixel")
+    parser.add_argument("--edge-samples", type=int, nargs="*", default=[0, 10000, 100000])
+    parser.add_argument("--fine", type=int, default=48 * 48, help="samples a pixel of the differences made here")
+    parser.add_argument("--cost", type=int, default=256, help="heights a side; 0: leave it out")
+    parser.add_argument("--mitsuba", type=int, default=0, metavar="SAMPLES")
+    options = parser.parse_args()
+    work = common_work(options.peers)
+    if options.cost:
+        cost(work, options.cost, options.edge_samples)
+    jax.config.update("jax_enable_x64", True)
+    for view in options.views:
+        accuracy(work, options, *view.split("-"))
 
 
 if __name__ == "__main__":

@@ -67,7 +67,9 @@ def _draw_edges(world: World, camera: Camera, settings: Settings, key: jax.Array
     def chunk(lottery: Lottery, key: jax.Array, first: jax.Array):
         u = jax.random.uniform(key, (size, 2), camera.world_from_camera.dtype)
         points, crossings = jax.vmap(functools.partial(one, lottery))(first + jnp.arange(size, dtype=jnp.int32), u)
-        light = jax.vmap(lambda crossing: jax.vmap(functools.partial(beside, crossing))(crossing.sides))(crossings)
+        # One batch: a `vmap` of a `vmap` would have to do all that `only_where` leaves out.
+        sides, both = crossings.sides.reshape(-1, 2), jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), crossings)
+        light = jax.vmap(beside)(both, sides).reshape(size, 2, 3)
         jump = (light[:, 0] - light[:, 1]) * jnp.where(crossings.valid, points.measure, 0)[:, None]
         return points, crossings, jump[:, :, None] * crossings.across[:, None, :]
 
@@ -84,6 +86,7 @@ def _draw_edges(world: World, camera: Camera, settings: Settings, key: jax.Array
             # By how much the pixel changes as the edge is lifted; and, for what moves it otherwise, as if all had one speed.
             total = jnp.sum(sizes)
             mean_speed = jnp.sum(sizes * crossings.speed) / jnp.where(total > 0, total, 1)
+            mean_speed = jnp.where(mean_speed > 0, mean_speed, 1)  # seen from straight above, lifting moves nothing
             sizes = sizes * (crossings.speed + mean_speed)
             return refined_weights(world, settings, weights, points.edge.ravel(), sizes.ravel())
 

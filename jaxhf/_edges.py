@@ -145,7 +145,8 @@ def refined_weights(
     """The weights times what a first round of draws from them has found on each edge, by `made_of`.
 
     Where an edge has few draws, the mean over its block of cells counts, and where that has few, the mean over all: as if each
-    edge had one draw more, with the mean of its block. No edge that may count loses all its weight, so nothing is biased.
+    edge had one draw more, with the mean of its block. No edge that may count loses all its weight, so nothing is biased;
+    where nothing was found at all, the weights stay as they are.
 
     Args:
       world, settings: for `sources`.
@@ -162,7 +163,8 @@ def refined_weights(
         mean = (jnp.sum(total) + everywhere) / (jnp.sum(n) + 1)
         mean = (total_block + mean) / (n_block + 1)
         refined.append(((total + mean[None].repeat(3, axis=0)) / (n + 1)).ravel())
-    return weights * jnp.concatenate(refined)
+    factors = jnp.concatenate(refined)
+    return weights * jnp.where((factors > 0).any(), factors, 1)
 
 
 def _over_blocks(values: Float[jax.Array, "3 ny nx"]) -> Float[jax.Array, "ny nx"]:
