@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compare import DOWN, SLACK
 
 import jaxhf
 
-SLACK = {np.float32: 8 * 2.0**-24, np.float64: 8 * 2.0**-53}  # as in `test_cast`
 FLAT = jaxhf.Settings(shading="flat")
-DOWN = np.array([0.0, 0.0, -1.0])
 HITS, PART = 1000, 100
 ROUGH = aimed.Ground(aimed.random_heights((33, 17), 1.0, seed=3), dx=0.3, dy=2.0)
 TILTED = (0.25 * np.arange(17) - 0.5 * np.arange(33)[:, None]).astype(np.float32).astype(np.float64)
