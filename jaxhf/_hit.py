@@ -88,6 +88,23 @@ class Origin(eqx.Module):
         )
 
 
+def leave(grid: Grid, hit: Hit, d: Vector) -> tuple[Ray, Origin]:
+    """The ray along `d` (world frame) from a hit on `grid`, on the side of its triangle to which `d` points.
+
+    It starts at the hit's place in the footprint and at the surface's height there, as `hit.p` may be far from the grid's
+    own corner, and coarse. A ray in the plane of the triangle stays on the side that the hit was met from. A hit that is
+    none gives a ray that is not valid.
+    """
+    ahead = dot(unit(d), hit.n)
+    side = jnp.where(ahead == 0, hit.side, jnp.where(ahead > 0, 1, -1).astype(hit.side.dtype))
+    origin = Origin(eqx.tree_at(lambda hit: hit.side, hit, side), jnp.ones((), bool))
+    at = origin.departure(grid)
+    a, b, c = triangle_plane(grid.z, at.ix, at.iy, at.upper)
+    u, v = at.x - at.ix.astype(at.x.dtype), at.y - at.iy.astype(at.y.dtype)
+    p = grid.world_from_grid.point(jnp.stack([at.x, at.y, c + a * u + b * v]))
+    return Ray(p, jnp.where(hit.status == int(Status.HIT), d, 0)), origin
+
+
 def intersect(
     surface: Surface,
     ray: Ray,

@@ -1,8 +1,8 @@
-"""Rays aimed at the hard places of a heightfield, by name: `FAMILIES[name](ground, generator, count)`.
+"""Rays aimed at the hard places of a heightfield, by name: `aimed(name, ground, count, seed)`.
 
 Random rays alone prove little: what goes wrong goes wrong at vertices, on edges, along the axes, at grazing angles and at the
-border. All rays are NumPy float64; lengths of directions vary. A ray that is steeper than every triangle crosses the surface
-wherever it is aimed at a point off the border, so that it must hit; such rays say so.
+border. All rays are NumPy float64; what they are aimed at, if anything, is at o + d. A ray that is steeper than every triangle
+crosses the surface wherever it is aimed at a point off the border, so that it must hit; such rays say so.
 """
 
 from collections.abc import Callable
@@ -74,10 +74,6 @@ def random_heights(shape: tuple[int, int], scale: float, seed: int) -> np.ndarra
     return (scale * waves).astype(np.float32).astype(np.float64)
 
 
-def _stretched(generator: np.random.Generator, d: np.ndarray) -> np.ndarray:
-    return d * 2.0 ** generator.integers(-6, 7, (len(d), 1))
-
-
 def _aim(ground: Ground, generator: np.random.Generator, x: np.ndarray, y: np.ndarray) -> Rays:
     """Rays at points of the surface given in cells, half of them steep, from above or below, half from anywhere.
 
@@ -93,7 +89,7 @@ def _aim(ground: Ground, generator: np.random.Generator, x: np.ndarray, y: np.nd
     climb = generator.choice([-1, 1], count) * (1.05 + generator.random(count)) * (ground.slope * away + 0.01 * ground.range)
     above = target + np.stack([away * np.cos(turn), away * np.sin(turn), climb], axis=1)
     o = np.where(steep[:, None], above, o)
-    return Rays(o, _stretched(generator, target - o), np.where(steep, _certain(ground, x, y), OPEN))
+    return Rays(o, target - o, np.where(steep, _certain(ground, x, y), OPEN))
 
 
 def _certain(ground: Ground, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -151,7 +147,7 @@ def along_diagonals(ground: Ground, generator: np.random.Generator, count: int) 
     o = target + np.stack(
         [steps * ground.dx, across * steps * ground.dy, ground.range * generator.uniform(-1, 1, count)], axis=1
     )
-    return Rays(o, _stretched(generator, target - o), np.full(count, OPEN))
+    return Rays(o, target - o, np.full(count, OPEN))
 
 
 def vertical(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
@@ -163,8 +159,7 @@ def vertical(ground: Ground, generator: np.random.Generator, count: int) -> Rays
     target = ground.points(x, y)
     side = generator.choice([-1, 1], count)
     o = target + np.stack([np.zeros(count), np.zeros(count), side * ground.range * generator.uniform(0.01, 3, count)], axis=1)
-    d = np.stack([np.zeros(count), np.zeros(count), -side.astype(float)], axis=1)
-    return Rays(o, _stretched(generator, d), _certain(ground, x, y))
+    return Rays(o, target - o, _certain(ground, x, y))
 
 
 def axis_aligned(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
@@ -181,7 +176,7 @@ def axis_aligned(ground: Ground, generator: np.random.Generator, count: int) -> 
     length = np.where(along_x, nx * ground.dx, ny * ground.dy)
     goal = ground.low + ground.range * generator.random(count)
     d = np.stack([along_x * forward * length, ~along_x * forward * length, np.where(level, 0, goal - o[:, 2])], axis=1)
-    return Rays(o, _stretched(generator, d), np.full(count, OPEN))
+    return Rays(o, d, np.full(count, OPEN))
 
 
 def grazing(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
@@ -197,7 +192,24 @@ def grazing(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
     rise = np.where(to_triangle, tilt / 1e-3, 0) + angle
     d = np.stack([ground.dx * step[0], ground.dy * step[1], 1e-3 * rise], axis=1)
     back = np.where(to_triangle, generator.uniform(0.5, 5, count), generator.uniform(0.5, 2, count) * max(nx, ny)) * 1e3
-    return Rays(target - back[:, None] * d, _stretched(generator, d * back[:, None]), np.full(count, OPEN))
+    return Rays(target - back[:, None] * d, d * back[:, None], np.full(count, OPEN))
+
+
+def skimming(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
+    """At 1e-6 rad, in world units, to the triangle that they are aimed at or, every second ray, to the horizontal."""
+    nx, ny = ground.cells
+    x, y = generator.uniform(0, nx, count), generator.uniform(0, ny, count)
+    target = ground.points(x, y)
+    turn = generator.uniform(0, 2 * np.pi, count)
+    step = 1e-3 * np.stack([np.cos(turn), np.sin(turn)])
+    to_triangle = np.arange(count) % 2 == 0
+    here, along_x, along_y = (ground.points(x + i, y + j) - target for i, j in (step, (step[0], 0 * turn), (0 * turn, step[1])))
+    normal = np.where(to_triangle[:, None], np.cross(along_x, along_y), [0.0, 0.0, 1.0])
+    tangent = np.where(to_triangle[:, None], here, here * [1.0, 1.0, 0.0])
+    normal, tangent = (v / np.maximum(np.linalg.norm(v, axis=1), 1e-300)[:, None] for v in (normal, tangent))
+    back = generator.uniform(0.1, 1, count) * max(nx * ground.dx, ny * ground.dy)
+    d = back[:, None] * (tangent + generator.choice([-1e-6, 1e-6], (count, 1)) * normal)
+    return Rays(target - d, d, np.full(count, OPEN))
 
 
 def border(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
@@ -219,7 +231,7 @@ def through_side(ground: Ground, generator: np.random.Generator, count: int) -> 
     outside[np.arange(count), axis] = np.where(generator.random(count) < 0.5, -1, 1) * generator.uniform(1.01, 3, count)
     corner = np.array([ground.x0, ground.y0, ground.low])
     o = corner + size * outside
-    return Rays(o, _stretched(generator, corner + size * inside - o), np.full(count, OPEN))
+    return Rays(o, corner + size * inside - o, np.full(count, OPEN))
 
 
 def miss(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
@@ -233,12 +245,12 @@ def miss(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
         point[np.arange(count), axis] = 0.5 + side * generator.uniform(0.51, 1, count)
     swap = side * (two - one)[np.arange(count), axis] < 0
     one, two = np.where(swap[:, None], two, one), np.where(swap[:, None], one, two)
-    return Rays(corner + size * one, _stretched(generator, size * (two - one)), np.full(count, MISS))
+    return Rays(corner + size * one, size * (two - one), np.full(count, MISS))
 
 
 def random(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
     o = ground.anywhere(generator, count)
-    return Rays(o, _stretched(generator, ground.anywhere(generator, count, 0.2) - o), np.full(count, OPEN))
+    return Rays(o, ground.anywhere(generator, count, 0.2) - o, np.full(count, OPEN))
 
 
 FAMILIES: dict[str, Callable[[Ground, np.random.Generator, int], Rays]] = {
@@ -250,6 +262,7 @@ FAMILIES: dict[str, Callable[[Ground, np.random.Generator, int], Rays]] = {
     "vertical": vertical,
     "axis_aligned": axis_aligned,
     "grazing": grazing,
+    "skimming": skimming,
     "border": border,
     "through_side": through_side,
     "miss": miss,
@@ -257,9 +270,14 @@ FAMILIES: dict[str, Callable[[Ground, np.random.Generator, int], Rays]] = {
 }
 
 
-def aimed(name: str, ground: Ground, count: int, seed: int, roundable: bool = False) -> Rays:
-    """`count` rays of one family; `roundable`: rounded to single precision, so that float32 renderers see the same rays."""
-    rays = FAMILIES[name](ground, np.random.default_rng([seed, list(FAMILIES).index(name)]), count)
-    if not roundable:
-        return rays
-    return rays._replace(o=rays.o.astype(np.float32).astype(np.float64), d=rays.d.astype(np.float32).astype(np.float64))
+def aimed(name: str, ground: Ground, count: int, seed: int, roundable: bool = False, stretched: bool = True) -> Rays:
+    """`count` rays of one family.
+
+    roundable: they are rounded to single precision, so that float32 renderers see the same rays. stretched: their
+    directions are multiplied by powers of two of all sizes, and what they are aimed at is no longer at o + d.
+    """
+    generator = np.random.default_rng([seed, list(FAMILIES).index(name)])
+    rays = FAMILIES[name](ground, generator, count)
+    if roundable:
+        rays = rays._replace(o=rays.o.astype(np.float32).astype(np.float64), d=rays.d.astype(np.float32).astype(np.float64))
+    return rays._replace(d=rays.d * 2.0 ** generator.integers(-6, 7, (count, 1))) if stretched else rays

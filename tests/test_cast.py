@@ -1,12 +1,4 @@
-"""`cast` against the oracle, closed forms and central differences: which rays hit, where, and how that moves.
-
-A ray may end in another way than the oracle says only where a rounding decides. How far rounding goes is `SLACK`, the shift
-of a ray against the surface relative to the largest lengths that occur (see `oracle.OracleHit`). Behind a height over the
-surface stand about a dozen operations, each rounded to half of `eps`: into the frame of the grid, to the box, along the ray,
-along an edge. In double precision the oracle's own rounding is part of it.
-"""
-
-import dataclasses
+"""`cast` against the oracle, closed forms and central differences: which rays hit, where, and how that moves."""
 
 import aimed
 import jax
@@ -14,78 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
+from compare import COUNT, DOWN, DTYPES, ROUGH, SLACK, assert_none, compare_with_oracle, every_family, heightfield, numpied
 
 import jaxhf
 
-DTYPES = [np.float32, np.float64]
-SLACK = {np.float32: 8 * 2.0**-24, np.float64: 8 * 2.0**-53}
 SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
-DOWN = np.array([0.0, 0.0, -1.0])
-# One size of field and of batch for many tests: each other one is compiled anew.
-ROUGH = aimed.Ground(aimed.random_heights((33, 17), 1.0, seed=3), dx=0.5, dy=2.0, x0=-3.0, y0=10.0)
-PER_FAMILY = 100
-COUNT = PER_FAMILY * len(aimed.FAMILIES)
-
-
-def heightfield(ground: aimed.Ground, dtype: type[np.floating] = np.float64) -> jaxhf.Heightfield:
-    return jaxhf.Heightfield(ground.heights.astype(dtype), *ground[1:])
-
-
-def numpied(hit):
-    """The fields of a Hit as NumPy arrays in double precision or integers."""
-    fields = {field.name: getattr(hit, field.name) for field in dataclasses.fields(hit)}
-    arrays = {name: np.asarray(value) for name, value in fields.items() if value is not None}
-    return {name: value.astype(np.float64) if value.dtype.kind == "f" else value for name, value in arrays.items()}
-
-
-def every_family(ground: aimed.Ground, seed: int) -> tuple[aimed.Rays, np.ndarray]:
-    """Rays of each family, one after the other, as float32 numbers, and the names that go with them."""
-    parts = [aimed.aimed(name, ground, PER_FAMILY, seed, roundable=True) for name in aimed.FAMILIES]
-    o, d, expect = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return aimed.Rays(o, d, expect), np.repeat(list(aimed.FAMILIES), PER_FAMILY)
-
-
-def assert_none(wrong, names, rays):
-    """Asserts that `wrong` marks no ray; says of which families they are, and gives the first."""
-    where = np.flatnonzero(wrong)
-    counts = dict(zip(*np.unique(names[where], return_counts=True), strict=True))
-    assert len(where) == 0, f"{counts}; first: ray {where[0]}, o = {rays.o[where[0]].tolist()}, d = {rays.d[where[0]].tolist()}"
-
-
-def compare_with_oracle(ground: aimed.Ground, rays: aimed.Rays, names: np.ndarray, dtype: type[np.floating]):
-    """Asserts that `cast` is right about every ray; returns what the oracle says."""
-    hit = numpied(jaxhf.cast(heightfield(ground, dtype), rays.o, rays.d))
-    expected = oracle.cast(*ground, rays.o, rays.d, slack=SLACK[dtype])
-    eps = np.finfo(dtype).eps
-    met, t = hit["status"] == jaxhf.Status.HIT, hit["t"]
-    assert_none(~np.isin(hit["status"], (jaxhf.Status.HIT, jaxhf.Status.MISS)), names, rays)
-    assert_none(expected.decided & (hit["status"] != expected.status), names, rays)
-    assert_none(met != np.isfinite(t), names, rays)
-    assert_none(met & ((t <= 0) | (t < expected.earliest)), names, rays)
-    assert_none(met & expected.decided & (t > expected.latest), names, rays)
-    for name, value in hit.items():
-        assert_none(~np.isfinite(value.reshape(len(t), -1)).all(1) & (met | (name != "t")), names, rays)
-
-    # The point is on the ray and on the surface, each to within a shift; its coordinates are rounded once more, with x0 and y0.
-    along = rays.o + np.where(met, t, 0)[:, None] * rays.d
-    corner = eps * np.array([abs(ground.x0), abs(ground.y0), abs(ground.low) + ground.range])
-    shift = expected.shift[:, None] * [ground.dx, ground.dy]
-    assert_none(met & (np.abs(hit["p"] - along) > np.column_stack([shift, 2 * expected.rise]) + corner).any(1), names, rays)
-
-    # Where shifted rays hit close to each other, and away from edges, the triangle is known and with it all the rest.
-    cells = ground.cells
-    spread = np.where(expected.decided & met, expected.spread, 0)
-    reach = np.max(np.abs(rays.d[:, :2]) / [ground.dx, ground.dy], axis=1) * spread + expected.shift
-    sharp = met & expected.decided & (reach < expected.place.inside)
-    place = expected.place
-    assert_none(sharp & (hit["cell"] != place.cell).any(1), names, rays)
-    assert_none(sharp & (hit["triangle"] != place.triangle), names, rays)
-    assert_none(sharp & (np.abs(hit["uv"] - place.uv) * cells > reach[:, None]).any(1), names, rays)
-    # The normal: a length and products, and before them two heights, each rounded relative to the range of all heights.
-    off = eps * ground.range * (1 / ground.dx + 1 / ground.dy) * place.n[:, 2]
-    assert_none(sharp & (np.abs(hit["n"] - place.n).max(1) > 4 * eps + off), names, rays)
-    assert_none(sharp & (hit["side"] * (place.n * rays.d).sum(1) > 0), names, rays)
-    return expected, sharp
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -109,15 +34,6 @@ def test_agrees_with_oracle_over_holes(dtype):
     whole = oracle.cast(*ROUGH, rays.o, rays.d)
     expected, _ = compare_with_oracle(ROUGH._replace(heights=heights), rays, names, dtype)
     assert np.sum(expected.decided & (expected.status != whole.status)) > 15
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("scale", [1e-20, 1e20])
-def test_extreme_heights(scale, dtype):
-    ground = aimed.Ground(aimed.random_heights((33, 17), scale, seed=5), dx=0.5, dy=2.0)
-    rays, names = every_family(ground, seed=6)
-    expected, _ = compare_with_oracle(ground, rays, names, dtype)
-    assert np.sum(expected.decided & (expected.status == oracle.HIT)) > 300
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -319,41 +235,6 @@ def test_a_hit_beside_misses_keeps_its_derivative():
     assert reverse_mode(primals, of_t)[0].sum() == pytest.approx(-12)  # lifting the field by 1 brings each hit closer by 1
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_invalid_rays(dtype):
-    bad = [np.nan, np.inf, -np.inf]
-    o, d = np.tile([0.0, 11.0, 5.0], (COUNT, 1)), np.tile(DOWN, (COUNT, 1))
-    for k in range(9):
-        o[k, k // 3] = bad[k % 3]
-        d[9 + k, k // 3] = bad[k % 3]
-    d[18] = 0
-    hit = numpied(jaxhf.cast(heightfield(ROUGH, dtype), o, d))
-    np.testing.assert_array_equal(hit["status"][:19], jaxhf.Status.INVALID)
-    np.testing.assert_array_equal(hit["status"][19:], jaxhf.Status.HIT)
-    for name, value in hit.items():
-        assert np.all(np.isposinf(value[:19]) if name == "t" else np.isfinite(value)), name
-
-
-def test_a_hole_lets_rays_through():
-    heights = np.zeros((4, 5))
-    heights[1, 2], heights[:, 3:] = np.nan, 2.0
-    x, y = np.meshgrid(np.arange(4) + 0.5, np.arange(3) + 0.25)
-    o, d = np.stack([x.ravel(), y.ravel(), np.full(12, 3.0)], axis=1), np.broadcast_to(DOWN, (12, 3))
-    # Across the hole, over and under the sheet behind it: the side on which the ray stands is found anew.
-    across = np.array([[0.5, 0.5, 2.75], [0.5, 0.5, 0.5]]), np.array([[1.0, 0.0, -0.25], [1.0, 0.0, 0.0]])
-    o, d = np.concatenate([o, across[0]]), np.concatenate([d, across[1]])
-    hit = jaxhf.cast(jaxhf.Heightfield(heights.astype(np.float32), 1.0), o, d)
-    np.testing.assert_array_equal(hit.status[:12].reshape(3, 4), [[1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]])
-    np.testing.assert_array_equal(hit.status[12:], [jaxhf.Status.HIT, jaxhf.Status.MISS])
-    np.testing.assert_allclose(hit.t[12], 3, rtol=4 * float(np.finfo(np.float32).eps))
-
-
-def test_nothing_but_holes_is_never_hit():
-    rays, _ = every_family(ROUGH, seed=21)
-    status = jaxhf.cast(heightfield(ROUGH._replace(heights=np.full_like(ROUGH.heights, np.nan))), rays.o, rays.d).status
-    np.testing.assert_array_equal(status, jaxhf.Status.MISS)
-
-
 @pytest.mark.parametrize(("traversal", "max_steps", "enough"), [("dda", 19, False), ("dda", 20, True), ("pyramid", 1, False)])
 def test_a_budget_that_runs_out_is_reported(traversal, max_steps, enough):
     """Twenty cells to a wall, none of them passed by its bounds; "dda" takes a step for each. The rest is as ever."""
@@ -365,90 +246,6 @@ def test_a_budget_that_runs_out_is_reported(traversal, max_steps, enough):
     status = jaxhf.cast(jaxhf.Heightfield(heights, 1.0), o, d, settings=settings).status
     hit, miss, exhausted = jaxhf.Status.HIT, jaxhf.Status.MISS, jaxhf.Status.EXHAUSTED
     np.testing.assert_array_equal(status, [hit if enough else exhausted, hit, miss])
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_where_the_ray_starts(dtype):
-    """Over z = |x| on a grid whose numbers are all exact: above, below, on a flank, on the ridge, in front of its end."""
-    x, _ = np.meshgrid(np.arange(-4.0, 5), np.arange(4))
-    field = jaxhf.Heightfield(np.abs(x).astype(dtype), 1.0, 1.0, x0=-4.0)
-    cases = [  # origin, direction, t
-        ((2.5, 1.5, 3.5), (0, 0, -1), 1.0),  # above, inside the box
-        ((2.5, 1.5, 1.5), (0, 0, 1), 1.0),  # below, inside the box
-        ((2.5, 1.5, 1.5), (0, 0, -1), np.inf),
-        ((2.5, 1.5, -3.0), (0, 0, 2), 2.75),  # below the box
-        ((0.5, 1.5, 2.0), (2, 0, 0), 0.75),  # between the flanks
-        ((-3.0, 1.5, 2.0), (1, 0, 0), 1.0),  # under one flank: its back first
-        ((2.0, 1.5, 2.0), (-1, 0, 0), 4.0),  # on a flank: not at t = 0, but across the valley
-        ((2.0, 1.5, 2.0), (-1, 0, -1.5), np.inf),  # on a flank and through it
-        ((2.0, 1.5, 2.0), (0, 0, 1), np.inf),
-        ((2.0, 1.5, 2.0), (0, 0, -1), np.inf),
-        ((2.0, 1.5, 2.0), (1, 0, 1), np.inf),  # in the plane of the flank
-        ((0.0, 1.5, 0.0), (1, 0, 0.5), np.inf),  # in the bottom of the valley, and under it
-        ((0.0, 1.5, 0.0), (1, 0.25, 2), np.inf),  # and out of it
-        ((-5.0, 1.5, 0.5), (1, 0, 0), 4.5),  # from outside, in under a flank and through its back
-        ((5.0, 1.5, 7.0), (-1, 0, -2), 2.0),  # from outside, over the end of a flank
-    ]
-    o, d, t = (np.array(values, np.float64) for values in zip(*cases, strict=True))
-    hit = numpied(jaxhf.cast(field, o, d))
-    np.testing.assert_array_equal(hit["status"], np.where(np.isfinite(t), jaxhf.Status.HIT, jaxhf.Status.MISS))
-    np.testing.assert_allclose(hit["t"], t, rtol=4 * float(np.finfo(dtype).eps))
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_flat_field(dtype):
-    """z = 7, where the box of the surface has no height."""
-    generator = np.random.default_rng(15)
-    field = jaxhf.Heightfield(np.full((6, 8), 7, dtype), 0.5, 2.0, x0=-1.0, y0=3.0)
-    target = np.column_stack([generator.uniform(-0.9, 2.4, 200), generator.uniform(3.1, 12.9, 200), np.full(200, 7.0)])
-    o = target + generator.uniform(-4, 4, (200, 3))
-    beside = np.array([[-3.0, 5.0, 7.0], [0.0, 5.0, 7.0], [-3.0, 5.0, 7.5], [0.0, 5.0, 8.0], [0.0, 5.0, 6.0]])
-    away = np.array([[1.0, 0.1, 0.0], [1.0, 0.1, 0.0], [1.0, 0.1, 0.0], [0.0, 0.0, 1.0], [1.0, 2.0, -1.0]])
-    hit = numpied(jaxhf.cast(field, np.concatenate([o, beside]), np.concatenate([target - o, away])))
-    np.testing.assert_array_equal(hit["status"], np.repeat([jaxhf.Status.HIT, jaxhf.Status.MISS], [200, 5]))
-    # o is rounded relative to the largest distance, 20, over the smallest step towards the plane.
-    np.testing.assert_allclose(hit["t"][:200], 1, rtol=float(np.finfo(dtype).eps) * 20 / np.abs(o[:, 2] - 7).min())
-    np.testing.assert_array_equal(hit["n"][:200], [[0, 0, 1]] * 200)
-    np.testing.assert_array_equal(hit["side"][:200], np.where(o[:, 2] > 7, 1, -1))
-
-
-@pytest.mark.parametrize("dtype", DTYPES)
-def test_exactly_on_the_border(dtype):
-    """The footprint is closed: vertical rays at border vertices and edges hit where all numbers are exact, and none beside."""
-    ground = aimed.Ground(aimed.random_heights((5, 4), 1.0, seed=16), dx=0.5, dy=2.0)
-    x, y = (values.ravel() for values in np.meshgrid(np.arange(0, 3.25, 0.25), np.arange(0, 4.25, 0.25)))
-    rim = (x == 0) | (x == 3) | (y == 0) | (y == 4)
-    outwards = np.stack([np.sign(x - 1.5) * (abs(x - 1.5) == 1.5), np.sign(y - 2) * (abs(y - 2) == 2), 0 * x], axis=1)[rim]
-    o = ground.points(x[rim], y[rim]) + np.array([0, 0, 3])
-    for start, expected in ((o, jaxhf.Status.HIT), (o + 1e-5 * outwards, jaxhf.Status.MISS)):
-        status = jaxhf.cast(heightfield(ground, dtype), start, np.broadcast_to(DOWN, o.shape)).status
-        np.testing.assert_array_equal(status, expected)
-
-
-def test_an_offset_costs_no_accuracy():
-    """In UTM coordinates and single precision the same bits as at the origin, when the rays are NumPy's."""
-    offset = np.array([449_000.5, 5.4e6, 0])
-    near, far = (ROUGH._replace(x0=float(corner[0]), y0=float(corner[1])) for corner in (0 * offset, offset))
-    rays, _ = every_family(near, seed=18)
-    o = np.round(rays.o * 2.0**10) / 2.0**10  # so that adding the offset is exact in double precision
-    one, two = (numpied(jaxhf.cast(heightfield(g, np.float32), o + np.array([g.x0, g.y0, 0]), rays.d)) for g in (near, far))
-    for name in set(one) - {"p"}:
-        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
-    assert np.sum(one["status"] == jaxhf.Status.HIT) > 300
-    np.testing.assert_allclose(two["p"], one["p"] + offset, atol=0.25 + 1e-3)  # there float32 has steps of 0.5
-
-
-def test_length_of_the_direction_does_not_matter():
-    """t scales with it; powers of two change no bit, from one end of single precision's range to the other."""
-    rays, _ = every_family(ROUGH, seed=19)
-    d = rays.d / 2.0 ** np.floor(np.log2(np.abs(rays.d).max(1)))[:, None]
-    d = np.where(np.abs(d) < 1e-6, 0, d)  # the smallest components must not get lost
-    field = heightfield(ROUGH, np.float32)
-    plain = numpied(jaxhf.cast(field, rays.o, d))
-    for exponent in (-90, 90):
-        scaled = numpied(jaxhf.cast(field, rays.o, d * 2.0**exponent))
-        for name in plain:
-            np.testing.assert_array_equal(scaled[name] * (2.0**exponent if name == "t" else 1), plain[name], err_msg=name)
 
 
 def test_shapes_and_precision():

@@ -27,7 +27,10 @@ def compare_both_ways(field: aimed.Ground, rays: aimed.Rays, name: str) -> np.nd
     assert np.all(t[hit] >= swept.earliest[hit] - tolerance)
     assert np.all(t[hit] <= swept.latest[hit] + tolerance)
     narrow = hit & (swept.spread < 1e-9 * t)
-    if min(field.heights.shape) > 2 and name != "grazing":  # else too few of the hits are away from borders and silhouettes
+    if min(field.heights.shape) > 2 and name not in (
+        "grazing",
+        "skimming",
+    ):  # else too few of the hits are away from borders and silhouettes
         assert narrow.sum() >= 0.75 * hit.sum()
     np.testing.assert_allclose(swept.t[narrow], t[narrow], rtol=1e-9)
     sharp = narrow & (swept.place.inside > 1e-6)

@@ -247,12 +247,13 @@ def test_exhausted_rays_are_no_misses():
 # Holes.
 
 
-def test_holes_show_the_background_and_cast_no_shadow():
+@pytest.mark.parametrize("hole", [np.nan, np.inf, -np.inf])
+def test_holes_show_the_background_and_cast_no_shadow(hole):
     # A ridge along x = 1/2, 1/8 high and 1/8 wide at each side, in light from the east at slope 1/2. Its middle is missing.
     heights = np.zeros((9, 9))
     heights[:, 4] = 1 / 8
     broken = heights.copy()
-    broken[4, 4] = np.nan
+    broken[4, 4] = hole
     camera = jaxhf.Perspective.look_at((0.5, 0.5, 2), (0.5, 0.5, 0), (0, 1, 0), fov=18, width=WIDTH, height=HEIGHT)
 
     def seen(heights):
