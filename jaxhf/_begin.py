@@ -89,6 +89,7 @@ def begin(
         t_end=jnp.where(inv_z > 0, grid.z_top - z_ray, -z_ray) * inv_z,
         t_stop=jnp.full_like(x, jnp.inf),
         ahead=None if departure is None else (departure.upper == begins_upper) & (rate != 0),
+        noise=None if departure is None else jnp.where(departure.active, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
     )
     t_stop = lesser(lesser(walk.distance_x(end_x), walk.distance_y(end_y)), walk.t_end)
     walk = eqx.tree_at(lambda walk: walk.t_stop, walk, t_stop if t_max is None else lesser(t_stop, t_max - t_start))

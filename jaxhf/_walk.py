@@ -92,6 +92,8 @@ class Walk(eqx.Module):
       t_end: where the ray leaves the grid's floor or ceiling.
       t_stop: where it leaves the box, or what it is asked for.
       ahead: for a ray that departs from a triangle, whether the cell's diagonal may lie before it; None where none does.
+      noise: for such rays, a g no larger than this has no sign: near a vertex the ray crosses into a neighbour at once,
+        where g is all rounding, and a neighbour in the same plane would be met.
     """
 
     z: Float[jax.Array, "ny nx"]
@@ -113,6 +115,7 @@ class Walk(eqx.Module):
     t_end: Scalar
     t_stop: Scalar
     ahead: Flag | None
+    noise: Scalar | None
 
     @property
     def bits_x(self) -> int:
@@ -205,8 +208,10 @@ class Walk(eqx.Module):
         low = jnp.where(through_x, jnp.where(self.back_x, z00, z10), jnp.where(self.back_y, z00, z01))
         high = jnp.where(through_x, jnp.where(self.back_x, z01, z11), jnp.where(self.back_y, z10, z11))
         gap_out = self._gap(out, low, high, jnp.where(through_x, v, u))
-        gap_out = jnp.where(last, self.dz, gap_out)  # below the lowest height or above the highest: no rounding can hide it
         gap_diagonal = self._gap(diagonal, z00, z11, along(diagonal)[0])
+        if self.noise is not None:
+            gap_out, gap_diagonal = (jnp.where(jnp.abs(gap) <= self.noise, 0, gap) for gap in (gap_out, gap_diagonal))
+        gap_out = jnp.where(last, self.dz, gap_out)  # below the lowest height or above the highest: no rounding can hide it
         met_first = crosses & ~on_own & _opposite(above, gap_diagonal)
         met = whole & (met_first | (~skip_out & _opposite(above, gap_out)))
         # A diagonal that is not crossed: which side of it the ray is on.

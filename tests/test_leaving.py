@@ -16,11 +16,12 @@ ROUGH = aimed.Ground(aimed.random_heights((33, 17), 1.0, seed=3), dx=0.3, dy=2.0
 TILTED = (0.25 * np.arange(17) - 0.5 * np.arange(33)[:, None]).astype(np.float32).astype(np.float64)
 
 
-def hits_all_over(ground: aimed.Ground, dtype: type[np.floating]) -> tuple[jaxhf.Heightfield, jaxhf.Hit]:
-    """From above and from below, inside of triangles and on edges, a twentieth of a cell away from vertices."""
+def hits_all_over(ground: aimed.Ground, dtype: type[np.floating], margin: float) -> tuple[jaxhf.Heightfield, jaxhf.Hit]:
+    """From above and from below, inside of triangles, on edges and, without a margin (in cells), at vertices."""
     generator = np.random.default_rng(1)
-    (u, v), kind = generator.uniform(0.05, 0.95, (2, HITS)), generator.integers(0, 6, HITS)
-    u, v = np.where(kind == 1, 1, u), np.where(kind == 2, 1, np.where(kind == 3, u, v))
+    (u, v), kind = generator.uniform(margin, 1 - margin, (2, HITS)), generator.integers(0, 6, HITS)
+    kind[(kind == 4) & (margin > 0)] = 5
+    u, v = np.where((kind == 1) | (kind == 4), 1, u), np.where((kind == 2) | (kind == 4), 1, np.where(kind == 3, u, v))
     x, y = generator.integers(0, ground.cells, (HITS, 2)).T + np.stack([u, v])
     up = np.where(np.arange(HITS) % 2, 1, -1)[:, None]
     field = jaxhf.Heightfield(ground.heights.astype(dtype), *ground[1:])
@@ -45,7 +46,7 @@ def directions(count: int) -> np.ndarray:
 @pytest.mark.parametrize("heights", [np.full((33, 17), 0.7), TILTED])
 def test_a_plane_is_left_for_good(heights, dtype, count):
     """1000 hits x 1000 directions, to both sides of the plane: nothing meets it again."""
-    field, hit = hits_all_over(aimed.Ground(heights, dx=0.3, dy=2.0), dtype)
+    field, hit = hits_all_over(aimed.Ground(heights, dx=0.3, dy=2.0), dtype, 0.0)
     for part in parts(hit):
         status = jaxhf.cast(field, None, directions(count), FLAT, leaving=part).status
         np.testing.assert_array_equal(status, np.full((PART, count), jaxhf.Status.MISS))
@@ -54,7 +55,7 @@ def test_a_plane_is_left_for_good(heights, dtype, count):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_rays_from_rough_terrain_agree_with_crossings(dtype):
     """In double precision, from the exact place on the triangle: none is lost, and none hits what is not there."""
-    field, hit = hits_all_over(ROUGH, dtype)
+    field, hit = hits_all_over(ROUGH, dtype, 0.05)
     count, found, near = 100, 0, 0
     d = np.tile(directions(count), (PART, 1))
     for part in parts(hit):
