@@ -10,7 +10,8 @@ PACKAGE = Path(__file__).parents[1] / "jaxhf"
 FLOW = (
     "_types", "_store", "_lanes", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film",
     "_heightfield", "_pyramid", "_grid",
-    "_cylinder", "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade", "_render", "io", "__init__", "__main__",
+    "_cylinder", "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade", "_render", "io",
+    "_unknowns", "_problem", "_residuals", "_solvers", "_uncertainty", "_fit", "__init__", "__main__",
 )  # fmt: skip
 
 
