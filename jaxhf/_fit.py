@@ -28,6 +28,7 @@ from ._unknowns import Unknowns, make_basis
 from .io._checkpoint import load_arrays, load_facts, save_checkpoint
 
 _REJECTIONS = 8  # in a row: the damping has grown by 4 ** 8
+_HALVINGS = 50  # in a row, in a line search, which starts with the whole gradient
 _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
 _ROBUST_STAGES = 3  # over which the scale of a robust loss comes down to its own
 
@@ -382,7 +383,8 @@ class _Run:
         wanted = _FLAT_STEPS if last else 1
         if len(gains) >= wanted and rejected == 0 and max(map(abs, gains[-wanted:])) < tolerance:
             return Stop.CONVERGED
-        if rejected >= (_REJECTIONS if last else 3):
+        damped = hasattr(self.fresh, "num_steps_since_acceptance")
+        if rejected >= ((_REJECTIONS if last else 3) if damped else _HALVINGS):
             return Stop.STALLED
         return Stop.MAX_STEPS if len(self.history) >= self.max_steps else None
 

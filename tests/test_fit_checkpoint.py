@@ -59,15 +59,14 @@ def test_a_killed_process_loses_at_most_one_interval(tmp_path, whole):
         "jaxhf.fit(*problem(), **OPTIONS, checkpoint=sys.argv[3], progress=progress)"
     )
     here = Path(__file__).parent
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, str(here.parent), str(here), str(path)], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None
-    for line in process.stdout:
-        if int(line) == 5:
-            process.send_signal(signal.SIGKILL)
-            break
-    assert process.wait() == -signal.SIGKILL
+    command = [sys.executable, "-c", script, str(here.parent), str(here), str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if int(line) == 5:
+                process.send_signal(signal.SIGKILL)
+                break
+    assert process.returncode == -signal.SIGKILL
     again = []
     agree(jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True, progress=again.append), whole)
     assert 4 <= again[0].step <= 6  # kept after 4, or a step later than it was told
