@@ -111,6 +111,23 @@ def render(
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
 
+def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Settings) -> Float[jax.Array, "n h w 3"]:
+    """Pictures of scenes that differ in numbers only, one after the other, in one program; for tracing.
+
+    Args:
+      scenes: one `localise`d scene, whose leaves have a leading axis of n scenes.
+      change: what is done to each before it is rendered.
+      settings: the knobs.
+    """
+
+    def one(scene: Scene) -> jax.Array:
+        scene = change(scene)
+        settled = settle(settings, scene)
+        return _trace_all(_on_every_device(scene), settled, (), _settled_key(None, settled))["image"]
+
+    return lax.map(one, scenes)
+
+
 def settle(settings: Settings, scene: Scene) -> Settings:
     """The settings with what they leave to the scene filled in."""
     samples = scene.samples if settings.samples is None else settings.samples

@@ -1,0 +1,128 @@
+"""How far a terrain is from its pictures and from what is known beforehand, in standard deviations."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._material import Matte
+from ._problem import Group, Problem
+from ._render import render_each
+from ._scene import Scene
+from ._texture import ImageTexture
+from ._unknowns import Unknowns
+
+
+def residuals(unknowns: Unknowns, problem: Problem) -> tuple[Any, None]:
+    """All residuals, to be squared and added up; the second value is optimistix's auxiliary output.
+
+    Those of the pictures pass through `soften`, so the sum is the robust loss itself, and a solver that accepts steps by
+    it needs to know nothing of reweighting.
+    """
+    parts = [soften(part, problem.loss, problem.loss_scale) for part in picture_residuals(unknowns, problem)]
+    return (parts, known_residuals(unknowns, problem)), None
+
+
+def half_squares(unknowns: Unknowns, problem: Problem) -> tuple[Float[Array, ""], None]:
+    """Half the sum of the squared residuals: what minimisers take."""
+    leaves = jax.tree.leaves(residuals(unknowns, problem)[0])
+    return sum((jnp.sum(leaf * leaf) for leaf in leaves), start=jnp.zeros((), leaves[0].dtype)) / 2, None
+
+
+def picture_residuals(unknowns: Unknowns, problem: Problem) -> list[Float[Array, "n h w c"]]:
+    """(picture - target) / noise, a group at a time."""
+    images = simulate(unknowns, problem)
+    return [group.weights * (image - group.targets) for group, image in zip(problem.groups, images, strict=True)]
+
+
+def simulate(unknowns: Unknowns, problem: Problem) -> list[Float[Array, "n h w c"]]:
+    """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
+    return [_simulate(unknowns, problem, group) for group in problem.groups]
+
+
+def _simulate(unknowns: Unknowns, problem: Problem, group: Group) -> Float[Array, "n h w c"]:
+    heights = problem.basis.heights(unknowns.waves)
+    n = len(group.places)
+
+    def with_unknowns(scene: Scene) -> Scene:
+        scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights)
+        return scene if unknowns.albedo is None else _painted(scene, unknowns.albedo)
+
+    image = render_each(group.scenes, with_unknowns, problem.settings)
+    if group.targets.shape[-1] == 1:
+        image = jnp.mean(image, axis=-1, keepdims=True)
+    if unknowns.exposures is not None:
+        image = image * jnp.stack([unknowns.exposures[k] for k in group.places]).reshape(n, 1, 1, 1)
+    if unknowns.offsets is not None:
+        image = image + jnp.stack([unknowns.offsets[k] for k in group.places]).reshape(n, 1, 1, 1)
+    return image
+
+
+def _painted(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
+    """The scene with the albedo of its first heightfield multiplied."""
+    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
+    material = scene.objects[k].material
+    assert isinstance(material, Matte)
+    old = material.albedo
+    texels = jnp.asarray(old.texels) if isinstance(old, ImageTexture) else jnp.asarray(old).reshape(1, 1, 3)
+    shape = (*(max(pair) for pair in zip(texels.shape[:2], factor.shape[:2], strict=True)), 3)
+    new = jnp.broadcast_to(texels, shape) * jnp.broadcast_to(factor, shape)
+    albedo = new.reshape(3) if shape[:2] == (1, 1) and not isinstance(old, ImageTexture) else ImageTexture(new)
+    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
+
+
+def known_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
+    """What was known before any picture: the prior, and that terrain is smooth."""
+    heights = problem.basis.heights(unknowns.waves)
+    parts: list[Array] = []
+    if problem.prior is not None:
+        parts.append(problem.prior.weight * (heights - problem.prior.heights))
+    if problem.smoothness is not None:
+        parts.append(problem.smoothness * laplacian(heights))
+    if problem.albedo_smoothness is not None and unknowns.albedo is not None:
+        parts += [problem.albedo_smoothness * laplacian(unknowns.albedo[..., c]) for c in range(unknowns.albedo.shape[-1])]
+    return parts
+
+
+def unusual(unknowns: Unknowns, problem: Problem) -> Float[Array, "ny nx"]:
+    """The waves in units of their usual size."""
+    return unknowns.waves / problem.basis.usual
+
+
+def laplacian(values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
+    """The sum of the differences to the neighbours that a vertex has."""
+    padded = jnp.pad(values, 1, mode="edge")
+    return padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2] - 4 * values
+
+
+def soften(residual: Array, loss: str, scale: Float[Array, ""] | None) -> Array:
+    """A residual whose half square is the robust loss ρ of the given one: sign(r) √(2ρ(r)).
+
+    With k the scale, in standard deviations. huber: quadratic up to k, then linear (Huber 1964); cauchy: k²/2 log(1 + (r/k)²);
+    geman: r²/2 / (1 + (r/k)²) (Geman and McClure 1985), which forgets what is far off altogether.
+    """
+    if loss == "squares" or scale is None:
+        return residual
+    x = residual / scale
+    square = x * x
+    if loss == "huber":
+        far = square > 1
+        size = jnp.sqrt(2 * jnp.where(far, jnp.abs(x), 1) - 1)
+        return scale * jnp.where(far, jnp.sign(x) * size, x)
+    if loss == "cauchy":
+        small = square < 1e-4
+        ratio = jnp.log1p(jnp.where(small, 1, square)) / jnp.where(small, 1, square)
+        return residual * jnp.sqrt(jnp.where(small, 1 - square / 2, ratio))
+    return residual / jnp.sqrt(1 + square)
+
+
+def robust_weight(residual: Array, loss: str, scale: Float[Array, ""] | None) -> Array:
+    """ρ'(r) / r: the weight that a residual has in iteratively reweighted least squares."""
+    if loss == "squares" or scale is None:
+        return jnp.ones_like(residual)
+    square = (residual / scale) ** 2
+    if loss == "huber":
+        return 1 / jnp.sqrt(jnp.maximum(square, 1))
+    return 1 / (1 + square) if loss == "cauchy" else 1 / (1 + square) ** 2

@@ -1,0 +1,130 @@
+"""The solvers, all of them optimistix's, behind one step function that is compiled once."""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optax
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from ._problem import Problem
+from ._residuals import half_squares, residuals
+from ._types import Flag, Scalar
+from ._unknowns import Unknowns
+
+Solver = Literal["lm", "bfgs", "lbfgs", "adam"]
+
+# BFGS keeps a dense matrix of this many rows at most: 128 MiB in double precision.
+BFGS_UNKNOWNS = 4096
+_FIRST_DAMPING = 1e-2
+_RATE = 0.02  # of Adam, in units of a wave's usual size
+
+
+class LevenbergMarquardt(optx.AbstractGaussNewton):
+    """Damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963), each solved without a matrix.
+
+    optimistix's own class is the same with a dense QR decomposition, and lowers the damping only where a step did at
+    least 99 % of what was predicted, which a picture with shadows hardly ever lets it.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable[..., Any]
+    descent: Any
+    search: Any
+    verbose: Callable[..., None]
+
+    def __init__(self, tolerance: float, inner_steps: int):
+        self.rtol = self.atol = tolerance
+        self.norm = optx.rms_norm
+        # LSMR (Fong and Saunders 2011) works on J itself; conjugate gradients on JᵀJ, whose condition is squared, went
+        # non-finite in single precision. Its limit on the condition is lifted: the damping bounds it.
+        self.descent = optx.DampedNewtonDescent(lx.LSMR(rtol=1e-3, atol=0.0, max_steps=inner_steps, conlim=1e16))
+        self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=4.0, low_constant=0.25)
+        self.verbose = _silent
+
+
+def _silent(**_: Any) -> None:
+    pass
+
+
+class Outcome(NamedTuple):
+    """What one step did: the half sum of squares where it now stands, and whether it stands elsewhere than before."""
+
+    loss: Scalar
+    accepted: Flag
+    converged: Flag
+    damping: Scalar
+    change: Scalar
+    unknowns: Unknowns
+
+
+def make_solver(name: str, tolerance: float, inner_steps: int) -> Any:
+    if name == "lm":
+        return LevenbergMarquardt(tolerance, inner_steps)
+    if name == "adam":
+        return optx.OptaxMinimiser(optax.adam(_RATE), rtol=tolerance, atol=tolerance, norm=optx.rms_norm)
+    kind = optx.BFGS if name == "bfgs" else optx.LBFGS
+    return kind(rtol=tolerance, atol=tolerance, norm=optx.rms_norm)
+
+
+def _function(solver: Any) -> Callable[[Unknowns, Problem], Any]:
+    return residuals if isinstance(solver, optx.AbstractLeastSquaresSolver) else half_squares
+
+
+_OPTIONS: dict[str, Any] = {}
+_TAGS: frozenset[object] = frozenset()
+
+
+@eqx.filter_jit
+def begin(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
+    """A solver's state before its first step. Its static parts must be those of the one state that is ever made."""
+    function = _function(solver)
+    shape, _ = eqx.filter_eval_shape(function, unknowns, problem)
+    state = solver.init(function, unknowns, problem, _OPTIONS, shape, None, _TAGS)
+    if isinstance(solver, LevenbergMarquardt):
+        state = _with_step_size(state, jnp.asarray(1 / _FIRST_DAMPING, unknowns.waves.dtype))
+    return state
+
+
+def _with_step_size(state: Any, step_size: Float[Array, ""]) -> Any:
+    """A state of Levenberg-Marquardt with another 1 / λ, which optimistix calls the step size."""
+    return eqx.tree_at(lambda state: state.search_state.step_size, state, step_size)
+
+
+def restarted(fresh: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None = None) -> Any:
+    """A state that stands at `unknowns` and knows nothing of its surroundings yet; `fresh` is what `begin` made.
+
+    The next step of Levenberg-Marquardt evaluates and linearises there, and always accepts: the state is then, to the bit,
+    what it was after the step that reached them, if `step_size` is the same. So a checkpoint need not hold linearised pictures.
+    """
+    if hasattr(fresh, "y_eval"):
+        fresh = eqx.tree_at(lambda state: state.y_eval, fresh, unknowns)
+    return fresh if step_size is None else _with_step_size(fresh, step_size)
+
+
+@eqx.filter_jit
+def advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tuple[Unknowns, Any, Outcome]:
+    """One step: a trial of new unknowns, which are accepted or not."""
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes its 32-bit counters with 64-bit numbers
+        new, new_state, _ = solver.step(_function(solver), unknowns, problem, _OPTIONS, state, _TAGS)
+    converged, _ = solver.terminate(_function(solver), new, problem, _OPTIONS, new_state, _TAGS)
+    dtype = unknowns.waves.dtype
+    zero, yes = jnp.zeros((), dtype), jnp.ones((), bool)
+    if isinstance(solver, optx.OptaxMinimiser):  # its loss is that of the unknowns before the step
+        loss, accepted, damping, evaluated = new_state.f, yes, zero, unknowns
+    else:
+        loss, evaluated = new_state.f_info.as_min(), new
+        accepted = new_state.num_accepted_steps > state.num_accepted_steps
+        damping = 1 / new_state.search_state.step_size if isinstance(solver, LevenbergMarquardt) else zero
+    moved = problem.basis.scale * (new.waves - unknowns.waves)  # orthonormal waves: the same length as that of the heights
+    change = jnp.sqrt(jnp.mean(moved * moved))
+    return new, new_state, Outcome(loss.astype(dtype), accepted, converged, damping.astype(dtype), change, evaluated)
+
+
+def count_unknowns(unknowns: Unknowns) -> int:
+    return sum(leaf.size for leaf in jax.tree.leaves(unknowns))

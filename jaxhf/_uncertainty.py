@@ -1,0 +1,118 @@
+"""How sure a fit is of its heights: standard deviations from the Gauss-Newton matrix, which is never formed."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from ._problem import Problem
+from ._residuals import known_residuals, picture_residuals, robust_weight, simulate, unusual
+from ._unknowns import Basis, Unknowns
+
+EXACT_ENTRIES = 2**24
+"""Up to so many residuals times unknowns the matrix is formed where "exact" is asked for: 128 MiB in double precision."""
+
+
+def standard_deviations(
+    unknowns: Unknowns, problem: Problem, samples: int | str, inner_steps: int
+) -> Float[np.ndarray, "ny nx"]:
+    """The standard deviation of each height, given what the pictures and the prior say; shape (ny, nx), height units.
+
+    The Gauss-Newton matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs them;
+    its inverse is the covariance (Laplace's approximation). Albedo, exposures and offsets vary along, so their doubt counts
+    too. Waves have their usual size (`Basis.usual`), and the other unknowns 1, as a prior besides: a direction that no
+    picture tells anything about, such as the height of everything at once, then gets a large deviation, not an infinite one.
+
+    Args:
+      samples: "exact" inverts the matrix. A number: so many x = argmin |J x - z|², z normal, are drawn; their covariance is H⁻¹
+        (Papandreou and Yuille, Gaussian sampling by local perturbations, 2010), so each deviation is right to
+        1 / √(2 · samples), however the heights are correlated.
+      inner_steps: of LSMR, each; five times as many as in a step of the fit are allowed.
+
+    Raises:
+      ValueError: "exact" for a matrix above `EXACT_ENTRIES`.
+    """
+    if samples == "exact":
+        rows = sum(group.targets.size for group in problem.groups) + 4 * problem.basis.base.size
+        entries = rows * sum(leaf.size for leaf in jax.tree.leaves(unknowns))
+        if entries > EXACT_ENTRIES:
+            raise ValueError(
+                f"fit: uncertainty 'exact' takes at most {EXACT_ENTRIES} residuals times unknowns, they are {entries}; "
+                "give a number of samples"
+            )
+        return np.sqrt(np.asarray(_exact_variance(unknowns, problem)))
+    total = np.zeros(problem.basis.base.shape)
+    for k in range(int(samples)):
+        draw = np.asarray(_draw(unknowns, problem, jax.random.key(k), 5 * inner_steps), np.float64)
+        total += draw * draw
+    return np.sqrt(total / int(samples))
+
+
+@eqx.filter_jit
+def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
+    """The pictures, and how much each height moves a random sum of them; zero, exactly, for one that moves none, (ny, nx).
+
+    The column of J of a vertex without influence is zero, and so is its product with any vector; that of another vertex with
+    a random vector is zero with probability zero.
+    """
+    heights = problem.basis.heights(unknowns.waves)
+
+    def pictures(heights: Float[Array, "ny nx"]) -> tuple[list[Array], list[Array]]:
+        basis = Basis(problem.basis.rows, problem.basis.columns, jnp.zeros_like(heights), problem.basis.usual, heights)
+        still = eqx.tree_at(lambda problem: problem.basis, problem, basis)
+        images = simulate(unknowns, still)
+        return [group.weights * image for group, image in zip(problem.groups, images, strict=True)], images
+
+    parts, pull_back, images = jax.vjp(pictures, heights, has_aux=True)
+    keys = jax.random.split(jax.random.key(0), len(parts))
+    draws = [jax.random.normal(key, part.shape, part.dtype) for key, part in zip(keys, parts, strict=True)]
+    return images, pull_back(draws)[0]
+
+
+def _operator(unknowns: Unknowns, problem: Problem) -> tuple[lx.AbstractLinearOperator, Any]:
+    """J with all its rows, and the shapes of what it makes."""
+    parts, pictures = jax.linearize(lambda u: picture_residuals(u, problem), unknowns)
+    _, known = jax.linearize(lambda u: known_residuals(u, problem), unknowns)
+    roots = [jnp.sqrt(robust_weight(part, problem.loss, problem.loss_scale)) for part in parts]
+
+    def rest(change: Unknowns) -> Unknowns:
+        return eqx.tree_at(lambda change: change.waves, change, unusual(change, problem))
+
+    def rows(change: Unknowns) -> Any:
+        return [root * part for root, part in zip(roots, pictures(change), strict=True)], known(change), rest(change)
+
+    operator = lx.FunctionLinearOperator(rows, jax.eval_shape(lambda: unknowns))
+    return operator, operator.out_structure()
+
+
+@eqx.filter_jit
+def _draw(unknowns: Unknowns, problem: Problem, key: PRNGKeyArray, steps: int) -> Float[Array, "ny nx"]:
+    operator, structure = _operator(unknowns, problem)
+    leaves, tree = jax.tree.flatten(structure)
+    keys = jax.random.split(key, len(leaves))
+    z = jax.tree.unflatten(tree, [jax.random.normal(k, leaf.shape, leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)])
+    solver = lx.LSMR(rtol=1e-4, atol=0.0, max_steps=steps, conlim=1e16)
+    change = lx.linear_solve(operator, z, solver, throw=False).value
+    return _height_change(problem, change.waves)
+
+
+@eqx.filter_jit
+def _exact_variance(unknowns: Unknowns, problem: Problem) -> Float[Array, "ny nx"]:
+    matrix = _operator(unknowns, problem)[0].as_matrix()
+    n = unknowns.waves.size
+    # QᵀQ = 1 of J = QR leaves (JᵀJ)⁻¹ = R⁻¹R⁻ᵀ; waves are the first of the unknowns.
+    root = jnp.linalg.qr(matrix, mode="r")
+    inverse = jax.scipy.linalg.solve_triangular(root, jnp.eye(root.shape[0], dtype=root.dtype))
+    scale, rows, columns = problem.basis.scale, problem.basis.rows, problem.basis.columns
+    cosines = (rows[:, None, :, None] * columns[None, :, None, :] * scale[:, :, None, None]).reshape(n, -1)
+    spread = jnp.matmul(cosines.T, inverse[:n], precision=lax.Precision.HIGHEST)
+    return jnp.sum(spread * spread, axis=1).reshape(problem.basis.base.shape)
+
+
+def _height_change(problem: Problem, waves: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
+    return problem.basis.heights(waves) - problem.basis.base

@@ -1,0 +1,218 @@
+"""Recovering heights from pictures: small terrains, no shadows, so that the derivative is that of the picture."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.fft
+
+import jaxhf
+from jaxhf._fit import _stages
+from jaxhf._residuals import robust_weight, soften
+from jaxhf._unknowns import make_basis, resample
+from jaxhf.io._procedural import fractal
+
+SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024)
+LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6))
+SIZE = 24
+# Its frame ends inside the terrain: a border that moves in the picture is what the derivative does not know.
+CAMERA = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.6, width=SIZE, height=SIZE)
+TRUTH = fractal([12, 12], seed=3, exponent=3.0, range=(0.0, 0.1))
+
+
+def scenes(heights=None, albedo=0.7, camera: jaxhf.Perspective | jaxhf.Orthographic = CAMERA) -> list[jaxhf.Scene]:
+    heights = np.full_like(TRUTH, 0.05) if heights is None else heights
+    field = jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(albedo))
+    return [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]
+
+
+def pictures(**options) -> list[np.ndarray]:
+    return [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in scenes(TRUTH, **options)]
+
+
+@pytest.fixture(scope="module")
+def targets() -> list[np.ndarray]:
+    return pictures()
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_heights_come_back_from_a_flat_start(targets):
+    """To the bound of the issue. One picture has a hole, where its target means nothing."""
+    weights = [np.ones((SIZE, SIZE)), None, None]
+    weights[0][4:7, 5:9] = 0
+    spoilt = [np.where(weights[0] > 0, targets[0], np.nan), *targets[1:]]
+    lines = []
+    found = jaxhf.fit(scenes(), spoilt, settings=SETTINGS, weights=weights, tolerance=1e-8, progress=lines.append)
+    assert found.result is jaxhf.Stop.CONVERGED
+    assert rms(np.asarray(found.heights) - TRUTH) < 1e-6 * np.ptp(TRUTH)
+    assert found.heights.dtype == np.float64
+    assert found.seen.all()
+    assert found.std is None
+    assert lines == list(found.history)
+    assert found.stats["steps"] == len(lines) == lines[-1].step
+    assert lines[-1].loss == found.stats["loss"] < 1e-6 * lines[0].loss
+    for image, residual, target in zip(found.images, found.residuals, targets, strict=True):
+        assert image.shape == residual.shape == (SIZE, SIZE)
+        np.testing.assert_allclose(image, target, atol=1e-6)
+    assert np.all(found.residuals[0][4:7, 5:9] == 0)
+
+
+def test_exposures_and_albedo_come_back_in_spite_of_outliers():
+    """Exposures and the albedo are not those of the scenes, and a twentieth of the pixels is wild."""
+    rng = np.random.default_rng(1)
+    truth = np.array([1.0, 1.2, 0.9])
+    measured = [picture * exposure * 0.8 for picture, exposure in zip(pictures(), truth, strict=True)]
+    for picture in measured:
+        picture += 0.001 * rng.standard_normal(picture.shape)
+        picture[rng.uniform(size=picture.shape) < 0.05] = 1.0
+    options = {"settings": SETTINGS, "noise": 0.001, "albedo": "constant", "exposures": True, "max_steps": 60}
+    found = jaxhf.fit(scenes(), measured, loss="geman", **options)
+    assert found.albedo is not None
+    product = np.asarray(found.exposures) * float(found.albedo[0, 0, 0])
+    np.testing.assert_allclose(product, 0.8 * truth, rtol=0.01)
+    assert found.albedo.shape == (1, 1, 1)
+    shape = np.asarray(found.heights) - np.mean(found.heights) - (TRUTH - TRUTH.mean())
+    assert rms(shape) < 0.02 * np.ptp(TRUTH)
+
+
+def noisy_fit(targets, rng, **options) -> jaxhf.Fit:
+    """A draw of the truth from the prior, as well as of the noise."""
+    noisy = [target + 0.01 * rng.standard_normal(target.shape) for target in targets]
+    prior = TRUTH + 0.004 * rng.standard_normal(TRUTH.shape)
+    return jaxhf.fit(
+        scenes(prior), noisy, settings=SETTINGS, noise=0.01, prior=prior, prior_std=0.004, levels=[1.0], **options
+    )  # fmt: skip
+
+
+def test_as_many_heights_lie_within_their_deviations_as_should(targets):
+    """10 fits of 144 heights: 68.3 % and 95.4 % to 5 points (the heights of one fit hang together a little)."""
+    rng = np.random.default_rng(2)
+    ratio, std = [], None
+    for k in range(10):
+        found = noisy_fit(targets, rng, uncertainty="exact" if k == 0 else None)
+        std = found.std if k == 0 else std  # all fits are at nearly the same place
+        ratio.append((np.asarray(found.heights) - TRUTH) / std)
+    assert std is not None
+    assert std.max() < 0.004
+    assert std.min() < 0.003
+    assert abs(np.mean(np.abs(ratio) < 1) - 0.683) < 0.05
+    assert abs(np.mean(np.abs(ratio) < 2) - 0.954) < 0.05
+
+
+def test_sampled_deviations_are_the_exact_ones(targets):
+    rng = np.random.default_rng(3)
+    exact = noisy_fit(targets, rng, uncertainty="exact").std
+    sampled = noisy_fit(targets, np.random.default_rng(3), uncertainty=200).std
+    assert exact is not None
+    assert sampled is not None
+    assert rms(sampled / exact - 1) < 2 / np.sqrt(2 * 200)  # each has a spread of 1 / sqrt(400)
+
+
+def test_what_no_picture_shows_is_marked():
+    half = jaxhf.Orthographic.look_at((0.25, 0.5, 3), (0.25, 0.5, 0), up=(0, 1, 0), extent=0.4, width=SIZE, height=SIZE)
+    measured = [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in scenes(TRUTH, camera=half)]
+    found = jaxhf.fit(scenes(camera=half), measured, settings=SETTINGS, max_steps=5, uncertainty="exact")
+    assert found.result is jaxhf.Stop.MAX_STEPS
+    unseen = ~found.seen
+    assert found.std is not None
+    assert unseen[:, 8:].all()  # 0.45 of the side is in sight, and normals reach a cell farther
+    assert found.seen[4:8, 1:5].all()
+    assert np.isinf(found.std[unseen]).all()
+    assert np.isfinite(found.std[found.seen]).all()
+
+
+@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+def test_other_solvers_come_near(targets, solver):
+    found = jaxhf.fit(scenes(), targets, settings=SETTINGS, solver=solver, max_steps=80)
+    assert found.stats["loss"] < 0.02 * found.history[0].loss
+    shape = np.asarray(found.heights) - np.mean(found.heights) - (TRUTH - TRUTH.mean())
+    assert rms(shape) < 0.3 * TRUTH.std()
+
+
+def test_a_loss_that_is_not_finite_stops_the_fit(targets):
+    wild = [targets[0].copy(), *targets[1:]]
+    wild[0][3, 3] = 1e200
+    found = jaxhf.fit(scenes(), wild, settings=SETTINGS)
+    assert found.result is jaxhf.Stop.NON_FINITE
+    np.testing.assert_array_equal(found.heights, 0.05)
+
+
+BAD = {
+    "scenes must hold at least one": ({"scenes": []}, {}),
+    r"targets must hold a picture for each of the 3 scenes, they are 1": ({"targets": 1}, {}),
+    r"targets\[1\] must have shape \(24, 24\)": ({"shape": (24, 23)}, {}),
+    r"targets\[2\] must be finite.*row 1 column 2 channel 0 is nan": ({"nan": True}, {}),
+    r"weights must hold one for each of the 3": ({}, {"weights": [None]}),
+    r"weights\[0\] must have shape": ({}, {"weights": [np.ones(3), None, None]}),
+    r"weights\[0\] must be finite, from 0 on": ({}, {"weights": [np.zeros((24, 24)), None, None]}),
+    r"noise must be positive": ({}, {"noise": 0}),
+    r"scenes\[1\]: the heights must have the shape of the first scene's, \(12, 12\); it is \(5, 5\)": ({"other": True}, {}),
+    r"prior must stand with prior_std": ({}, {"prior": 0.0}),
+    r"prior_std must stand with a prior": ({}, {"prior_std": 1.0}),
+    r"start must be finite, row 0 column 1": ({}, {"start": [[0.0, np.inf], [0.0, 0.0]]}),
+    r"solver must be one of lm, bfgs, lbfgs, adam; it is 'sgd'": ({}, {"solver": "sgd"}),
+    r"levels must be shares above 0, the last of them 1": ({}, {"levels": [0.5]}),
+    r"uncertainty must be None, 'exact' or a number": ({}, {"uncertainty": "some"}),
+    r"max_steps must be a whole number from 1 on, it is 0": ({}, {"max_steps": 0}),
+    r"smoothness must be positive and finite, it is -1": ({}, {"smoothness": -1}),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_input_is_refused(message):
+    changes, options = BAD[message]
+    given, measured = scenes(), [np.zeros((SIZE, SIZE)) for _ in LIGHTS]
+    if "scenes" in changes:
+        given = []
+    if "targets" in changes:
+        measured = measured[:1]
+    if "shape" in changes:
+        measured[1] = np.zeros(changes["shape"])
+    if "nan" in changes:
+        measured[2][1, 2] = np.nan
+    if "other" in changes:
+        given[1] = scenes(np.zeros((5, 5)))[1]
+    with pytest.raises(ValueError, match=f"^fit: {message}"):
+        jaxhf.fit(given, measured, **options)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman"])
+def test_softened_residuals_square_to_the_robust_loss(loss):
+    """Its derivative is ρ'(r) = weight(r) r, by a central difference; and a small residual is left as it is."""
+    scale = jnp.asarray(2.0)
+    r = jnp.array([-30.0, -2.5, -1.3, 1e-5, 0.7, 2.001, 9.0])
+
+    def rho(r):
+        return soften(r, loss, scale) ** 2 / 2
+
+    numeric = (rho(r + 1e-5) - rho(r - 1e-5)) / 2e-5
+    np.testing.assert_allclose(numeric, robust_weight(r, loss, scale) * r, rtol=1e-6, atol=1e-10)
+    _, slope = jax.jvp(rho, (r,), (jnp.ones_like(r),))
+    np.testing.assert_allclose(slope, numeric, rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(soften(r[3], loss, scale), r[3], rtol=1e-9)
+    assert abs(float(soften(r[0], loss, scale))) < 15
+
+
+def test_the_basis_is_the_cosine_transform():
+    field = jaxhf.Heightfield(np.zeros((5, 8)), dx=2.0, dy=1.0)
+    basis = make_basis(field, np.ones((5, 8)))
+    waves = np.random.default_rng(0).standard_normal((5, 8))
+    expected = 1 + np.asarray(scipy.fft.idctn(np.asarray(basis.scale) * waves, norm="ortho"))
+    np.testing.assert_allclose(basis.heights(jnp.asarray(waves)), expected, rtol=1e-12)
+    half = make_basis(field, np.ones((5, 8)), 0.5)
+    assert np.count_nonzero(half.scale) == 3 * 4 - 1  # not the constant one, before all others are there
+
+
+def test_resampling_keeps_a_plane():
+    y, x = np.mgrid[0:1:4j, 0:1:6j]
+    fine_y, fine_x = np.mgrid[0:1:9j, 0:1:5j]
+    np.testing.assert_allclose(resample(2 * x - y, (9, 5)), 2 * fine_x - fine_y, atol=1e-12)
+
+
+def test_levels_double_from_eight_waves():
+    assert _stages((64, 40), "lm", None, "squares") == [0.125, 0.25, 0.5, 1.0]
+    assert _stages((12, 12), "lm", None, "huber") == [1.0, 1.0, 1.0, 1.0]
+    assert _stages((64, 64), "adam", None, "squares") == [1.0]
