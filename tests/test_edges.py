@@ -61,7 +61,7 @@ def shift(x: float, y: float, z: float) -> np.ndarray:
 
 
 def heights_of(scene: jaxhf.Scene) -> Any:
-    return scene.heights
+    return scene.heightfields[0].heights
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
