@@ -133,6 +133,17 @@ def test_silhouette_alone_moves_with_heights():
     assert_column(np.asarray(boundary).T, 0.7 * np.cos(np.pi / 6) / PIXEL)
 
 
+def test_crest_alone_moves_with_heights():
+    """A ridge before the black background, seen 10 degrees from above and lit on both sides: a silhouette for the eye only."""
+    ridge = 0.5 - np.abs(np.linspace(-0.5, 0.5, 9))[None].repeat(9, axis=0)
+    tilt, target = np.pi / 18, np.array([0.5, 0.5, 0.51])
+    eye = target + 2 * np.array([-np.cos(tilt), 0, np.sin(tilt)])
+    camera = jaxhf.Orthographic.look_at(eye, target, (0, 0, 1), WIDE, width=SIZE, height=SIZE)
+    scene = small_scene(ridge, camera, (0.0, 0.0, 1.0))
+    _, boundary = changes(scene, moved(heights_of, 1)(scene))
+    assert_column(np.asarray(boundary).T, 0.7 * np.cos(tilt) / PIXEL)  # the smooth normal at the crest points straight up
+
+
 def test_silhouette_alone_moves_with_a_transform():
     """The border of a flat sheet, seen from above, moves with the sheet."""
     scene = small_scene(np.zeros((9, 9)), from_above(1.01), (0.0, 0.0, 1.0))
