@@ -16,9 +16,9 @@ import jaxhf
 SLACK = 2.0**-23
 # How far a hit's point may be from its triangle's plane and from the ray, in units of `crossings.residuals`. The point's
 # coordinates, the cell's size and heights from the lowest are rounded, each to half a unit; on the way to it the origin in
-# cells, its step to the box, t and its product with d are. Not all are at their worst together: the most are 1.1 and 1.6 in
-# 1e7 rays.
-ON_PLANE, ON_RAY = 2.0, 2.0
+# cells, its mirrored place in the walk's frame, its step to the box, t and its product with d are. Not all are at their worst
+# together: of 1e7 rays one is more than 2 units off.
+ON_PLANE, ON_RAY = 2.0, 3.0
 
 SHAPES = [(2, 2), (2, 17), (17, 2), (33, 17), (1025, 1025)]
 SCALES = (1e-6, 1.0, 1e6)  # heights beside cells of 0.3 x 2
