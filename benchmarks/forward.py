@@ -1,5 +1,7 @@
 """Times one frame, from changed heights to image: 512 x 512 pixels, one sample, smooth normals, a light with shadows.
 
+"prepared" leaves out what a frame of new heights needs first: their normals and bounds.
+
 The variants are run in turn, several times, so that a machine whose speed drifts does not favour one; medians are printed,
 and the ratio to the first variant, pair by pair. With `--mitsuba` (pip install mitsuba; it needs LLVM's library, see
 DRJIT_LIBLLVM_PATH) the same terrain is also rendered by Mitsuba 3's `direct` integrator.
@@ -41,6 +43,12 @@ def scene(heights: np.ndarray, camera: str) -> jaxhf.Scene:
 def ours(heights: np.ndarray, camera: str, settings: jaxhf.Settings) -> Callable[[], object]:
     base = scene(heights, camera)
     return lambda: jax.block_until_ready(jaxhf.render(base, settings))
+
+
+def prepared(heights: np.ndarray, camera: str) -> Callable[[], object]:
+    """Without the normals and bounds of the heights, as Mitsuba's frame."""
+    ready = jaxhf.prepare(scene(heights, camera))
+    return lambda: jax.block_until_ready(jaxhf.render(ready))
 
 
 def mitsuba(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]:
@@ -103,6 +111,7 @@ def main() -> None:
                 "pyramid": ours(heights, camera, jaxhf.Settings()),
                 "pyramid, no shadows": ours(heights, camera, jaxhf.Settings(shadows=False)),
                 "dda": ours(heights, camera, jaxhf.Settings(traversal="dda")),
+                "pyramid, prepared": prepared(heights, camera),
             }
             if options.mitsuba:
                 variants |= mitsuba(heights, camera)
