@@ -8,13 +8,13 @@ DRJIT_LIBLLVM_PATH) the same terrain is also rendered by Mitsuba 3's `direct` in
 """
 
 import argparse
-import importlib
 import os
 import time
 from collections.abc import Callable
 
 import jax
 import numpy as np
+from peers import mitsuba_scene
 
 import jaxhf
 from jaxhf.io._procedural import fractal
@@ -52,45 +52,15 @@ def prepared(heights: np.ndarray, camera: str) -> Callable[[], object]:
 
 
 def mitsuba(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]:
-    dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")  # optional: not in any extra
-    mi.set_variant("llvm_ad_rgb")
-    size = len(heights)
-    x, y = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
-    corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
-    faces = np.concatenate(
-        [np.stack([corner, corner + 1, corner + size + 1], 1), np.stack([corner, corner + size + 1, corner + size], 1)]
-    )
-    mesh = mi.Mesh("terrain", size * size, len(faces), has_vertex_normals=True)
-    parameters = mi.traverse(mesh)
-    positions = np.stack([x, y, heights], -1).astype(np.float32).ravel()
-    parameters["faces"] = faces.astype(np.uint32).ravel()
-    parameters["vertex_positions"] = positions
-    parameters.update()
-    eye, target, fov = CAMERAS[camera]
-    loaded = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct"},
-            "terrain": mesh,
-            "light": {"type": "directional", "direction": [-v for v in LIGHTS[camera]], "irradiance": np.pi},
-            "sensor": {
-                "type": "perspective",
-                "fov": fov,
-                "to_world": mi.ScalarTransform4f().look_at(origin=eye, target=target, up=(0, 0, 1)),
-                "film": {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}},
-                "sampler": {"type": "independent", "sample_count": 1},
-            },
-        }
-    )
-    scene_parameters = mi.traverse(loaded)
+    dr, mi, loaded, parameters, positions = made = mitsuba_scene(heights, CAMERAS[camera], LIGHTS[camera], PIXELS, "direct")
 
     def frame():
         dr.eval(mi.render(loaded, spp=1))
         dr.sync_thread()
 
     def rebuild():
-        scene_parameters["terrain.vertex_positions"] = positions
-        scene_parameters.update()
+        parameters[made.place] = positions
+        parameters.update()
         frame()
 
     return {"mitsuba": frame, "mitsuba, new heights": rebuild}

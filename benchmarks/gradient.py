@@ -12,8 +12,6 @@ reference, and timed.
 """
 
 import argparse
-import importlib
-import importlib.util
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,19 +20,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from forward import report
+from peers import common_work, mitsuba_scene
 
 import jaxhf
 
 PIXELS, VERTICES = 128, 64
-
-
-def common_work(peers: Path) -> Any:
-    spec = importlib.util.spec_from_file_location("common_work", peers / "common_work.py")
-    assert spec is not None
-    assert spec.loader is not None
-    work = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(work)
-    return work
 
 
 def make_scene(work: Any, heights: Any, camera: str, light: str, pixels: int) -> jaxhf.Scene:
@@ -118,45 +109,16 @@ def mitsuba(
     work: Any, heights: np.ndarray, directions: dict[str, np.ndarray], camera: str, light: str, samples: int
 ) -> tuple[list[np.ndarray], float]:
     """Its derivatives by `direct_projective`, and the time of one step: new heights, picture, gradient of a loss."""
-    dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")  # optional: not in any extra
-    mi.set_variant("llvm_ad_rgb")
-    size = len(heights)
-    x, y = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
-    corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
-    faces = np.concatenate(
-        [np.stack([corner, corner + 1, corner + size + 1], 1), np.stack([corner, corner + size + 1, corner + size], 1)]
+    dr, mi, scene, parameters, base = made = mitsuba_scene(
+        heights, work.CAMERAS[camera], work.light(light), PIXELS, "direct_projective", samples, work.ALBEDO
     )
-    mesh = mi.Mesh("terrain", size * size, len(faces), has_vertex_normals=True)
-    mesh_parameters = mi.traverse(mesh)
-    mesh_parameters["faces"] = faces.astype(np.uint32).ravel()
-    mesh_parameters["vertex_positions"] = np.stack([x, y, heights], -1).astype(np.float32).ravel()
-    mesh_parameters.update()
-    mesh.set_bsdf(mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": work.ALBEDO}}))
-    eye, target, fov = work.CAMERAS[camera]
-    scene = mi.load_dict(
-        {
-            "type": "scene",
-            "integrator": {"type": "direct_projective"},
-            "terrain": mesh,
-            "light": {"type": "directional", "direction": [float(-v) for v in work.light(light)], "irradiance": np.pi},
-            "sensor": {
-                "type": "perspective",
-                "fov": fov,
-                "to_world": mi.ScalarTransform4f().look_at(origin=list(eye), target=list(target), up=[0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}},
-                "sampler": {"type": "independent", "sample_count": samples},
-            },
-        }
-    )
-    parameters = mi.traverse(scene)
-    place = "terrain.vertex_positions"
-    base = np.stack([x, y, heights], -1).astype(np.float32).ravel()
+    place = made.place
 
     rows = []
     for direction in directions.values():
         z = mi.Float(0.0)
         dr.enable_grad(z)
-        offset = np.zeros((size * size, 3), np.float32)
+        offset = np.zeros((heights.size, 3), np.float32)
         offset[:, 2] = direction.ravel()
         parameters[place] = mi.Float(base) + z * mi.Float(offset.ravel())
         parameters.update()
@@ -186,22 +148,11 @@ def cost(work: Any, side: int, edge_samples: list[int]) -> None:
 
     key = jax.random.key(0)
     frame = jax.jit(lambda heights: jaxhf.render(scene.with_heights(heights), jaxhf.Settings()))
-    variants: dict[str, Callable[[], object]] = {"frame": lambda: frame(scene.heights)}
+    variants: dict[str, Callable[[], object]] = {"frame": lambda: jax.block_until_ready(frame(scene.heights))}
     for count in edge_samples:
         step = jax.jit(jax.value_and_grad(lambda heights, key, s=jaxhf.Settings(edge_samples=count): loss(heights, key, s)))
-        variants[f"value and gradient, {count} points"] = lambda step=step: step(scene.heights, key)
-    times: dict[str, list[float]] = {name: [] for name in variants}
-    for variant in variants.values():
-        jax.block_until_ready(variant())
-    for _ in range(9):
-        for name, variant in variants.items():
-            begin = time.perf_counter()
-            jax.block_until_ready(variant())
-            times[name].append(time.perf_counter() - begin)
-    print(f"\n{side} x {side} heights and pixels, camera B, low light, float32, one sample")
-    for name, seconds in times.items():
-        ratio = np.median(np.array(seconds) / np.array(times["frame"]))
-        print(f"  {name:34s} {1e3 * np.median(seconds):8.1f} ms   {ratio:6.2f} of the frame", flush=True)
+        variants[f"value and gradient, {count} points"] = lambda step=step: jax.block_until_ready(step(scene.heights, key))
+    report(f"{side} x {side} heights and pixels, camera B, low light, float32, one sample", variants, repeats=9)
 
 
 def main() -> None:

@@ -6,7 +6,6 @@ case a process: the times include compilation, as a user meets it.
 """
 
 import argparse
-import importlib.util
 import os
 import resource
 import time
@@ -15,6 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from peers import common_work
 
 import jaxhf
 from jaxhf.io._procedural import fractal
@@ -71,11 +71,7 @@ def flat(options: argparse.Namespace) -> None:
 
 
 def common(options: argparse.Namespace) -> None:
-    spec = importlib.util.spec_from_file_location("common_work", options.peers / "common_work.py")
-    assert spec is not None
-    assert spec.loader is not None
-    work = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(work)
+    work = common_work(options.peers)
     data = np.load(options.peers / f"targets_D_{options.light}.npz")
     eye, target, fov = work.CAMERAS["D"]
     camera = jaxhf.Perspective.look_at(eye, target, fov=fov, width=128, height=128)
