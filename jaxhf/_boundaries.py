@@ -9,19 +9,8 @@ from jax import lax
 from jaxtyping import Float
 
 from ._camera import Camera
-from ._edges import (
-    Crossing,
-    EdgePoint,
-    Lottery,
-    cast_shadow,
-    draw,
-    make_crossing,
-    make_lottery,
-    picture_point,
-    plain_weights,
-    refined_weights,
-    side_ray,
-)
+from ._edges import Crossing, EdgePoint, cast_shadow, draw, make_crossing, picture_point, side_ray
+from ._lottery import Lottery, make_lottery, plain_weights, refined_weights
 from ._settings import Settings
 from ._shade import World, radiance
 from ._store import stored

@@ -16,11 +16,12 @@ from jaxtyping import Float, Int
 
 from ._boundaries import moving_boundaries
 from ._camera import Camera
-from ._edges import sources, with_tangent
+from ._edges import with_tangent
 from ._film import grid_side, sample_offset
 from ._grid import Grid
 from ._heightfield import Heightfield
 from ._hit import Hit, intersect, leave
+from ._lottery import sources
 from ._ray import Ray
 from ._scene import Scene, localise, localise_camera
 from ._settings import Settings

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf import _edges, _heightfield, _hit, _render, _scene, _shade, _transform
+from jaxhf import _edges, _heightfield, _hit, _lottery, _render, _scene, _shade, _transform
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
@@ -161,7 +161,7 @@ FEATURES: dict[str, tuple[Case, Case, list[Change]]] = {
     "edge samples": (
         PLAIN,
         Case(scene(), jaxhf.Settings(shading="flat", shadows=False, edge_samples=64)),
-        [fails_everywhere(_edges.draw), fails_everywhere(_edges.plain_weights), fails_everywhere(_edges.with_tangent)],
+        [fails_everywhere(_edges.draw), fails_everywhere(_lottery.plain_weights), fails_everywhere(_edges.with_tangent)],
     ),
     "AOVs": (PLAIN, DEPTH, [fails_everywhere(_render._observe)]),
     "step counting": (

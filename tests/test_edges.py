@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf import _edges
+from jaxhf import _lottery
 
 EDGES = jaxhf.Settings(samples=16, edge_samples=2000)
 INTERIOR = jaxhf.Settings(samples=16)
@@ -304,7 +304,7 @@ def test_lottery_is_exact_in_single_precision():
     """A million weights of which a few are large: a running sum in single precision would lose the small ones."""
     weights = np.full(2**20, 1e-9, np.float32)
     weights[::65536] = 1
-    lottery = _edges.make_lottery(jnp.asarray(weights), jnp.asarray(1000, jnp.int32))
+    lottery = _lottery.make_lottery(jnp.asarray(weights), jnp.asarray(1000, jnp.int32))
     tickets = np.diff(np.asarray(lottery.cumulative, np.int64), prepend=0)
     assert tickets.min() == 1
     np.testing.assert_allclose(tickets[::65536], 2**30 / 16, rtol=2e-3)

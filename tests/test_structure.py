@@ -11,7 +11,7 @@ FLOW = (
     "_types", "_store", "_lanes", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera", "_film",
     "_heightfield", "_pyramid", "_grid",
     "_cylinder", "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade",
-    "_silhouette", "_edges", "_boundaries", "_render", "io",
+    "_silhouette", "_lottery", "_edges", "_boundaries", "_render", "io",
     "_unknowns", "_problem", "_residuals", "_solvers", "_uncertainty", "_fit", "__init__", "__main__",
 )  # fmt: skip
 
