@@ -53,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--no-shadows", dest="shadows", action="store_false", default=None, help="let light through everything")
     render.add_argument("--max-depth", type=int, metavar="N", help="mirror bounces [4]")
     render.add_argument("--max-steps", type=int, metavar="N", help="step budget of a walk [as many as any ray needs]")
-    render.add_argument("--chunk", type=int, metavar="RAYS", help="rays traced together [4096]")
+    render.add_argument("--chunk", type=int, metavar="RAYS", help="rays traced together [1024]")
     render.add_argument(
         "--devices", type=int, metavar="N", help="cores that share the work, each with a copy [all, at most 16]"
     )

@@ -86,18 +86,28 @@ def make_grid(
 
 def corners(values: Float[jax.Array, "ny nx *rest"], ix: Index, iy: Index) -> tuple[jax.Array, ...]:
     """What stands at the vertices 00, 10, 01, 11 of a cell that is in range."""
+    nx = values.shape[1]
+    first = iy * nx + ix
+    return tuple(_at(values, first + further) for further in (0, 1, nx, nx + 1))
 
+
+def triangle_corners(
+    values: Float[jax.Array, "ny nx *rest"], ix: Index, iy: Index, upper: Flag
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """What stands at the vertices of a triangle of a cell in range: 00, that between (10, or 01 in the upper), and 11."""
+    nx = values.shape[1]
+    first = iy * nx + ix
+    return _at(values, first), _at(values, first + jnp.where(upper, nx, 1)), _at(values, first + nx + 1)
+
+
+def _at(values: Float[jax.Array, "ny nx *rest"], place: Index) -> jax.Array:
     ny, nx = values.shape[:2]
     flat = values.reshape(ny * nx, *values.shape[2:])
-    first = iy * nx + ix
-
-    def at(place):
-        return flat.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-    return at(first), at(first + 1), at(first + nx), at(first + nx + 1)
+    return flat.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def triangle_plane(z: Float[jax.Array, "ny nx"], ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """(a, b, c) of the triangle's plane c + a u + b v, with u and v from the cell's vertex 00; finite in a hole too."""
-    z00, z10, z01, z11 = (jnp.where(jnp.isfinite(value), value, 0) for value in corners(z, ix, iy))
-    return jnp.where(upper, z11 - z01, z10 - z00), jnp.where(upper, z01 - z00, z11 - z10), z00
+    z00, between, z11 = (jnp.where(jnp.isfinite(value), value, 0) for value in triangle_corners(z, ix, iy, upper))
+    first, second = between - z00, z11 - between
+    return jnp.where(upper, second, first), jnp.where(upper, first, second), z00

@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 from ._begin import Departure
 from ._cylinder import Tube, tube_distance
-from ._grid import Grid, corners, triangle_plane
+from ._grid import Grid, triangle_corners, triangle_plane
 from ._lanes import only_where
 from ._ray import Ray
 from ._settings import Settings
@@ -172,11 +172,11 @@ def blocked(
 def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
     """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray (grid frame)."""
     t = distance(grid, ray, found)
-    upper, dtype = found.upper, t.dtype
+    dtype = t.dtype
     place = ray(t)
-    x, y = found.ix.astype(dtype), found.iy.astype(dtype)
-    u, v = place[0] - x, place[1] - y
-    a, b, c = triangle_plane(grid.z, found.ix, found.iy, upper)
+    u, v = place[0] - found.ix.astype(dtype), place[1] - found.iy.astype(dtype)
+    plane = triangle_plane(grid.z, found.ix, found.iy, found.upper)
+    t, place, u, v, (a, b, c) = stored((t, place, u, v, plane), grid.sure)
     p = grid.world_from_grid.point(jnp.stack([place[0], place[1], c + a * u + b * v]))
     one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
     n = unit(grid.grid_from_world.covector(jnp.stack([-a, -b, one])))
@@ -208,9 +208,9 @@ def _shading_normal(grid: Grid, found: CellHit, u: Scalar, v: Scalar, n: Vector)
     """The barycentric mean of the triangle's three vertex normals (Phong 1975), and its derivatives by cells."""
     if grid.normals is None:
         return n, jnp.zeros_like(n), jnp.zeros_like(n)
-    n00, n10, n01, n11 = corners(grid.normals, found.ix, found.iy)
-    per_u = jnp.where(found.upper, n11 - n01, n10 - n00)
-    per_v = jnp.where(found.upper, n01 - n00, n11 - n10)
+    n00, between, n11 = triangle_corners(grid.normals, found.ix, found.iy, found.upper)
+    first, second = between - n00, n11 - between
+    per_u, per_v = jnp.where(found.upper, second, first), jnp.where(found.upper, first, second)
     mean = n00 + u * per_u + v * per_v
     if grid.object_from_world is not None:
         mean, per_u, per_v = (grid.object_from_world.covector(normal) for normal in (mean, per_u, per_v))

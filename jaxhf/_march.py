@@ -15,16 +15,13 @@ Step = Callable[[jax.Array], jax.Array]
 
 # Blocks of cells that are looked at between two visits to cells.
 _SKIPS = 2
-# Rays that walk together, until the last of them has ended. Fewer would pay more for each kernel's start.
-_TOGETHER = 1024
 
 
 def march(walk: Walk, state: jax.Array, budget: int, count: bool) -> tuple[jax.Array, Index | None]:
     """The state in which a walk ends, and the number of its steps if they are to be counted.
 
-    Under `vmap` the rays do not all wait for the slowest: they are cut into blocks, each of which ends on its own. The
-    stages before and after the walk have larger arrays, which is why the blocks are made here, by a rule for `vmap`, and
-    not where the picture is cut into tiles.
+    Under `vmap` they go on until the last of them has ended. This has a rule of its own, as that of `while_loop` would count
+    the steps of each ray, and keep an ended one's state by a selection, both of which `Walk` does by itself.
     """
 
     @jax.custom_batching.custom_vmap
@@ -36,21 +33,9 @@ def march(walk: Walk, state: jax.Array, budget: int, count: bool) -> tuple[jax.A
         lanes, shared = eqx.partition(walk, in_batched[0])
         state = state if in_batched[1] else jnp.broadcast_to(state, (axis_size,))
 
-        def block(lanes_and_state):
-            lanes, state = lanes_and_state
-            skip = jax.vmap(lambda lanes, state: eqx.combine(lanes, shared).skip(state))
-            visit = jax.vmap(lambda lanes, state: eqx.combine(lanes, shared).visit(state))
-            return _until_done(lambda state: skip(lanes, state), lambda state: visit(lanes, state), state, budget, count)
-
-        together = min(axis_size, _TOGETHER)
-        blocks = -(-axis_size // together)
-
-        def cut(values: jax.Array) -> jax.Array:
-            spare = [(0, blocks * together - axis_size)] + [(0, 0)] * (values.ndim - 1)
-            return jnp.pad(values, spare).reshape(blocks, together, *values.shape[1:])
-
-        ended = lax.map(block, jax.tree.map(cut, (lanes, state)))
-        ended = jax.tree.map(lambda values: values.reshape(-1)[:axis_size], ended)
+        skip = jax.vmap(lambda lanes, state: eqx.combine(lanes, shared).skip(state))
+        visit = jax.vmap(lambda lanes, state: eqx.combine(lanes, shared).visit(state))
+        ended = _until_done(lambda state: skip(lanes, state), lambda state: visit(lanes, state), state, budget, count)
         return ended, jax.tree.map(lambda _: True, ended)
 
     return run(walk, state)

@@ -188,8 +188,14 @@ def _mesh() -> Mesh:
 
 
 def _on_every_device(tree: Any) -> Any:
-    """Copies a scene or a part of it to each device of this process, wherever the caller has put it."""
-    return tree if jax.local_device_count() == 1 else jax.device_put(tree, NamedSharding(_mesh(), P()))
+    """Copies a scene or a part of it to each device of this process, wherever the caller has put it.
+
+    What is still NumPy is left to the compiled program, which copies it by itself.
+    """
+    if jax.local_device_count() == 1:
+        return tree
+    ours, host = eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array))
+    return eqx.combine(jax.device_put(ours, NamedSharding(_mesh(), P())), host)
 
 
 def _over_devices(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]):

@@ -124,7 +124,7 @@ def localise(scene: Scene) -> Scene:
         samples=scene.samples,
     )
     dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
-    moved = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), moved)
+    moved = jax.tree.map(lambda leaf: _in_precision(leaf, dtype), moved)
     return eqx.tree_at(lambda moved: moved.camera, moved, localise_camera(scene.camera, scene))
 
 
@@ -133,7 +133,12 @@ def localise_camera(camera: Camera, scene: Scene) -> Camera:
     matrix = camera.world_from_camera
     moved = eqx.tree_at(lambda camera: camera.world_from_camera, camera, _shifted(matrix, -_like(matrix, _anchor(scene))))
     dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), moved)
+    return jax.tree.map(lambda leaf: _in_precision(leaf, dtype), moved)
+
+
+def _in_precision(leaf: Any, dtype: Any) -> Any:
+    """A NumPy leaf stays on the host, from where a compiled program takes it sooner than a copy by hand."""
+    return jnp.asarray(leaf, dtype) if isinstance(leaf, jax.Array) else np.asarray(leaf, dtype)
 
 
 def _grid_corner(shape: Shape) -> np.ndarray:

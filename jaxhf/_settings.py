@@ -38,7 +38,7 @@ class Settings:
     samples: int | None = None
     max_depth: int = 4
     edge_samples: int = 0
-    chunk: int = 4096
+    chunk: int = 1024
 
     def __post_init__(self):
         for name, kind in (("traversal", Traversal), ("shading", Shading), ("normals", NormalScheme)):
