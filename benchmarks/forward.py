@@ -2,19 +2,22 @@
 
 "prepared" leaves out what a frame of new heights needs first: their normals and bounds.
 
-The variants are run in turn, several times, so that a machine whose speed drifts does not favour one; medians are printed,
-and the ratio to the first variant, pair by pair. With `--mitsuba` (pip install mitsuba; it needs LLVM's library, see
-DRJIT_LIBLLVM_PATH) the same terrain is also rendered by Mitsuba 3's `direct` integrator.
+The variants are run in turn, several times and each time in another order, so that neither a machine whose speed drifts nor
+what one leaves to the next favours one; medians are printed, and the ratio to the first variant, pair by pair. With
+`--mitsuba` (pip install mitsuba; it needs LLVM's library, see DRJIT_LIBLLVM_PATH) the same terrain is also rendered by
+Mitsuba 3's `direct` integrator, with `--embree` (pip install embreex) by Embree and NumPy, with `--povray` by POV-Ray.
 """
 
 import argparse
 import os
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import jax
 import numpy as np
-from peers import mitsuba_scene
+from peers import embree_frame, mitsuba_scene, povray_seconds
 
 import jaxhf
 from jaxhf.io._procedural import fractal
@@ -66,12 +69,24 @@ def mitsuba(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]
     return {"mitsuba": frame, "mitsuba, new heights": rebuild}
 
 
+def embree(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]:
+    frame, build = embree_frame(heights, CAMERAS[camera], LIGHTS[camera], PIXELS)
+
+    def rebuild():
+        build()
+        frame()
+
+    return {"embree, one core": frame, "embree, one core, new heights": rebuild}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256, 1024], help="vertices a side")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="cores that share the work")
     parser.add_argument("--mitsuba", action="store_true")
+    parser.add_argument("--embree", action="store_true", help="with embreex, and shading in NumPy")
+    parser.add_argument("--povray", action="store_true", help="what povray says of itself, after the others")
     options = parser.parse_args()
     jax.config.update("jax_num_cpu_devices", options.devices)
     for size in options.sizes:
@@ -85,17 +100,27 @@ def main() -> None:
             }
             if options.mitsuba:
                 variants |= mitsuba(heights, camera)
+            if options.embree:
+                variants |= embree(heights, camera)
             report(f"{size}² heights, camera {camera}", variants, options.repeats)
+            if options.povray:
+                with tempfile.TemporaryDirectory() as folder:
+                    said = [
+                        povray_seconds(heights, CAMERAS[camera], LIGHTS[camera], PIXELS, Path(folder))
+                        for _ in range(options.repeats)
+                    ]
+                print(f"  {'povray':28s} {1e3 * np.median(said):8.1f} ms")
 
 
 def report(title: str, variants: dict[str, Callable[[], object]], repeats: int) -> None:
     times: dict[str, list[float]] = {name: [] for name in variants}
     for variant in variants.values():
         variant()
+    order = np.random.default_rng(0)
     for _ in range(repeats):
-        for name, variant in variants.items():
+        for name in order.permutation(list(variants)):
             begin = time.perf_counter()
-            variant()
+            variants[name]()
             times[name].append(time.perf_counter() - begin)
     print(title)
     first = np.array(next(iter(times.values())))

@@ -1,8 +1,10 @@
-"""What is measured against: the common work of a folder of peers' measurements, and the same terrain in Mitsuba 3."""
+"""What is measured against: the common work of a folder of peers' measurements, and the same terrain in other renderers."""
 
 import importlib
 import importlib.util
-from collections.abc import Sequence
+import re
+import subprocess
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +19,20 @@ def common_work(peers: Path) -> Any:
     work = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(work)
     return work
+
+
+def mesh_of(heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) over the unit square and triangles (m, 3)."""
+    size = len(heights)
+    x, y = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
+    corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
+    lower, upper = [corner, corner + 1, corner + size + 1], [corner, corner + size + 1, corner + size]
+    faces = np.concatenate([np.stack(lower, 1), np.stack(upper, 1)])
+    return np.stack([x, y, heights], -1).astype(np.float32).reshape(-1, 3), faces.astype(np.int32)
+
+
+View = tuple[Sequence[float], Sequence[float], float]
+"""Eye, target, field of view in degrees."""
 
 
 class MitsubaScene(NamedTuple):
@@ -40,7 +56,7 @@ class MitsubaScene(NamedTuple):
 
 def mitsuba_scene(
     heights: np.ndarray,
-    view: tuple[Sequence[float], Sequence[float], float],
+    view: View,
     towards: Sequence[float],
     pixels: int,
     integrator: str,
@@ -50,21 +66,15 @@ def mitsuba_scene(
     """Heights over the unit square under one directional light.
 
     Args:
-      view: eye, target, field of view in degrees.
       towards: the light.
       albedo: of a surface with two sides; None: Mitsuba's default.
     """
     dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")
     mi.set_variant("llvm_ad_rgb")
-    size = len(heights)
-    x, y = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
-    corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
-    faces = np.concatenate(
-        [np.stack([corner, corner + 1, corner + size + 1], 1), np.stack([corner, corner + size + 1, corner + size], 1)]
-    )
-    mesh = mi.Mesh("terrain", size * size, len(faces), has_vertex_normals=True)
+    vertices, faces = mesh_of(heights)
+    mesh = mi.Mesh("terrain", len(vertices), len(faces), has_vertex_normals=True)
     parameters = mi.traverse(mesh)
-    positions = np.stack([x, y, heights], -1).astype(np.float32).ravel()
+    positions = vertices.ravel()
     parameters["faces"] = faces.astype(np.uint32).ravel()
     parameters["vertex_positions"] = positions
     parameters.update()
@@ -87,3 +97,83 @@ def mitsuba_scene(
         }
     )
     return MitsubaScene(dr, mi, scene, mi.traverse(scene), positions)
+
+
+def camera_rays(view: View, pixels: int) -> np.ndarray:
+    """Unit directions (pixels * pixels, 3) through the pixels' centres, row after row from the top left."""
+    eye, target, fov = view
+    forward = (np.asarray(target) - eye) / np.linalg.norm(np.asarray(target) - eye)
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    s = ((np.arange(pixels) + 0.5) / pixels * 2 - 1) * np.tan(np.radians(fov) / 2)
+    d = forward + s[None, :, None] * right - s[:, None, None] * up
+    return (d / np.linalg.norm(d, axis=-1, keepdims=True)).reshape(-1, 3)
+
+
+def embree_frame(
+    heights: np.ndarray, view: View, towards: Sequence[float], pixels: int
+) -> tuple[Callable[[], np.ndarray], Callable[[], None]]:
+    """A frame by Embree (pip install embreex) on one core, shaded with NumPy, and what builds its structure."""
+    rtcore = importlib.import_module("embreex.rtcore_scene")
+    construction = importlib.import_module("embreex.mesh_construction")
+    vertices, faces = mesh_of(heights)
+    d = camera_rays(view, pixels).astype(np.float32)
+    o = np.broadcast_to(np.asarray(view[0], np.float32), d.shape).copy()
+    wi = (np.asarray(towards) / np.linalg.norm(towards)).astype(np.float32)
+    sun = np.broadcast_to(wi, d.shape)
+    origin, along, across = (vertices[faces[:, k]] for k in range(3))
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, faces[:, k], np.cross(along - origin, across - origin))
+    held = []
+
+    def build() -> None:
+        scene = rtcore.EmbreeScene()
+        held[:] = [scene, construction.TriangleMesh(scene, vertices, faces)]
+        scene.run(o[:1], d[:1])  # it builds when it is first asked
+
+    def frame() -> np.ndarray:
+        scene = held[0]
+        hits = scene.run(o, d, output=True)
+        met = np.flatnonzero(hits["primID"] >= 0)
+        corners = faces[hits["primID"][met]]
+        u, v = hits["u"][met, None], hits["v"][met, None]
+        ns = normals[corners[:, 0]] * (1 - u - v) + normals[corners[:, 1]] * u + normals[corners[:, 2]] * v
+        cosine = np.abs(ns @ wi) / np.linalg.norm(ns, axis=1)
+        p = o[met] + (hits["tfar"][met, None] - 1e-5) * d[met]
+        lit = (scene.run(p, sun[: len(met)], query="OCCLUDED") < 0) & (hits["Ng"][met] @ wi > 0)
+        image = np.zeros(len(d), np.float32)
+        image[met] = 0.7 * cosine * lit
+        return image.reshape(pixels, pixels)
+
+    build()
+    return frame, build
+
+
+def povray_seconds(heights: np.ndarray, view: View, towards: Sequence[float], pixels: int, folder: Path) -> float:
+    """Seconds of CPU that POV-Ray (povray on the path) says its tracing took, over its threads.
+
+    Its own heightfield with its smooth normals, of heights in 16 bits; reading the scene is not counted, nor what its
+    threads wait for.
+    """
+    tall = float(heights.max())
+    levels = np.round(heights[::-1] / tall * 65535).astype(">u2")
+    (folder / "heights.pgm").write_bytes(f"P5\n{len(heights)} {len(heights)}\n65535\n".encode() + levels.tobytes())
+    eye, target, fov = view
+    vector = "<{:.9g}, {:.9g}, {:.9g}>".format
+    (folder / "scene.pov").write_text(
+        f"""#version 3.7; global_settings {{ assumed_gamma 1 }}
+camera {{ perspective location {vector(*_swapped(eye))} right x up y angle {fov} sky y look_at {vector(*_swapped(target))} }}
+light_source {{ {vector(*(1e4 * np.asarray(_swapped(towards))))} rgb 1 parallel point_at 0 }}
+height_field {{ pgm "heights.pgm" smooth pigment {{ rgb 0.7 }} finish {{ diffuse 1 ambient 0 }} scale {vector(1, tall, 1)} }}
+"""
+    )
+    command = ["povray", "scene.pov", f"+W{pixels}", f"+H{pixels}", "-D", "-A", "+FN", "+Oout.png"]
+    said = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stderr
+    threads, seconds = re.findall(r"using (\d+) thread\(s\) with ([\d.]+) CPU-seconds", said)[-1]
+    return float(seconds) / int(threads)
+
+
+def _swapped(v: Sequence[float]) -> tuple[float, float, float]:
+    return v[0], v[2], v[1]
