@@ -13,6 +13,7 @@ import jaxhf._hit
 import jaxhf._render
 import jaxhf._shade
 import jaxhf._store
+from jaxhf._devices import local_mesh
 from jaxhf._render import settle
 from jaxhf._scene import localise
 
@@ -30,7 +31,7 @@ def compiled(base: jaxhf.Scene, settings: jaxhf.Settings, form: Callable) -> tup
         vars(module)["stored"] = form
     jax.clear_caches()
     local = localise(base)
-    program = jaxhf._render._trace_all.lower(local, settle(settings, base), ()).compile()
+    program = jaxhf._render._trace_all.lower(local, settle(settings, base), (), local_mesh(), None).compile()
     bodies = re.findall(r"^%?fused_computation\S* .*?\{\n(.*?)^\}", program.as_text() or "", re.M | re.S)
     return lambda: jax.block_until_ready(program(local)), sum(body.count("\n") for body in bodies)
 

@@ -6,9 +6,11 @@ import math
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ._camera import Camera
+from ._devices import map_over
 from ._edges import Crossing, EdgePoint, cast_shadow, draw, make_crossing, picture_point, side_ray
 from ._lottery import Lottery, make_lottery, plain_weights, refined_weights
 from ._settings import Settings
@@ -19,46 +21,51 @@ from ._store import stored
 _ROUNDS = 4
 
 
-def moving_boundaries(world: World, camera: Camera, settings: Settings, key: jax.Array) -> Float[jax.Array, "h w 3"]:
+def moving_boundaries(
+    world: World, camera: Camera, settings: Settings, key: jax.Array, mesh: Mesh
+) -> Float[jax.Array, "h w 3"]:
     """An image that means nothing, but whose derivative is that which moving boundaries add to the picture's."""
     chunks = math.ceil(settings.edge_samples / (_ROUNDS * settings.chunk))
     size = math.ceil(settings.edge_samples / (_ROUNDS * chunks))
-    points, crossings, flows = lax.stop_gradient(_draw_edges(world, camera, settings, key, chunks, size))
+    points, crossings, flows = lax.stop_gradient(_draw_edges(world, camera, settings, key, mesh, chunks, size))
 
     @jax.checkpoint
     def carry(world: World, camera: Camera, point: EdgePoint, flow: jax.Array):
         x, _ = picture_point(world, camera, settings, point, point.s)
         return flow[:, 0] * x[0] + flow[:, 1] * x[1]
 
-    def chunk(drawn: tuple[EdgePoint, jax.Array]):
-        return jax.vmap(carry, in_axes=(None, None, 0, 0))(world, camera, *drawn)
+    def chunk(seen: tuple[World, Camera], drawn: tuple[EdgePoint, jax.Array]):
+        return jax.vmap(carry, in_axes=(None, None, 0, 0))(*seen, *drawn)
 
-    light = lax.map(chunk, (points, flows)).reshape(-1, 3)
+    light = map_over(mesh, chunk, (world, camera), (points, flows)).reshape(-1, 3)
     column, row = (crossings.x[..., axis].astype(jnp.int32).ravel() for axis in (0, 1))
     image = jnp.zeros((camera.height * camera.width, 3), light.dtype)
     return image.at[row * camera.width + column].add(light).reshape(camera.height, camera.width, 3)
 
 
-def _draw_edges(world: World, camera: Camera, settings: Settings, key: jax.Array, chunks: int, size: int):
+def _draw_edges(world: World, camera: Camera, settings: Settings, key: jax.Array, mesh: Mesh, chunks: int, size: int):
     """Points on edges, in chunks: the points, their places in the picture, and for each by how much the light that leaves
     its pixel changes with its place, shape (3, 2)."""
     world, camera = lax.stop_gradient((world, camera))
 
-    def one(lottery: Lottery, k: jax.Array, u: jax.Array):
+    def one(world: World, camera: Camera, lottery: Lottery, k: jax.Array, u: jax.Array):
         sure = world.surfaces[0].sure
         point = stored(draw(world, camera, settings, lottery, k, u), sure)
         point = stored(cast_shadow(world, point, settings), sure)
         return stored((point, make_crossing(world, camera, settings, point)), sure)
 
-    def beside(crossing: Crossing, side: jax.Array) -> jax.Array:
+    def beside(world: World, camera: Camera, crossing: Crossing, side: jax.Array) -> jax.Array:
         return radiance(world, stored(side_ray(camera, crossing, side), world.surfaces[0].sure), settings)[0]
 
-    def chunk(lottery: Lottery, key: jax.Array, first: jax.Array):
+    def chunk(known: tuple[World, Camera, Lottery], drawn: tuple[jax.Array, jax.Array]):
+        (world, camera, lottery), (key, first) = known, drawn
         u = jax.random.uniform(key, (size, 2), camera.world_from_camera.dtype)
-        points, crossings = jax.vmap(functools.partial(one, lottery))(first + jnp.arange(size, dtype=jnp.int32), u)
+        points, crossings = jax.vmap(functools.partial(one, world, camera, lottery))(
+            first + jnp.arange(size, dtype=jnp.int32), u
+        )
         # One batch: a `vmap` of a `vmap` would have to do all that `only_where` leaves out.
         sides, both = crossings.sides.reshape(-1, 2), jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), crossings)
-        light = jax.vmap(beside)(both, sides).reshape(size, 2, 3)
+        light = jax.vmap(functools.partial(beside, world, camera))(both, sides).reshape(size, 2, 3)
         jump = (light[:, 0] - light[:, 1]) * jnp.where(crossings.valid, points.measure, 0)[:, None]
         return points, crossings, jump[:, :, None] * crossings.across[:, None, :]
 
@@ -67,7 +74,7 @@ def _draw_edges(world: World, camera: Camera, settings: Settings, key: jax.Array
         lottery = make_lottery(weights, jnp.where(number == 0, per_round, (_ROUNDS - 1) * per_round))
         firsts = jnp.maximum(number - 1, 0) * per_round + jnp.arange(chunks, dtype=jnp.int32) * size
         keys = jax.random.split(jax.random.fold_in(key, number), chunks)
-        drawn = lax.map(lambda each: chunk(lottery, *each), (keys, firsts))
+        drawn = map_over(mesh, chunk, (world, camera, lottery), (keys, firsts))
 
         def refined(weights: jax.Array) -> jax.Array:
             points, crossings, flows = drawn

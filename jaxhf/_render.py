@@ -11,11 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
+from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from ._boundaries import moving_boundaries
 from ._camera import Camera
+from ._devices import local_mesh, map_over, on_every_device
 from ._edges import with_tangent
 from ._film import grid_side, sample_offset
 from ._grid import Grid
@@ -44,10 +45,12 @@ class Prepared(eqx.Module):
     Attributes:
       scene: as it was given, with the camera that is to see it.
       settings: those for which it was prepared.
+      mesh: the devices on which it lies.
     """
 
     scene: Scene
     settings: Settings = eqx.field(static=True)
+    mesh: Mesh = eqx.field(static=True)
     _world: World
 
     def with_camera(self, camera: Camera) -> "Prepared":
@@ -55,10 +58,13 @@ class Prepared(eqx.Module):
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, camera=camera))
 
 
-def prepare(scene: Scene, settings: Settings = Settings()) -> Prepared:
-    """Takes the normals and the bounds of the heights once, for many pictures of the same terrain in the same light."""
-    settings = settle(settings, scene)
-    return Prepared(scene, settings, _make_world(_on_every_device(localise(scene)), settings=settings))
+def prepare(scene: Scene, settings: Settings = Settings(), *, mesh: Mesh | None = None) -> Prepared:
+    """Takes the normals and the bounds of the heights once, for many pictures of the same terrain in the same light.
+
+    The arguments are those of `render`.
+    """
+    settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
+    return Prepared(scene, settings, mesh, _make_world(on_every_device(localise(scene), mesh), settings=settings))
 
 
 def render(
@@ -68,11 +74,12 @@ def render(
     aovs: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
     key: jax.Array | None = None,
+    mesh: Mesh | None = None,
 ) -> Any:
     """Renders a picture.
 
-    Its tiles are dealt out to all devices of this process, each of which holds a copy of the scene; the picture has the
-    same bits on any number of them. JAX takes the cores of a CPU for one device, unless
+    Its tiles are dealt out to many devices, each of which holds a copy of the scene; the picture has the same bits on any
+    number of CPU devices. JAX takes the cores of a CPU for one device, unless
     `jax.config.update("jax_num_cpu_devices", n)` says otherwise before it is first used.
 
     Args:
@@ -83,48 +90,54 @@ def render(
       progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
       key: of JAX's random numbers, for what is sampled: the points on edges, if the settings ask for them. The same key
         gives the same derivative; None stands for a fixed one.
+      mesh: the devices that share the work, whatever its axes; None: all of this process. Where it spans several processes
+        (`jax.distributed`), each must call with the same values, and gets the whole picture.
 
     Returns:
       Linear radiance, shape (h, w, 3), top row first; with `aovs` that and a dict of them.
 
     Raises:
-      ValueError: an unknown AOV, or settings for a scene that was prepared with others.
+      ValueError: an unknown AOV, or settings or a mesh for a scene that was prepared with others.
     """
     aovs = tuple(aovs)
     for name in aovs:
         if name not in AOVS:
             raise ValueError(f"render: aovs must be among {', '.join(AOVS)}; one is {name!r}")
     if not isinstance(scene, Prepared) and progress is not None:
-        scene, settings = prepare(scene, settings), Settings()
+        scene, settings = prepare(scene, settings, mesh=mesh), Settings()
     if isinstance(scene, Prepared):
+        if mesh is not None and mesh != scene.mesh:
+            raise ValueError(f"render: the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
         if settings != Settings() and settle(settings, scene.scene) != scene.settings:
             raise ValueError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
-        settings, world = scene.settings, scene._world
-        camera = _on_every_device(localise_camera(scene.scene.camera, scene.scene))
+        settings, world, mesh = scene.settings, scene._world, scene.mesh
+        camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:
-            outputs = _trace_prepared(world, camera, settings, aovs, _settled_key(key, settings))
+            outputs = _trace_prepared(world, camera, settings, aovs, mesh, _settled_key(key, settings, mesh))
         else:
-            outputs = _trace_in_parts(world, camera, settings, aovs, progress)
+            outputs = _trace_in_parts(world, camera, settings, aovs, mesh, progress)
     else:
-        settings = settle(settings, scene)
-        outputs = _trace_all(_on_every_device(localise(scene)), settings, aovs, _settled_key(key, settings))
+        settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
+        local = on_every_device(localise(scene), mesh)
+        outputs = _trace_all(local, settings, aovs, mesh, _settled_key(key, settings, mesh))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
 
-def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Settings) -> Float[jax.Array, "n h w 3"]:
+def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh) -> Float[jax.Array, "n h w 3"]:
     """Pictures of scenes that differ in numbers only, one after the other, in one program; for tracing.
 
     Args:
       scenes: one `localise`d scene, whose leaves have a leading axis of n scenes.
       change: what is done to each before it is rendered.
       settings: the knobs.
+      mesh: the devices that share the work.
     """
 
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         settled = settle(settings, scene)
-        return _trace_all(_on_every_device(scene), settled, (), _settled_key(None, settled))["image"]
+        return _trace_all(on_every_device(scene, mesh), settled, (), mesh, _settled_key(None, settled, mesh))["image"]
 
     return lax.map(one, scenes)
 
@@ -135,8 +148,10 @@ def settle(settings: Settings, scene: Scene) -> Settings:
     return dataclasses.replace(settings, samples=grid_side(samples) ** 2)
 
 
-def _settled_key(key: jax.Array | None, settings: Settings) -> jax.Array | None:
-    return (jax.random.key(0) if key is None else key) if settings.edge_samples else None
+def _settled_key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
+    if not settings.edge_samples:
+        return None
+    return on_every_device(jax.random.key(0) if key is None else key, mesh)
 
 
 class _Tiling:
@@ -158,79 +173,45 @@ class _Tiling:
         return grid.reshape(self.rows * self.side, self.columns * self.side, *tail)[: self.height, : self.width]
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "aovs"))
-def _trace_all(scene: Scene, settings: Settings, aovs: tuple[str, ...], key: jax.Array | None = None) -> dict[str, jax.Array]:
-    return _trace_world(make_world(scene, settings), scene.camera, settings, aovs, key)
+@functools.partial(jax.jit, static_argnames=("settings", "aovs", "mesh"))
+def _trace_all(
+    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+) -> dict[str, jax.Array]:
+    return _trace_world(make_world(scene, settings), scene.camera, settings, aovs, mesh, key)
 
 
 def _trace_world(
-    world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], key: jax.Array | None
+    world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
 ) -> dict[str, jax.Array]:
     tiling = _Tiling(camera, settings)
-    tiles = _over_devices(world, camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
+    tiles = _trace_each(mesh, world, camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
     outputs = jax.tree.map(tiling.assemble, tiles)
     if key is not None and sources(world, settings):
-        outputs["image"] = with_tangent(outputs["image"], moving_boundaries(world, camera, settings, key))
+        outputs["image"] = with_tangent(outputs["image"], moving_boundaries(world, camera, settings, key, mesh))
     return outputs
 
 
-_trace_prepared = jax.jit(_trace_world, static_argnames=("settings", "aovs"))
+_trace_prepared = jax.jit(_trace_world, static_argnames=("settings", "aovs", "mesh"))
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "aovs"))
-def _trace_tiles(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]):
-    return _over_devices(world, camera, settings, aovs, tiles)
+def _trace_each(
+    mesh: Mesh, world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]
+):
+    """Tiles one after the other, (n, side * side, ...) of each output."""
+    return map_over(mesh, lambda seen, tile: _trace_tile(seen[0], seen[1], settings, aovs, tile), (world, camera), tiles)
 
 
-def _mesh() -> Mesh:
-    devices = jax.local_devices()
-    return jax.make_mesh((len(devices),), ("tiles",), axis_types=(AxisType.Auto,), devices=devices)
-
-
-def _on_every_device(tree: Any) -> Any:
-    """Copies a scene or a part of it to each device of this process, wherever the caller has put it.
-
-    What is still NumPy is left to the compiled program, which copies it by itself.
-    """
-    if jax.local_device_count() == 1:
-        return tree
-    ours, host = eqx.partition(tree, lambda leaf: isinstance(leaf, jax.Array))
-    return eqx.combine(jax.device_put(ours, NamedSharding(_mesh(), P())), host)
-
-
-def _over_devices(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]):
-    """Traces tiles one after the other, dealt out in turn to the devices of this process."""
-
-    def trace(world: World, camera: Camera, tiles: jax.Array):
-        return lax.map(lambda tile: _trace_tile(world, camera, settings, aovs, tile), tiles)
-
-    devices = jax.local_device_count()
-    if devices == 1:
-        return trace(world, camera, tiles)
-    mesh = _mesh()
-    count = math.ceil(tiles.shape[0] / devices)
-    dealt = jnp.pad(tiles, (0, count * devices - tiles.shape[0]), mode="edge").reshape(count, devices).T
-    over = jax.shard_map(
-        lambda world, camera, tiles: trace(world, camera, tiles[0]),
-        mesh=mesh,
-        in_specs=(P(), P(), P("tiles")),
-        out_specs=P("tiles"),
-        check_vma=False,
-    )
-    traced = over(world, camera, dealt)
-
-    def in_order(values: jax.Array) -> jax.Array:
-        tail = values.shape[1:]
-        return values.reshape(devices, count, *tail).swapaxes(0, 1).reshape(devices * count, *tail)[: tiles.shape[0]]
-
-    return jax.tree.map(in_order, traced)
-
-
+_trace_tiles = jax.jit(_trace_each, static_argnames=("mesh", "settings", "aovs"))
 _make_world = jax.jit(make_world, static_argnames=("settings",))
 
 
 def _trace_in_parts(
-    world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], progress: Callable[[int, int], None]
+    world: World,
+    camera: Camera,
+    settings: Settings,
+    aovs: tuple[str, ...],
+    mesh: Mesh,
+    progress: Callable[[int, int], None],
 ):
     """As `_trace_all`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
     tiling = _Tiling(camera, settings)
@@ -239,7 +220,7 @@ def _trace_in_parts(
     parts = []
     for first in range(0, tiling.count, size):
         tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
-        parts.append(jax.device_get(_trace_tiles(world, camera, settings, aovs, jnp.asarray(tiles, jnp.int32))))
+        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, settings, aovs, np.asarray(tiles, np.int32))))
         progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
     return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)
 
