@@ -3,6 +3,7 @@
 import functools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -24,6 +25,7 @@ def moving_boundaries(world: World, camera: Camera, settings: Settings, key: jax
     chunks = math.ceil(settings.edge_samples / (_ROUNDS * settings.chunk))
     size = math.ceil(settings.edge_samples / (_ROUNDS * chunks))
     points, crossings, flows = lax.stop_gradient(_draw_edges(world, camera, settings, key, chunks, size))
+    points = eqx.tree_at(lambda points: points.valid, points, (flows != 0).any((2, 3)))
 
     @jax.checkpoint
     def carry(world: World, camera: Camera, point: EdgePoint, flow: jax.Array):
