@@ -97,12 +97,47 @@ def accuracy(work: Any, options: argparse.Namespace, camera: str, light: str) ->
             one, two = ([np.asarray(along(d, jax.random.key(k))) for d in directions.values()] for k in (0, 1))
             cosine, error = compare(one, reference)
             noise = np.median([np.linalg.norm(a - b) / np.linalg.norm(b) / np.sqrt(2) for a, b in zip(one, two, strict=True)])
-            ms = median_ms(lambda k, gradient=gradient: gradient(scene.heights, jax.random.key(k)))
-            print(f"{samples:24} {count:8} {cosine:8.4f} {error:8.4f} {noise:8.4f} {ms:24.0f}", flush=True)
+            line = f"{samples:24} {count:8} {cosine:8.4f} {error:8.4f} {noise:8.4f}"
+            if not options.untimed:
+                line += f" {median_ms(lambda k, gradient=gradient: gradient(scene.heights, jax.random.key(k))):24.0f}"
+            print(line, flush=True)
     if options.mitsuba:
         rows, ms = mitsuba(work, heights, directions, camera, light, options.mitsuba)
         cosine, error = compare(rows, reference)
         print(f"{f'Mitsuba, {options.mitsuba}':>24} {'':8} {cosine:8.4f} {error:8.4f} {'':8} {ms:24.0f}", flush=True)
+
+
+def interior(work: Any, options: argparse.Namespace, camera: str, light: str) -> None:
+    """The error of the interior derivative alone, against that of `--fine` samples: of n x n samples everywhere, and with 8 x 8
+    where a boundary was seen."""
+    heights, directions = work.bumps(VERTICES)
+    names = ["scale_all", "amp0", "amp17", "xshift0"]
+    scene = make_scene(work, heights, camera, light, PIXELS)
+
+    def derivatives(samples: int, edge_samples: int = 0) -> np.ndarray:
+        settings = jaxhf.Settings(normals="six-angle", samples=samples, edge_samples=edge_samples)
+
+        @jax.jit
+        def along(direction: jax.Array) -> jax.Array:
+            return jax.jvp(lambda z: jaxhf.render(scene.with_heights(z), settings)[..., 0], (scene.heights,), (direction,))[1]
+
+        return np.stack([np.asarray(along(directions[name])) for name in names])
+
+    reference, finer = derivatives(options.fine), derivatives(64)
+    size = np.linalg.norm(reference, axis=(1, 2))
+    plain = {samples: derivatives(samples) for samples in (1, 4, 16)}
+    seen = (derivatives(1, options.edge_samples[-1]) != plain[1]).any(0)  # moved, or looked at again
+    print(f"\ncamera {camera}, {light} light: interior derivative, relative to that of {options.fine} samples a pixel")
+    print(f"{'':40} {'samples a pixel':>16}" + "".join(f"{name:>12}" for name in names))
+
+    def report_errors(label: str, rays: float, rows: np.ndarray) -> None:
+        errors = np.linalg.norm(rows - reference, axis=(1, 2)) / size
+        print(f"{label:40} {rays:16.1f}" + "".join(f"{error:12.4f}" for error in errors), flush=True)
+
+    for samples, rows in plain.items():
+        report_errors("everywhere alike", samples, rows)
+        report_errors("8 x 8 where boundaries were seen", samples + 64 * seen.mean(), np.where(seen, finer, rows))
+    report_errors("everywhere alike", 64, finer)
 
 
 def mitsuba(
@@ -163,6 +198,8 @@ def main() -> None:
     parser.add_argument("--edge-samples", type=int, nargs="*", default=[0, 10000, 100000])
     parser.add_argument("--fine", type=int, default=48 * 48, help="samples a pixel of the differences made here")
     parser.add_argument("--cost", type=int, default=256, help="heights a side; 0: leave it out")
+    parser.add_argument("--interior", action="store_true", help="the interior derivative's error, in place of the whole's")
+    parser.add_argument("--untimed", action="store_true", help="accuracy alone, where the machine is not quiet")
     parser.add_argument("--mitsuba", type=int, default=0, metavar="SAMPLES")
     options = parser.parse_args()
     work = common_work(options.peers)
@@ -170,7 +207,7 @@ def main() -> None:
         cost(work, options.cost, options.edge_samples)
     jax.config.update("jax_enable_x64", True)
     for view in options.views:
-        accuracy(work, options, *view.split("-"))
+        (interior if options.interior else accuracy)(work, options, *view.split("-"))
 
 
 if __name__ == "__main__":

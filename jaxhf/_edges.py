@@ -15,6 +15,7 @@ docs/gradients.md derives this.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Float, Int
 
 from ._camera import Camera
@@ -26,7 +27,7 @@ from ._ray import Ray
 from ._settings import Settings
 from ._shade import Vertex, World, first_vertex, nowhere
 from ._silhouette import STEPS, framed_part
-from ._transform import unit
+from ._transform import affine, largest_component, power_of_two, unit
 from ._types import Flag, Index, Point2, Scalar, Vector
 from ._walk import Status
 
@@ -207,7 +208,7 @@ def _away_from_light(world: World, point: EdgePoint, p: Vector) -> Vector:
 def _fallen(world: World, point: EdgePoint, p: Vector) -> Vector:
     """Where the light past p meets the triangle that was found; differentiable."""
     away = _away_from_light(world, point, p)
-    near = p + point.t * away
+    near = p + jnp.where(point.valid, point.t, 0) * away
     landed = near
     for k, surface in enumerate(world.surfaces):
         if isinstance(surface, Grid):
@@ -216,9 +217,13 @@ def _fallen(world: World, point: EdgePoint, p: Vector) -> Vector:
             cell = jnp.clip(point.cell, 0, jnp.array(surface.cells, jnp.int32) - 1)
             a, b, c = triangle_plane(surface.z, cell[0], cell[1], point.upper)
             u, v = local.o[0] - cell[0].astype(p.dtype), local.o[1] - cell[1].astype(p.dtype)
-            slope = local.d[2] - a * local.d[0] - b * local.d[1]
-            grazing = slope == 0
-            step = jnp.where(grazing, 0, (c + a * u + b * v - local.o[2]) / jnp.where(grazing, 1, slope))
+            # At a length around one, as the derivative has the slope's square in it; a power of two changes no bit.
+            size = largest_component(local.d)
+            size = power_of_two(jnp.where(size > 0, size, 1))
+            d = local.d / size
+            slope = d[2] - a * d[0] - b * d[1]
+            grazing = (slope == 0) | ~point.valid
+            step = jnp.where(grazing, 0, (c + a * u + b * v - local.o[2]) / jnp.where(grazing, 1, slope)) / size
             landed = jnp.where(point.receiver == k, near + step * away, landed)
         else:
             t, found = tube_distance(surface, Ray(p, away), None)
@@ -236,7 +241,9 @@ def picture_point(
     p = _on_edge(world, point, s, lift)
     if any(source.light is not None for source in sources(world, settings)):
         p = jnp.where(point.light >= 0, _fallen(world, point, p), p)
-    at = camera.film_from_world()(p)
+    # Of a point that does not count, a place may be larger than any number, and its derivative, times zero, none.
+    ahead = affine(jnp.asarray(camera.world_from_camera)).point(jnp.array([0, 0, 1], p.dtype))
+    at = camera.film_from_world()(jnp.where(point.valid, p, lax.stop_gradient(ahead)))
     before = (at[2] > 0) & (at[3] > 0)
     x = at[:2] / jnp.where(before, at[2], 1)
     size = jnp.array([camera.width, camera.height], x.dtype)
@@ -267,7 +274,8 @@ def make_crossing(world: World, camera: Camera, settings: Settings, point: EdgeP
 
     x, along, valid = jax.jvp(place, (point.s,), (jnp.ones_like(point.s),), has_aux=True)
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
-    valid = valid & (length > 0) & jnp.isfinite(length)
+    # Of what would cross the whole picture within less than the rounding of s, no place is known.
+    valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)
     x = jnp.where(valid, x, 0)
     across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
     n = across / jnp.where(valid, length, 1)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from ._settings import NormalScheme
 from ._store import stored
+from ._transform import power_of_two
 from ._types import AnyArray
 
 
@@ -74,9 +75,14 @@ def vertex_normals(
     Mitsuba does. What lies beyond the border or touches a hole takes no part, so that a vertex there weighs less in the
     interpolation; one with no triangle at all gets (0, 0, 1).
     """
+    # Products of two huge heights would be larger than any number in single precision. Any unit will do, and a power of two
+    # changes no bit.
+    largest = jnp.max(jnp.abs(jnp.where(jnp.isfinite(heights), heights, 0)))
+    unit = power_of_two(jnp.maximum(largest * 2.0**-61, 1))
     if scheme == "central":
-        return _central(heights, dx, dy)
-    return _fan_mean(heights, dx, dy, _FANS[scheme.split("-")[0]], {"six": "area", "six-angle": "angle"}.get(scheme, "equal"))
+        return _central(heights / unit, dx, dy, 1 / unit)
+    weight = {"six": "area", "six-angle": "angle"}.get(scheme, "equal")
+    return _fan_mean(heights / unit, dx / unit, dy / unit, _FANS[scheme.split("-")[0]], weight)
 
 
 def _neighbours(heights):
@@ -92,7 +98,8 @@ def _neighbours(heights):
     return at
 
 
-def _central(heights, dx, dy):
+def _central(heights, dx, dy, up):
+    """With `up` for the vertical component."""
     at = _neighbours(heights)
     here, here_present = at(0, 0)
 
@@ -104,7 +111,7 @@ def _central(heights, dx, dy):
         steps = (ahead_present & here_present).astype(here.dtype) + (behind_present & here_present).astype(here.dtype)
         return (ahead - behind) / (jnp.maximum(steps, 1) * step)
 
-    return jnp.stack([-slope(1, 0, dx), -slope(0, 1, dy), jnp.ones_like(here)], axis=-1)
+    return jnp.stack([-slope(1, 0, dx), -slope(0, 1, dy), jnp.full_like(here, up)], axis=-1)
 
 
 def _fan_mean(heights, dx, dy, fan, weight):
@@ -120,14 +127,16 @@ def _fan_mean(heights, dx, dy, fan, weight):
         x, y = (ay * bz - by * az) * dy, (bx * az - ax * bz) * dx
         z = jnp.where(present, (ax * by - ay * bx) * dx * dy, 0)  # x and y are zero where there is no triangle
         if weight != "area":
-            length = _length(x, y, jnp.where(present, z, 1))
+            length = _length(x, y, jnp.where(present & (z > 0), z, 1))
             share = 1 / length
             if weight == "angle":
                 share = share * jnp.atan2(length, ax * bx * dx * dx + ay * by * dy * dy + az * bz)
             share = stored(share, sure)
             x, y, z = x * share, y * share, z * share
         total_x, total_y, total_z = total_x + x, total_y + y, total_z + z
-    return jnp.stack([total_x, total_y, jnp.where(total_z == 0, 1, total_z)], axis=-1)
+    # Zero, where there is no triangle; or less than any number, beside slopes that are larger than any.
+    nothing = (total_x == 0) & (total_y == 0) & (total_z == 0)
+    return jnp.stack([total_x, total_y, jnp.where(nothing, 1, total_z)], axis=-1)
 
 
 def _length(x, y, z):

@@ -187,7 +187,8 @@ def _trace_world(
     tiles = _trace_each(mesh, world, camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
     outputs = jax.tree.map(tiling.assemble, tiles)
     if key is not None and sources(world, settings):
-        outputs["image"] = with_tangent(outputs["image"], moving_boundaries(world, camera, settings, key, mesh))
+        image = outputs["image"]
+        outputs["image"] = with_tangent(image, moving_boundaries(world, camera, settings, key, mesh, image))
     return outputs
 
 

@@ -25,8 +25,8 @@ class Settings:
         to a square.
       max_depth: how often a ray may be mirrored before the rest counts as black.
       edge_samples: points on edges of the terrain, in all, at which the derivative of moving silhouettes and shadow
-        boundaries is taken, see docs/gradients.md; 0: the derivative that each sample has by itself, no more. The
-        picture is the same.
+        boundaries is taken, and about as many samples more for it in the pixels where these are seen, see
+        docs/gradients.md; 0: the derivative that each sample has by itself, no more. The picture is the same.
       chunk: rays that are traced together; rounded down to a square of 8 x 8, 16 x 16, ... pixels.
     """
 

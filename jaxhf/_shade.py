@@ -20,7 +20,7 @@ from ._scene import Scene, Shape
 from ._settings import Settings
 from ._store import stored
 from ._texture import ImageTexture
-from ._transform import affine, dot, unit
+from ._transform import affine, dot, largest_component, power_of_two, unit
 from ._types import Flag, Index, MatrixLeaf, Scalar, Vector
 from ._walk import Status
 
@@ -177,10 +177,13 @@ def _towards(light: Directional | Point, p: Vector) -> tuple[Vector, Vector, Sca
     if isinstance(light, Directional):
         return unit(light.towards), light.radiance, None
     to = light.p - p
+    size = largest_component(to)
+    size = power_of_two(jnp.where(size > 0, size, 1))  # beyond its square root no number has a square
+    to = to / size
     square = dot(to, to)
     square = jnp.where(square > 0, square, 1)
     distance = jnp.sqrt(square)
-    return to / distance, light.intensity / square, distance
+    return to / distance, light.intensity / square / size / size, distance * size
 
 
 def _visible(

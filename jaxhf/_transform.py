@@ -7,6 +7,7 @@ round differently for different batch sizes.
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -40,14 +41,15 @@ def finite(v: Vector) -> Flag:
 
 def unit(v: Vector) -> Vector:
     """`v` at length 1; a zero vector stays zero, with zero derivative. Neither over- nor underflows on the way."""
-    largest = largest_component(v)
+    largest = lax.stop_gradient(largest_component(v))  # any factor does; its own derivative has its square in it
     zero = largest == 0
+    largest = jnp.minimum(largest, float(jnp.finfo(v.dtype).max) / 8)  # whose reciprocal is a normal number
     v = v / jnp.where(zero, 1, largest)
     return v / jnp.sqrt(jnp.where(zero, 1, dot(v, v)))
 
 
-def power_of_two(value: Scalar) -> Scalar:
-    """The power of two next below a positive number, clamped to 2^-100..2^100, so that its reciprocal is normal and exact.
+def power_of_two(value: Float[jax.Array, "*shape"]) -> Float[jax.Array, "*shape"]:
+    """The power of two next below positive numbers, clamped to 2^-100..2^100, so that its reciprocal is normal and exact.
 
     It carries no derivative.
     """
@@ -84,10 +86,14 @@ class Affine(eqx.Module):
     def inverse(self) -> "Affine":
         """By the adjugate; in NumPy float64 where the map is NumPy, so that a host-side inverse loses nothing."""
         linear: Any = self.linear
-        xp: Any = np if isinstance(linear, np.ndarray) and isinstance(self.offset, np.ndarray) else jnp
+        host = isinstance(linear, np.ndarray) and isinstance(self.offset, np.ndarray)
+        xp: Any = np if host else jnp
+        # Each column is divided by about its size, as the derivative has the determinant's square in it.
+        sizes: Any = np.ones(3) if host else power_of_two(jnp.abs(linear).max(axis=0))
+        linear = linear / sizes[None, :]
         a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
         adjugate = xp.stack([xp.cross(b, c), xp.cross(c, a), xp.cross(a, b)])
-        inverse = adjugate / (a * adjugate[0]).sum()
+        inverse = adjugate / (a * adjugate[0]).sum() / sizes[:, None]
         return Affine(inverse, -(inverse * self.offset[None, :]).sum(1))
 
 

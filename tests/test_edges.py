@@ -66,23 +66,23 @@ def heights_of(scene: jaxhf.Scene) -> Any:
 
 @functools.partial(jax.jit, static_argnames=("settings",))
 def changes(scene: jaxhf.Scene, direction: jaxhf.Scene, settings: jaxhf.Settings = EDGES) -> tuple[jax.Array, jax.Array]:
-    """The interior part of the derivative, and that of the boundaries."""
+    """The interior part of the derivative, from as many samples as are taken at boundaries, and what these add."""
 
     def along(settings: jaxhf.Settings) -> jax.Array:
         return jax.jvp(lambda scene: jaxhf.render(scene, settings)[..., 0], (scene,), (direction,))[1]
 
-    interior = along(dataclasses.replace(settings, edge_samples=0))
+    interior = along(dataclasses.replace(settings, samples=64, edge_samples=0))
     return interior, along(settings) - interior
 
 
-def assert_column(change: Any, rate: float, rtol: float = 0.05) -> None:
+def assert_column(change: Any, rate: float, elsewhere: float = 1e-9) -> None:
     """All of the change is in the column of the boundary, and the same in each row."""
-    # rtol: one row has some 40 of the points, drawn one a stratum.
+    # 0.05: one row has some 40 of the points, drawn one a stratum.
     change = np.asarray(change)
     column = int(np.argmax(np.abs(change).sum(0)))
-    np.testing.assert_allclose(change[:, column], rate, rtol=rtol)
+    np.testing.assert_allclose(change[:, column], rate, rtol=0.05)
     np.testing.assert_allclose(change.sum(), rate * SIZE, rtol=0.02)
-    assert np.abs(np.delete(change, column, 1)).max() < 1e-9 * abs(rate)
+    assert np.abs(np.delete(change, column, 1)).max() < elsewhere * abs(rate)
 
 
 LIT = 0.7 * TAN / np.hypot(1, TAN)  # radiance of the ground
@@ -93,12 +93,40 @@ def shadow_scene(light: Any = (-1.0, 0.0, TAN), at: float = SHADOW) -> jaxhf.Sce
     return small_scene(HEIGHT * PLATEAU, from_above(at + 0.01), light)
 
 
-def test_cast_shadow_alone_moves_with_heights():
-    """Raising the occluder by dh moves its shadow by dh / TAN, over lit ground."""
+def world_of(scene: jaxhf.Scene) -> Any:
+    return scene.objects[0].world_from_object
+
+
+def camera_of(scene: jaxhf.Scene) -> Any:
+    return scene.camera.world_from_camera
+
+
+def extent_of(scene: jaxhf.Scene) -> Any:
+    assert isinstance(scene.camera, jaxhf.Orthographic)
+    return scene.camera.extent
+
+
+def stretch(x: float, y: float, z: float) -> np.ndarray:
+    return np.diag([x, y, z, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("leaf", "change", "speed"),
+    [
+        (heights_of, PLATEAU, 1 / TAN),
+        (world_of, stretch(0, 0, 1), HEIGHT / TAN),
+        (world_of, shift(1, 0, 0), 1),
+        (camera_of, shift(1, 0, 0), -1),
+        (extent_of, 1, 0.01 / WIDE),  # the shadow ends this far left of the middle
+    ],
+    ids=["heights", "stretched", "shifted", "camera", "extent"],
+)
+def test_cast_shadow_alone_moves(leaf, change, speed):
+    """Raising the occluder by dh, by itself or by its transform, moves its shadow by dh / TAN over lit ground."""
     scene = shadow_scene()
-    interior, boundary = changes(scene, moved(heights_of, PLATEAU)(scene))
-    assert np.abs(interior).max() == 0
-    assert_column(boundary, -LIT / TAN / PIXEL)
+    interior, boundary = changes(scene, moved(leaf, change)(scene))
+    assert np.abs(interior).max() < 1e-12
+    assert_column(boundary, -LIT * speed / PIXEL)
 
 
 def test_cast_shadow_moves_with_the_light():
@@ -129,7 +157,7 @@ def test_silhouette_alone_moves_with_heights():
     camera = jaxhf.Orthographic.look_at(eye, target, up, WIDE, width=SIZE, height=SIZE)
     scene = small_scene(np.zeros((9, 9)), camera, (0.0, 0.0, 1.0))
     interior, boundary = changes(scene, moved(heights_of, 1)(scene))
-    assert np.abs(interior).max() < 1e-30
+    assert np.abs(interior).max() < 1e-12
     assert_column(np.asarray(boundary).T, 0.7 * np.cos(np.pi / 6) / PIXEL)
 
 
@@ -141,30 +169,52 @@ def test_crest_alone_moves_with_heights():
     camera = jaxhf.Orthographic.look_at(eye, target, (0, 0, 1), WIDE, width=SIZE, height=SIZE)
     scene = small_scene(ridge, camera, (0.0, 0.0, 1.0))
     _, boundary = changes(scene, moved(heights_of, 1)(scene))
-    assert_column(np.asarray(boundary).T, 0.7 * np.cos(tilt) / PIXEL)  # the smooth normal at the crest points straight up
-
-
-def test_silhouette_alone_moves_with_a_transform():
-    """The border of a flat sheet, seen from above, moves with the sheet."""
-    scene = small_scene(np.zeros((9, 9)), from_above(1.01), (0.0, 0.0, 1.0))
-    interior, boundary = changes(scene, moved(lambda scene: scene.objects[0].world_from_object, shift(1, 0, 0))(scene))
-    assert np.abs(interior).max() < 1e-30
-    assert_column(boundary, 0.7 / PIXEL)
+    # The smooth normal at the crest points straight up. Elsewhere 4 x 4 samples and 8 x 8 have not quite the same mean.
+    assert_column(np.asarray(boundary).T, 0.7 * np.cos(tilt) / PIXEL, elsewhere=1e-3)
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [EDGES, pytest.param(dataclasses.replace(EDGES, shading="flat", shadows=False), marks=pytest.mark.slow)],
-    ids=["smooth", "flat"],
+    ("leaf", "change", "speed"),
+    [
+        (world_of, shift(1, 0, 0), 1),
+        (world_of, stretch(1, 0, 0), 1),
+        (camera_of, shift(1, 0, 0), -1),
+        (extent_of, 1, 0.01 / WIDE),
+    ],
+    ids=["shifted", "stretched", "camera", "extent"],
 )
-def test_terminator_moves_with_the_camera(settings):
+def test_silhouette_alone_moves(leaf, change, speed):
+    """The border of a flat sheet, x = 1, seen from above."""
+    scene = small_scene(np.zeros((9, 9)), from_above(1.01), (0.0, 0.0, 1.0))
+    interior, boundary = changes(scene, moved(leaf, change)(scene))
+    assert np.abs(interior).max() < 1e-12
+    assert_column(boundary, 0.7 * speed / PIXEL)
+
+
+def test_terminator_moves_with_the_camera():
     """A ridge, seen from above with one side dark: its crest moves against the camera. Nobody's silhouette but the light's."""
     ridge = 0.5 - np.abs(np.linspace(-0.5, 0.5, 9))[None].repeat(9, axis=0)
     scene = small_scene(ridge, from_above(0.49), (-1.0, 0.0, 0.2))
-    _, boundary = changes(scene, moved(lambda scene: scene.camera.world_from_camera, shift(1, 0, 0))(scene), settings)
-    # The lit side's radiance just beside the crest; smooth normals there point straight up.
-    cosine = 1.2 / np.sqrt(2) if settings.shading == "flat" else 0.2
-    assert_column(boundary, -0.7 * cosine / np.hypot(1, 0.2) / PIXEL)
+    _, boundary = changes(scene, moved(camera_of, shift(1, 0, 0))(scene))
+    # The lit side's radiance just beside the crest: the smooth normal there points straight up.
+    assert_column(boundary, -0.7 * 0.2 / np.hypot(1, 0.2) / PIXEL, elsewhere=1e-3)
+
+
+def test_edges_of_facets_move():
+    """With flat shading radiance jumps at every edge: here at the crest of a low ridge, seen and lit on both sides."""
+    ridge = 0.1 * (0.5 - np.abs(np.linspace(-0.5, 0.5, 9))[None].repeat(9, axis=0))
+    scene = small_scene(ridge, from_above(0.49), (-1.0, 0.0, 1.0))
+    settings = dataclasses.replace(EDGES, shading="flat", shadows=False)
+    _, boundary = changes(scene, moved(camera_of, shift(1, 0, 0))(scene), settings)
+    assert_column(boundary, -0.7 * (1.1 - 0.9) / np.hypot(1, 0.1) / np.sqrt(2) / PIXEL)
+
+
+def test_boundary_pixels_are_looked_at_again():
+    """Radiance is in proportion to albedo: where the shadow ends, 8 x 8 samples say how much of a pixel is lit."""
+    scene = shadow_scene()
+    finer, difference = changes(scene, moved(lambda scene: scene.objects[0].material.albedo, 1)(scene))
+    assert np.abs(difference).max() < 1e-12
+    assert np.abs(finer - jaxhf.render(scene, INTERIOR)[..., 0] / 0.7).max() > 0.1 * LIT
 
 
 def test_forward_and_reverse_agree():
@@ -224,13 +274,30 @@ def whole_scene(kind: str) -> jaxhf.Scene:
     return jax.tree.map(jnp.asarray, scene)
 
 
+# Turns about a generic axis.
+TURN = np.array([[0, -0.3, 0.2, 0], [0.3, 0, -0.1, 0], [-0.2, 0.1, 0, 0], [0, 0, 0, 0]])
+
+
+def zoom_of(scene: jaxhf.Scene) -> Any:
+    return scene.camera.fov if isinstance(scene.camera, jaxhf.Perspective) else scene.camera.extent
+
+
+def sheet_of(scene: jaxhf.Scene) -> Any:
+    return scene.objects[1].world_from_object
+
+
+# Every kind of leaf that moves boundaries.
 DIRECTIONS = {
     "heights": moved(heights_of, 0.3 * BUMPS),
     "heights of the sheet": moved(lambda scene: scene.objects[1].shape.heights, X[:4, :4] + 0.3),
-    "transform of the sheet": moved(lambda scene: scene.objects[1].world_from_object, shift(0.05, 0.02, 0.05)),
+    "place of the sheet": moved(sheet_of, shift(0.05, 0.02, 0.05)),
+    "turn of the sheet": lambda scene: moved(sheet_of, TURN @ np.asarray(sheet_of(scene)))(scene),
+    "stretch of the ground": moved(world_of, stretch(0.1, 0.05, 0.5)),
     "sun": moved(lambda scene: scene.lights[0].towards, (0.1, 0.1, 0.1)),
     "lamp": moved(lambda scene: scene.lights[1].p, (0.2, 0.1, -0.2)),
-    "camera": moved(lambda scene: scene.camera.world_from_camera, shift(0.1, -0.05, 0.05)),
+    "place of the camera": moved(camera_of, shift(0.1, -0.05, 0.05)),
+    "turn of the camera": lambda scene: moved(camera_of, TURN @ np.asarray(camera_of(scene)))(scene),
+    "zoom": lambda scene: moved(zoom_of, 0.25 * np.asarray(zoom_of(scene)))(scene),
 }
 WIDTH, ROWS, STEP = 24, 16, 0.1
 PLACE = np.arange(WIDTH)[None] / WIDTH * 2 + np.arange(ROWS)[:, None] / ROWS * 3
@@ -266,38 +333,7 @@ def test_whole_picture_against_central_differences(kind):
         print(kind, name, np.linalg.norm(whole - numeric) / size, np.linalg.norm(without - numeric) / size)
         errors[name] = np.linalg.norm(whole - numeric) / size
         assert np.linalg.norm(without - numeric) > 0.1 * size, name
-    assert max(errors.values()) < 0.25, errors  # noise: some shadows here move a hundred times faster than most
-
-
-def eye_at(eye: Any, target: Any) -> jaxhf.Perspective:
-    return jaxhf.Perspective.look_at(eye, target, width=16, height=16)
-
-
-OUTSIDE = eye_at((0.6, -0.7, 0.7), (0.5, 0.5, 0.05))
-ROUGH = 0.2 * np.random.default_rng(3).uniform(size=(5, 5))
-EXTREMES = {
-    "flat": (np.zeros((5, 5)), OUTSIDE),
-    "holes": (np.where(np.arange(25).reshape(5, 5) % 7 == 3, np.nan, ROUGH), OUTSIDE),
-    "all holes": (np.full((5, 5), np.nan), OUTSIDE),
-    "eye inside": (ROUGH, eye_at((0.5, 0.5, 0.12), (0.9, 0.8, 0.1))),
-    "eye on a vertex": (np.zeros((5, 5)), eye_at((0.5, 0.5, 0.0), (0.9, 0.8, 0.1))),
-    "seen from its plane": (np.zeros((5, 5)), eye_at((0.5, -1, 0.0), (0.5, 0.5, 0.0))),
-    "steep": (1e6 * ROUGH, OUTSIDE),
-}
-
-
-@jax.jit
-def gradient_of_sum(scene: jaxhf.Scene) -> jaxhf.Scene:
-    return jax.grad(lambda scene: jnp.sum(jaxhf.render(scene, jaxhf.Settings(edge_samples=300))))(scene)
-
-
-@pytest.mark.parametrize("name", EXTREMES)
-def test_finite(name):
-    heights, camera = EXTREMES[name]
-    lamp, sun = jaxhf.Point((0.5, 0.5, 0.0)), jaxhf.Directional((1, 0, 0))  # at a vertex of flat terrain, and in its plane
-    scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera, [sun, lamp])
-    gradient = gradient_of_sum(jax.tree.map(jnp.asarray, scene))
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert max(errors.values()) < 0.18, errors  # 0.146 for the stretch, else 0.082: some shadows move a hundred times faster
 
 
 def test_lottery_is_exact_in_single_precision():
