@@ -1,5 +1,6 @@
 """A sweep as one page of plots."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ def plot(measured: Sequence[Measured], title: str) -> Any:
     if knobs:
         panels = below.subplots(rows, columns, squeeze=False).ravel()
         for axes, (task, knob, values) in zip(panels, knobs, strict=False):
-            _draw_knob(axes, task, knob, values)
+            _draw_knob(axes, task, knob, values, _decades(measured, task))
         for axes in panels[len(knobs) :]:
             axes.set_axis_off()
     return figure
@@ -90,7 +91,13 @@ def _floor(error: float) -> float:
     return max(error, 1e-9)
 
 
-def _draw_knob(axes: Any, task: str, knob: str, values: list[tuple[str, Measured]]) -> None:
+def _decades(measured: Sequence[Measured], task: str) -> tuple[float, float]:
+    """Powers of ten around all errors of a task: in each panel the same, so that what changes nothing looks level."""
+    errors = [_floor(row.figures[ERRORS[task]]) for row in measured if row.task == task]
+    return 10.0 ** math.floor(math.log10(min(errors))), 10.0 ** (math.floor(math.log10(max(errors))) + 1)
+
+
+def _draw_knob(axes: Any, task: str, knob: str, values: list[tuple[str, Measured]], limits: tuple[float, float]) -> None:
     places = range(len(values))
     axes.bar(places, [row.figures["against_base"] for _, row in values], width=0.6, color="0.8")
     axes.set_ylabel("time, of the base", fontsize="small")
@@ -98,5 +105,5 @@ def _draw_knob(axes: Any, task: str, knob: str, values: list[tuple[str, Measured
     axes.set_title(f"{task}: {knob}", fontsize="medium")
     errors = axes.twinx()
     errors.plot(places, [_floor(row.figures[ERRORS[task]]) for _, row in values], "o-", color="tab:red", markersize=4)
-    errors.set_yscale("log")
+    errors.set(yscale="log", ylim=limits)
     errors.set_ylabel(ERRORS[task].replace("_", " "), color="tab:red", fontsize="small")

@@ -408,13 +408,13 @@ def _minutes(sweep: Sweep, missing: Sequence[Configuration], start: float, frame
     samples = sweep.configurations[0].settings.samples or 1
     starts, runs = 0.0, 0.0
     for one in missing:
-        starts += {"picture": 1.5, "derivative": 6, "fit": 10}[one.task] * start
+        starts += {"picture": 1.5, "derivative": 8, "fit": 12}[one.task] * start
         share = (one.settings.samples or 1) / samples * (2 if one.precision == "float64" else 1)
         runs += (repeats + 1) * frame * (1 + (share if one.task == "picture" else 1))
     total = starts / _together(sweep) + runs
     if not sweep.reference.exists():
         total += 2 * start + 2 * frame * sweep.reference_samples / samples
-        total += 6 * start if any(one.task == "derivative" for one in sweep.configurations) else 0
+        total += 8 * start if any(one.task == "derivative" for one in sweep.configurations) else 0
     return max(1, math.ceil(total / 60))
 
 
