@@ -129,6 +129,7 @@ def test_curves_change_one_knob():
     assert list(found) == ["samples", "shading", "max_steps"]
     assert [value for value, _ in found["max_steps"]] == ["8", "16", "None"]
     assert [value for value, _ in found["samples"]] == ["1", "16", "25", "None"]
+    assert [value for value, _ in found["shading"]] == ["flat", "smooth"]  # not with other samples as well
 
 
 def test_tables_and_plot_hold_every_row():
@@ -161,6 +162,11 @@ def test_plan_sweeps_what_the_scene_has():
     assert len(set(debug.configurations)) == len(debug.configurations)
     assert (landsea.width, landsea.height) == (480, 270)
     assert {one.task for one in landsea.configurations} == {"picture", "derivative"}
+
+
+def test_plan_has_no_shadows_under_a_sky_alone(tmp_path):
+    (tmp_path / "a.toml").write_text(SCENE.replace('type = "directional"', 'type = "sky"\nradiance = 0.5'))
+    assert not any("shadows" in changed for changed in knobs_of(plan(tmp_path / "a.toml")))
 
 
 def test_plan_of_some_knobs():
