@@ -63,7 +63,29 @@ def _parser() -> argparse.ArgumentParser:
     info = commands.add_parser("info", help="print what a scene holds", description="Print what a scene holds.")
     info.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
     info.set_defaults(run=_info)
+    _add_tradeoff(commands)
     return parser
+
+
+def _add_tradeoff(commands: Any) -> None:
+    about = (
+        "Sweep each setting over a scene: error against a reference in double precision, time, compilation and peak memory; "
+        "print which settings nothing beats, and keep a table and a plot. What was measured is kept: the same command goes on "
+        "after Ctrl-C, and only prints when all is there. It says how long it will take."
+    )
+    tradeoff = commands.add_parser("tradeoff", help="measure what each setting costs and gains", description=about)
+    tradeoff.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
+    tradeoff.add_argument("-o", "--output", metavar="FOLDER", help="for table, reference and plot [NAME-tradeoff]")
+    tradeoff.add_argument("--error", type=float, metavar="E", help="recommend the cheapest settings within this error")
+    tradeoff.add_argument("--time", type=float, metavar="SECONDS", help="recommend the most exact settings within this time")
+    tradeoff.add_argument("--quick", action="store_true", help="fewer values, a smaller picture, a coarser reference")
+    tradeoff.add_argument("--fit", action="store_true", help="sweep tolerance and levels of a small fit, too")
+    tradeoff.add_argument("--knobs", nargs="+", default=(), metavar="KNOB", help="sweep only these")
+    tradeoff.add_argument("--width", type=int, metavar="PIXELS", help="size [the scene's, at most 480 for the longer side]")
+    tradeoff.add_argument("--devices", type=int, metavar="N", help="cores that share the work [all, at most 16]")
+    tradeoff.add_argument("--repeats", type=int, default=5, metavar="N", help="runs whose median is taken [5]")
+    tradeoff.add_argument("--markdown", action="store_true", help="print all figures as tables")
+    tradeoff.set_defaults(run=_tradeoff)
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -201,6 +223,56 @@ def _info(options: argparse.Namespace) -> None:
     for k, light in enumerate(scene.lights):
         values = ", ".join(f"{name} {_numbers(value)}" for name, value in vars(light).items())
         print(f"light {k}: {type(light).__name__}, {values}")
+
+
+def _tradeoff(options: argparse.Namespace) -> None:
+    from ._curves import require_matplotlib, save_plot
+    from ._front import front_lines, markdown, recommend
+    from ._tradeoff import plan, run
+
+    for name in ("error", "time", "repeats"):
+        value = getattr(options, name)
+        if value is not None and not value > 0:
+            raise ValueError(f"--{name} must be positive, it is {value}")
+    require_matplotlib()
+    sweep = plan(
+        options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick,
+        fits=options.fit,
+    )  # fmt: skip
+    with _Counter() as counter:
+        failures = run(sweep, options.repeats, counter.tell, counter)
+    measured = sweep.measured()
+    plot = save_plot(sweep, measured)
+    asks = options.error is not None or options.time is not None
+    if options.markdown:
+        print(markdown(measured))
+    if asks or not options.markdown:
+        print("\n".join(recommend(measured, options.error, options.time) if asks else front_lines(measured)))
+    print(f"{len(measured)} configurations: {sweep.table}, {plot}")
+    if failures:
+        raise ValueError(f"{len(failures)} configurations failed; the first: {failures[0]}")
+
+
+class _Counter:
+    """What a sweep is at, on a terminal only."""
+
+    def __call__(self, done: int, total: int, what: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\r\033[K{done}/{total} {what}", end="", file=sys.stderr, flush=True)
+
+    def tell(self, line: str) -> None:
+        self._clear()
+        print(line, flush=True)
+
+    def _clear(self) -> None:
+        if sys.stderr.isatty():
+            print("\r\033[K", end="", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> "_Counter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._clear()
 
 
 def _heightfield(field: "Heightfield") -> str:

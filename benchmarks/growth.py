@@ -1,0 +1,206 @@
+"""How time and memory grow with heights, pixels, samples, pictures and devices: one table, one page of plots, the exponents.
+
+Each point is a process of its own, so that its peak of memory is its own. One quantity varies, the others stay at 1024 x 1024
+heights, 512 x 512 pixels, one sample, one picture, all cores, in the view of camera B of forward.py. The terrain is a sum of
+waves, from the whole side down to eight cells, which takes no memory beyond its heights. "frame" is from new heights to the
+picture, "prepared" has their normals and bounds at hand; several pictures are seen from several places. An exponent e says
+that a cost grows as quantity ** e: the slope of the logarithms over the upper half of the points.
+"""
+
+import argparse
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxhf._worker import MeasurementError, Worker, peak_mb, serve, timed
+
+BASE = {"heights": 1024, "pixels": 512, "samples": 1, "images": 1}
+UNITS = {"heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores"}
+# At the peak, measured up to 8192 x 8192 heights: 63 bytes each.
+BYTES_A_HEIGHT = 66
+
+
+def waves(size: int, count: int = 48) -> np.ndarray:
+    """A terrain over the unit square, from products of vectors alone."""
+    rng = np.random.default_rng(0)
+    frequency = np.exp(rng.uniform(0, math.log(size / 8), count))
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, count))
+    place = np.linspace(0, 2 * np.pi, size)
+    x = np.outer(place, frequency * np.cos(angle)) + phase
+    y = np.outer(place, frequency * np.sin(angle))
+    amplitude = 0.03 / frequency
+    rows = np.concatenate([np.cos(y), np.sin(y)], 1).astype(np.float32)
+    columns = np.concatenate([amplitude * np.cos(x), -amplitude * np.sin(x)], 1).astype(np.float32)
+    return rows @ columns.T
+
+
+def prepare(job: dict[str, Any]) -> Mapping[str, Callable[[], Mapping[str, Any]]]:
+    import jax
+    from forward import CAMERAS, LIGHTS
+
+    import jaxhf
+
+    jax.config.update("jax_num_cpu_devices", job["devices"])
+    eye, target, fov = CAMERAS["B"]
+    side = job["pixels"]
+    cameras = [
+        jaxhf.Perspective.look_at(np.add(eye, (0.01 * k, 0, 0)), target, fov=fov, width=side, height=side)
+        for k in range(job["images"])
+    ]
+    scene = jaxhf.Scene(
+        [jaxhf.Object(jaxhf.Heightfield(waves(job["heights"])))], cameras[0], [jaxhf.Directional(LIGHTS["B"])], job["samples"]
+    )
+    ready: Any = None
+
+    def frame() -> None:
+        nonlocal ready
+        if job["images"] == 1:
+            jax.block_until_ready(jaxhf.render(scene))
+        else:
+            ready = jaxhf.prepare(scene)
+            views()
+
+    def views() -> None:
+        for camera in cameras:
+            jax.block_until_ready(jaxhf.render(ready.with_camera(camera)))
+
+    def first() -> dict[str, float]:
+        frame()
+        return {"peak_mb": peak_mb()}
+
+    def prepared() -> dict[str, float]:
+        nonlocal ready
+        if ready is None:
+            ready = jaxhf.prepare(scene)
+            views()
+        return timed(views)
+
+    return {"ready": first, "frame": lambda: timed(frame), "prepared": prepared}
+
+
+def measure(quantity: str, value: int, cores: list[int], repeats: int) -> dict[str, Any]:
+    job = BASE | {quantity: value} if quantity in BASE else dict(BASE)
+    used = cores[:value] if quantity == "devices" else cores
+    with Worker(__file__, job | {"devices": len(used)}, set(used)) as worker:
+        peak = worker.answer()["peak_mb"]
+        frames = [worker.ask("frame")["seconds"] for _ in range(repeats)]
+        worker.ask("prepared")
+        prepared = [worker.ask("prepared")["seconds"] for _ in range(repeats)]
+    count = value**2 if quantity in ("heights", "pixels") else value
+    return {
+        "quantity": quantity, "value": value, "count": count, "frame": float(np.median(frames)),
+        "prepared": float(np.median(prepared)), "peak_mb": peak,
+    }  # fmt: skip
+
+
+def exponent(points: list[dict[str, Any]], cost: str) -> float:
+    """Least squares through the logarithms of the upper half of the points, two at least."""
+    points = sorted(points, key=lambda point: point["count"])[-max(2, (len(points) + 1) // 2) :]
+    slope, _ = np.polyfit(np.log([point["count"] for point in points]), np.log([point[cost] for point in points]), 1)
+    return float(slope)
+
+
+def table(points: list[dict[str, Any]]) -> str:
+    lines = ["| | frame, s | prepared, s | peak, MiB |", "|---|---|---|---|"]
+    for quantity in dict.fromkeys(point["quantity"] for point in points):
+        mine = [point for point in points if point["quantity"] == quantity]
+        for point in mine:
+            name = f"{point['value']}²" if quantity in ("heights", "pixels") else str(point["value"])
+            lines.append(
+                f"| {name} {UNITS[quantity]} | {point['frame']:.3g} | {point['prepared']:.3g} | {point['peak_mb']:.0f} |"
+            )
+        if len(mine) > 1:
+            slopes = " | ".join(f"**{exponent(mine, cost):.2f}**" for cost in ("frame", "prepared", "peak_mb"))
+            lines.append(f"| **exponent of {UNITS[quantity]}** | {slopes} |")
+    return "\n".join(lines)
+
+
+def plot(points: list[dict[str, Any]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot as plt
+
+    quantities = list(dict.fromkeys(point["quantity"] for point in points))
+    figure, axes = plt.subplots(2, len(quantities), figsize=(3.6 * len(quantities), 7), layout="constrained", squeeze=False)
+    for column, quantity in enumerate(quantities):
+        mine = sorted((point for point in points if point["quantity"] == quantity), key=lambda point: point["count"])
+        counts = [point["count"] for point in mine]
+        for row, costs in enumerate((("frame", "prepared"), ("peak_mb",))):
+            panel = axes[row][column]
+            for cost in costs:
+                label = cost.replace("peak_mb", "peak") + (f", exponent {exponent(mine, cost):.2f}" if len(mine) > 1 else "")
+                panel.plot(counts, [point[cost] for point in mine], "o-", label=label)
+            panel.set(xscale="log", yscale="log", xlabel=UNITS[quantity], ylabel="MiB" if row else "seconds")
+            names = [f"{point['value']}²" if quantity in ("heights", "pixels") else str(point["value"]) for point in mine]
+            panel.set_xticks(counts, names, rotation=90 if len(names) > 5 else 0)
+            panel.set_xticks([], minor=True)
+            panel.set_ylim(*whole_decades([point[cost] for cost in costs for point in mine]))
+            panel.grid(True, alpha=0.3)
+            panel.legend(fontsize="small")
+    figure.savefig(path)
+
+
+def whole_decades(values: list[float]) -> tuple[float, float]:
+    """Powers of ten around them, so that noise does not fill a panel."""
+    return 10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values)))
+
+
+def available_bytes() -> int:
+    """Of memory, caches that the system would give up included (Linux)."""
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path("growth"), help="growth.json and growth.png go here")
+    parser.add_argument("--quantities", nargs="+", default=list(UNITS), choices=UNITS)
+    parser.add_argument("--largest", type=int, default=16384, help="heights a side, at most")
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    cores = sorted(os.sched_getaffinity(0))
+    values = {
+        "heights": [2**k for k in range(6, 15) if 2**k <= options.largest],
+        "pixels": [2**k for k in range(6, 13)],
+        "samples": [n * n for n in (1, 2, 4, 8)],
+        "images": [1, 2, 4, 8, 16],
+        "devices": [n for n in (1, 2, 4, 8, 16) if n <= len(cores)],
+    }
+    print("about 8 minutes on two free cores", flush=True)
+    options.output.mkdir(parents=True, exist_ok=True)
+    points: list[dict[str, Any]] = []
+    for quantity in options.quantities:
+        for value in values[quantity]:
+            needed, free = BYTES_A_HEIGHT * value**2, available_bytes()
+            if quantity == "heights" and needed > free:
+                print(
+                    f"{value}² heights are left out: they need {needed / 2**30:.0f} GiB, {free / 2**30:.0f} are free",
+                    flush=True,
+                )
+                continue
+            begin = time.perf_counter()
+            try:
+                points.append(measure(quantity, value, cores, options.repeats))
+            except MeasurementError as error:
+                print(f"{quantity} {value}: {error}", flush=True)
+                continue
+            if sys.stderr.isatty():
+                print(f"{quantity} {value}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
+    (options.output / "growth.json").write_text(json.dumps(points, indent=1))
+    plot(points, options.output / "growth.png")
+    print(table(points))
+
+
+if __name__ == "__main__":
+    if "--serve" in sys.argv:
+        serve(prepare)
+    else:
+        main()

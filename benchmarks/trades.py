@@ -1,0 +1,188 @@
+"""The trades that the seed's reports weighed, measured again on their scenes: space against time, exactness against time.
+
+Walks: the pyramid of bounds, single cells with bounds of their own ("dda"), single cells without any bounds (Amanatides and
+Woo 1987 as it stands). Triangles: made on demand from the heights, or all stored beforehand. Normals: the three schemes of
+the reports, and flat shading. The package has neither walks without bounds nor stored triangles: both are put in its place
+here, in a process of their own. Every variant is a process; frames take turns with the first variant's, and ratios are the
+medians of pairs. "difference" is the RMSE of the picture to the first variant's, over its mean.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from seeds import SCENES
+
+from jaxhf._worker import Worker, peak_mb, serve, timed
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "pyramid, triangles on demand, normals of six, smooth": {},
+    "dda with bounds": {"settings": {"traversal": "dda"}},
+    "dda without bounds": {"settings": {"traversal": "dda"}, "bounds": False},
+    "triangles stored": {"triangles": True},
+    "dda without bounds, triangles stored": {"settings": {"traversal": "dda"}, "bounds": False, "triangles": True},
+    "normals central": {"settings": {"normals": "central"}},
+    "normals of four": {"settings": {"normals": "four"}},
+    "flat": {"settings": {"shading": "flat"}},
+}
+
+
+def without_bounds() -> None:
+    """Walks look at no block before they visit a cell, and no bounds are held."""
+    import equinox as eqx
+    import jax.numpy as jnp
+
+    from jaxhf import _march, _shade, _walk
+
+    make_grid = _shade.make_grid
+
+    def grid_of(*arguments: Any, **options: Any) -> Any:
+        grid = make_grid(*arguments, **options)
+        return eqx.tree_at(lambda grid: grid.pyramid.bounds, grid, jnp.zeros(0, grid.z.dtype))
+
+    _march._SKIPS = 0
+    _walk.Walk.skip = lambda self, state: state
+    _shade.make_grid = grid_of
+
+
+def with_stored_triangles() -> None:
+    """Each cell's two triangles as six heights, one cell after the other: six numbers a cell in place of one a height."""
+    import equinox as eqx
+    import jax
+
+    from jaxhf import _grid, _shade, _walk
+
+    class Triangles(eqx.Module):
+        heights: jax.Array
+        shape: tuple[int, int] = eqx.field(static=True)
+
+    corners, make_grid = _grid.corners, _shade.make_grid
+
+    def corners_of(values: Any, ix: jax.Array, iy: jax.Array) -> tuple[jax.Array, ...]:
+        if not isinstance(values, Triangles):
+            return corners(values, ix, iy)
+        first = 6 * (iy * (values.shape[1] - 1) + ix)
+
+        def at(k: int) -> jax.Array:
+            return values.heights.at[first + k].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+        return at(0), at(1), at(5), at(2)
+
+    def grid_of(*arguments: Any, **options: Any) -> Any:
+        grid = make_grid(*arguments, **options)
+        z = grid.z
+        z00, z10, z01, z11 = z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]
+        stored = jax.numpy.stack([z00, z10, z11, z00, z11, z01], -1).reshape(-1)
+        return eqx.tree_at(lambda grid: grid.z, grid, Triangles(stored, (z.shape[0], z.shape[1])))
+
+    _grid.corners = _walk.corners = corners_of
+    _shade.make_grid = grid_of
+
+
+def prepare(job: dict[str, Any]) -> Mapping[str, Callable[[], Mapping[str, Any]]]:
+    import jax
+
+    import jaxhf
+
+    jax.config.update("jax_num_cpu_devices", job["devices"])
+    variant = VARIANTS[job["variant"]]
+    if not variant.get("bounds", True):
+        without_bounds()
+    if variant.get("triangles"):
+        with_stored_triangles()
+    scene = jaxhf.load_scene(job["scene"])
+    ready = jaxhf.prepare(scene, jaxhf.Settings(**variant.get("settings", {})))
+
+    def frame() -> None:
+        """From normals, bounds and triangles at hand: what is stored costs no time."""
+        jax.block_until_ready(jaxhf.render(ready))
+
+    def first() -> dict[str, float]:
+        frame()
+        return {"peak_mb": peak_mb(), "held_mb": sum(leaf.nbytes for leaf in jax.tree.leaves(ready)) / 2**20}
+
+    def picture() -> dict[str, float]:
+        np.save(job["picture"], np.asarray(jaxhf.render(ready)))
+        return {}
+
+    return {"ready": first, "frame": lambda: timed(frame), "picture": picture}
+
+
+def measure(scene: Path, cores: list[int], repeats: int, names: list[str]) -> list[dict[str, Any]]:
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+
+        def start(name: str, k: int) -> Worker:
+            job = {"scene": str(scene), "variant": name, "devices": len(cores), "picture": f"{folder}/{k}.npy"}
+            return Worker(__file__, job, set(cores))
+
+        with start(names[0], 0) as base:
+            base.answer()
+            base.ask("picture")
+            reference = np.load(f"{folder}/0.npy").astype(np.float64)
+            for k, name in enumerate(names, 1):
+                with start(name, k) as worker:
+                    ready = worker.answer()
+                    pairs = [(worker.ask("frame")["seconds"], base.ask("frame")["seconds"]) for _ in range(repeats)]
+                    worker.ask("picture")
+                difference = np.load(f"{folder}/{k}.npy").astype(np.float64) - reference
+                seconds, base_seconds = np.array(pairs).T
+                rows.append(
+                    {
+                        "scene": scene.stem,
+                        "variant": name,
+                        "seconds": float(np.median(seconds)),
+                        "ratio": float(np.median(seconds / base_seconds)),
+                        "difference": float(np.sqrt(np.mean(difference**2)) / reference.mean()),
+                        **ready,
+                    }
+                )
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        "| scene | variant | time, of the first | seconds | held, MiB | peak, MiB | difference |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row['scene']} | {row['variant']} | {row['ratio']:.2f} | {row['seconds']:.3g} | {row['held_mb']:.1f} | "
+        f"{row['peak_mb']:.0f} | {row['difference']:.2g} |"
+        for row in rows
+    ]
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="where the .pbrt scenes lie")
+    parser.add_argument("--scenes", nargs="+", default=[name for name in SCENES if name != "landsea-big64"])
+    parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--cores", type=int, default=1, help="that share the work; one by default, as in the reports")
+    parser.add_argument("-o", "--output", type=Path, help="keep the figures in this .json")
+    options = parser.parse_args()
+    for name in options.scenes:
+        if not (options.folder / f"{name}.pbrt").is_file():
+            parser.error(f"{options.folder / name}.pbrt: there is no such file")
+    cores = sorted(os.sched_getaffinity(0))[: options.cores]
+    print(f"about {len(options.scenes) * len(options.variants) / 3:.0f} minutes", flush=True)
+    rows: list[dict[str, Any]] = []
+    for name in options.scenes:
+        rows += measure(options.folder / f"{name}.pbrt", cores, options.repeats, options.variants)
+        if options.output:
+            options.output.write_text(json.dumps(rows, indent=1))
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    if "--serve" in sys.argv:
+        serve(prepare)
+    else:
+        main()

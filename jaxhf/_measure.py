@@ -1,0 +1,217 @@
+"""One configuration's cost and error; `python -m jaxhf._measure --serve` does it in a process of its own."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from ._fit import fit
+from ._heightfield import Heightfield
+from ._render import cast_camera, render
+from ._scene import Object, Scene
+from ._settings import Settings
+from ._worker import peak_mb, serve, timed
+from .io import load_scene
+from .io._sweep import load_reference, save_reference
+
+DERIVATIVE_PIXELS = (
+    160  # of the longer side: a derivative costs some times a picture, and needs no more to be told from another
+)
+WAVES = 8  # a side: the gradient is compared along the 8 x 8 smoothest changes of the heights
+FIT_HEIGHTS, FIT_PIXELS = 32, 64  # a side, at most
+
+# Rays that are cast together where hits are compared.
+_CAST = 1 << 16
+
+
+def picture_errors(image: Float[np.ndarray, "h w 3"], reference: Float[np.ndarray, "h w 3"]) -> dict[str, float]:
+    """Root mean square and 99.9 % of the difference (of a pixel's worst channel), over the reference's mean radiance."""
+    difference = np.asarray(image, np.float64) - reference
+    mean = float(np.mean(reference)) or 1.0
+    worst = np.abs(difference).max(-1)
+    return {"rmse": float(np.sqrt(np.mean(difference**2))) / mean, "p999": float(np.quantile(worst, 0.999)) / mean}
+
+
+def wrong_share(found: Int[np.ndarray, "n k"], reference: Int[np.ndarray, "n k"]) -> float:
+    """Of rows that differ anywhere."""
+    return float(np.mean((found != reference).any(-1)))
+
+
+def gradient_errors(found: Float[np.ndarray, " n"], reference: Float[np.ndarray, " n"]) -> dict[str, float]:
+    lengths = float(np.linalg.norm(found)), float(np.linalg.norm(reference))
+    cosine = float(np.vdot(found, reference)) / (lengths[0] * lengths[1]) if all(lengths) else 0.0
+    return {"cosine": cosine, "relative_error": float(np.linalg.norm(found - reference)) / (lengths[1] or 1.0)}
+
+
+def centre_hits(scene: Scene, settings: Settings) -> Int[np.ndarray, "n 5"]:
+    """Object, cell, triangle and status of the hits through the pixels' centres; the first four -1 where there is none."""
+    x, y = np.meshgrid(np.arange(scene.camera.width) + 0.5, np.arange(scene.camera.height) + 0.5)
+    x, y = x.ravel(), y.ravel()
+    parts = []
+    for first in range(0, x.size, _CAST):
+        part = np.minimum(np.arange(first, first + _CAST), x.size - 1)
+        vertex = jax.device_get(cast_camera(scene, x[part], y[part], settings))
+        found = vertex.index >= 0
+        place = np.stack([vertex.index, *vertex.hit.cell.T, vertex.hit.triangle], -1)
+        parts.append(np.concatenate([np.where(found[:, None], place, -1), vertex.hit.status[:, None]], -1))
+    return np.concatenate(parts)[: x.size].astype(np.int32)
+
+
+def resized(scene: Scene, width: int, height: int) -> Scene:
+    return dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, width=width, height=height))
+
+
+def shrunk(scene: Scene, pixels: int) -> Scene:
+    """The same view in a picture whose longer side has at most so many pixels."""
+    width, height = scene.camera.width, scene.camera.height
+    scale = min(1.0, pixels / max(width, height))
+    return resized(scene, max(1, round(scale * width)), max(1, round(scale * height)))
+
+
+class Picture:
+    """A frame from heights to image, normals and bounds included."""
+
+    def __init__(self, scene: Scene, settings: Settings):
+        self.scene, self.settings = scene, settings
+
+    def run(self) -> jax.Array:
+        self.image = jax.block_until_ready(render(self.scene, self.settings))
+        return self.image
+
+    def reference(self) -> dict[str, np.ndarray]:
+        return {"picture": np.asarray(self.run(), np.float64), "hits": centre_hits(self.scene, self.settings)}
+
+    def errors(self, reference: Mapping[str, np.ndarray]) -> dict[str, float]:
+        wrong = wrong_share(centre_hits(self.scene, self.settings), reference["hits"])
+        return picture_errors(np.asarray(self.image), reference["picture"]) | {"wrong_hits": wrong}
+
+
+class Derivative:
+    """Value and gradient, in all heights, of a loss: the picture under a smooth seeded weight.
+
+    What is compared is the gradient along the smoothest changes of the heights, as single heights are lost in the noise of
+    the points on edges.
+    """
+
+    def __init__(self, scene: Scene, settings: Settings):
+        self.scene = scene = shrunk(scene, DERIVATIVE_PIXELS)
+        self.heights = jnp.asarray(scene.heights)
+        waves = np.random.default_rng(0).normal(size=(6, 6, 3))
+        rows, columns = _cosines(scene.camera.height, 6), _cosines(scene.camera.width, 6)
+        weights = jnp.asarray(np.einsum("yi,xj,ijc->yxc", rows, columns, waves), self.heights.dtype)
+
+        def loss(heights: jax.Array) -> jax.Array:
+            return jnp.sum(weights * render(scene.with_heights(heights), settings))
+
+        self.step = eqx.filter_jit(jax.value_and_grad(loss))
+
+    def run(self) -> jax.Array:
+        return jax.block_until_ready(self.step(self.heights))[1]
+
+    def reference(self) -> dict[str, np.ndarray]:
+        return {"gradient": self._along_waves()}
+
+    def errors(self, reference: Mapping[str, np.ndarray]) -> dict[str, float]:
+        return gradient_errors(self._along_waves(), reference["gradient"])
+
+    def _along_waves(self) -> Float[np.ndarray, " n"]:
+        gradient = np.asarray(self.run(), np.float64)
+        ny, nx = gradient.shape
+        return np.einsum("yi,yx,xj->ij", _cosines(ny, WAVES), gradient, _cosines(nx, WAVES)).ravel()
+
+
+def _cosines(n: int, count: int) -> Float[np.ndarray, "n k"]:
+    return np.cos(np.pi * np.arange(count) * (np.arange(n)[:, None] + 0.5) / n)
+
+
+class Recovery:
+    """A small fit: the scene's first heightfield, thinned, found again from one picture and a smoothed prior."""
+
+    def __init__(self, scene: Scene, settings: Settings, tolerance: float, levels: list[float] | None):
+        scene = shrunk(_thinned(scene, FIT_HEIGHTS), FIT_PIXELS)
+        self.truth = np.asarray(scene.heights, np.float64)
+        target = np.asarray(render(scene, dataclasses.replace(settings, samples=16)))
+        basis = [_cosines(n, max(2, n // 8)) for n in self.truth.shape]
+        inverse = [np.linalg.pinv(one) for one in basis]
+        prior = basis[0] @ (inverse[0] @ self.truth @ inverse[1].T) @ basis[1].T
+        options: dict[str, Any] = {
+            "settings": settings, "noise": 0.01 * float(target.mean()), "start": prior, "prior": prior,
+            "prior_std": float((prior - self.truth).std()), "tolerance": tolerance, "levels": levels,
+        }  # fmt: skip
+        self.fit: Callable[[], Any] = lambda: fit([scene], [target], **options)
+
+    def run(self) -> Float[np.ndarray, "ny nx"]:
+        self.heights = np.asarray(self.fit().heights, np.float64)
+        return self.heights
+
+    def errors(self, reference: Mapping[str, np.ndarray]) -> dict[str, float]:
+        del reference  # the truth is known
+        return {"rmse": float(np.sqrt(np.mean((self.heights - self.truth) ** 2)) / np.ptp(self.truth))}
+
+
+def _thinned(scene: Scene, most: int) -> Scene:
+    """With every n-th height of the first heightfield, so that it has at most so many a side."""
+    objects = list(scene.objects)
+    place = next(k for k, obj in enumerate(objects) if isinstance(obj.shape, Heightfield))
+    obj = objects[place]
+    field = obj.shape
+    assert isinstance(field, Heightfield)
+    step = max(1, math.ceil(max(field.heights.shape) / most))
+    thin = Heightfield(np.asarray(field.heights)[::step, ::step], step * field.dx, step * field.dy, field.x0, field.y0)
+    objects[place] = Object(thin, obj.material, obj.world_from_object)
+    return dataclasses.replace(scene, objects=objects)
+
+
+def _make(job: dict[str, Any], task: str, settings: Settings) -> Picture | Derivative | Recovery:
+    scene = resized(load_scene(job["scene"], np.dtype(job["precision"])), job["width"], job["height"])
+    if task == "picture":
+        return Picture(scene, settings)
+    if task == "derivative":
+        return Derivative(scene, settings)
+    return Recovery(scene, settings, job["tolerance"], job["levels"])
+
+
+def _prepare(job: dict[str, Any]) -> dict[str, Callable[[], Mapping[str, Any]]]:
+    jax.config.update("jax_enable_x64", job["precision"] == "float64")
+    jax.config.update("jax_num_cpu_devices", job["devices"])
+    settings = Settings(**job["settings"])
+    if job["task"] == "reference":
+
+        def make_reference() -> dict[str, Any]:
+            parts = {}
+            for task, options in job["parts"].items():
+                made = _make(job, task, dataclasses.replace(settings, **options))
+                assert not isinstance(made, Recovery)
+                parts |= made.reference()
+            save_reference(job["reference"], job["identity"], parts)
+            return {}
+
+        return {"ready": make_reference}
+    measured = _make(job, job["task"], settings)
+
+    def first() -> dict[str, float]:
+        taken = timed(measured.run)
+        return {"first_seconds": taken["seconds"], "peak_mb": _peak()}
+
+    return {
+        "ready": first,
+        "frame": lambda: timed(measured.run),
+        "errors": lambda: measured.errors(load_reference(job["reference"], job["identity"])),
+    }
+
+
+def _peak() -> float:
+    device = jax.local_devices()[0]
+    if device.platform == "cpu":
+        return peak_mb()
+    return (device.memory_stats() or {}).get("peak_bytes_in_use", 0) / 2**20
+
+
+if __name__ == "__main__":
+    serve(_prepare)
