@@ -7,7 +7,7 @@ import pytest
 import scipy.fft
 
 import jaxhf
-from jaxhf._fit import _stages
+from jaxhf._descent import make_stages
 from jaxhf._residuals import robust_weight, soften
 from jaxhf._unknowns import make_basis, resample
 from jaxhf.io._procedural import fractal
@@ -213,6 +213,6 @@ def test_resampling_keeps_a_plane():
 
 
 def test_levels_double_from_eight_waves():
-    assert _stages((64, 40), "lm", None, "squares") == [0.125, 0.25, 0.5, 1.0]
-    assert _stages((12, 12), "lm", None, "huber") == [1.0, 1.0, 1.0, 1.0]
-    assert _stages((64, 64), "adam", None, "squares") == [1.0]
+    assert make_stages((64, 40), "lm", None, "squares") == [0.125, 0.25, 0.5, 1.0]
+    assert make_stages((12, 12), "lm", None, "huber") == [1.0, 1.0, 1.0, 1.0]
+    assert make_stages((64, 64), "adam", None, "squares") == [1.0]
