@@ -18,5 +18,6 @@ from .io import (
     load_heights as load_heights,
     load_image as load_image,
     load_scene as load_scene,
+    save_heights as save_heights,
     save_image as save_image,
 )
