@@ -58,7 +58,7 @@ class Prepared(eqx.Module):
 def prepare(scene: Scene, settings: Settings = Settings()) -> Prepared:
     """Takes the normals and the bounds of the heights once, for many pictures of the same terrain in the same light."""
     settings = settle(settings, scene)
-    return Prepared(scene, settings, _make_world(_on_every_device(localise(scene)), settings=settings))
+    return Prepared(scene, settings, _make_world(on_every_device(localise(scene)), settings=settings))
 
 
 def render(
@@ -100,14 +100,14 @@ def render(
         if settings != Settings() and settle(settings, scene.scene) != scene.settings:
             raise ValueError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
         settings, world = scene.settings, scene._world
-        camera = _on_every_device(localise_camera(scene.scene.camera, scene.scene))
+        camera = on_every_device(localise_camera(scene.scene.camera, scene.scene))
         if progress is None:
             outputs = _trace_prepared(world, camera, settings, aovs, _settled_key(key, settings))
         else:
             outputs = _trace_in_parts(world, camera, settings, aovs, progress)
     else:
         settings = settle(settings, scene)
-        outputs = _trace_all(_on_every_device(localise(scene)), settings, aovs, _settled_key(key, settings))
+        outputs = _trace_all(on_every_device(localise(scene)), settings, aovs, _settled_key(key, settings))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -124,7 +124,7 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         settled = settle(settings, scene)
-        return _trace_all(_on_every_device(scene), settled, (), _settled_key(None, settled))["image"]
+        return _trace_all(on_every_device(scene), settled, (), _settled_key(None, settled))["image"]
 
     return lax.map(one, scenes)
 
@@ -187,7 +187,7 @@ def _mesh() -> Mesh:
     return jax.make_mesh((len(devices),), ("tiles",), axis_types=(AxisType.Auto,), devices=devices)
 
 
-def _on_every_device(tree: Any) -> Any:
+def on_every_device(tree: Any) -> Any:
     """Copies a scene or a part of it to each device of this process, wherever the caller has put it."""
     return tree if jax.local_device_count() == 1 else jax.device_put(tree, NamedSharding(_mesh(), P()))
 
