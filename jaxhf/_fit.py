@@ -19,7 +19,7 @@ from ._scene import Scene
 from ._settings import Settings
 from ._solvers import BFGS_UNKNOWNS, Solver, count_unknowns, make_solver
 from ._types import AnyArray
-from ._uncertainty import pictures_and_influence, standard_deviations
+from ._uncertainty import pictures_and_influence, require_small, standard_deviations
 from ._unknowns import make_basis
 
 
@@ -158,6 +158,8 @@ def fit(
         raise ValueError(
             f"fit: solver bfgs takes at most {BFGS_UNKNOWNS} unknowns, there are {count_unknowns(unknowns)}; take lbfgs"
         )
+    if uncertainty == "exact":
+        require_small(unknowns, problem)
     run = Descent(
         problem,
         unknowns,

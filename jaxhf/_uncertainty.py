@@ -34,25 +34,26 @@ def standard_deviations(
         (Papandreou and Yuille, Gaussian sampling by local perturbations, 2010), so each deviation is right to
         1 / √(2 · samples), however the heights are correlated.
       inner_steps: of LSMR, each; five times as many as in a step of the fit are allowed.
-
-    Raises:
-      ValueError: "exact" for a matrix above `EXACT_ENTRIES`.
     """
     unknowns, problem = placed((unknowns, problem))
     if samples == "exact":
-        rows = sum(group.targets.size for group in problem.groups) + 4 * problem.basis.base.size
-        entries = rows * sum(leaf.size for leaf in jax.tree.leaves(unknowns))
-        if entries > EXACT_ENTRIES:
-            raise ValueError(
-                f"fit: uncertainty 'exact' takes at most {EXACT_ENTRIES} residuals times unknowns, they are {entries}; "
-                "give a number of samples"
-            )
         return np.sqrt(np.asarray(_exact_variance(unknowns, problem)))
     total = np.zeros(problem.basis.base.shape)
     for k in range(int(samples)):
         draw = np.asarray(_draw(unknowns, problem, jax.random.key(k), 5 * inner_steps), np.float64)
         total += draw * draw
     return np.sqrt(total / int(samples))
+
+
+def require_small(unknowns: Unknowns, problem: Problem) -> None:
+    """Raises ValueError where "exact" would make a matrix above `EXACT_ENTRIES`."""
+    rows = sum(group.targets.size for group in problem.groups) + 4 * problem.basis.base.size
+    entries = rows * sum(leaf.size for leaf in jax.tree.leaves(unknowns))
+    if entries > EXACT_ENTRIES:
+        raise ValueError(
+            f"fit: uncertainty 'exact' takes at most {EXACT_ENTRIES} residuals times unknowns, they are {entries}; "
+            "give a number of samples"
+        )
 
 
 def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
