@@ -26,6 +26,7 @@ from .io._checkpoint import load_arrays, load_facts, save_checkpoint
 _REJECTIONS = 8  # in a row: the damping has grown by 4 ** 8
 _HALVINGS = 50  # in a row, in a line search, which starts with the whole gradient
 _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
+_SHARP = 1.1  # a robust loss's scale so near to its own is taken for it
 _ROBUST_STAGES = 3  # over which the scale of a robust loss comes down to its own
 
 
@@ -135,13 +136,15 @@ class Descent:
         self.stage += 1
         self.stage_start = len(self.history)
         self._set_basis(field, np.asarray(heights))
-        last = self.stage + 1 == len(self.stages)
         pictures, pull = pictures_and_influence(self.unknowns, self.problem)
         spread = _spread(pictures, self.problem)
         if self.stages[self.stage] == 1:
             self.lift = self._lift(pictures, np.asarray(pull))
             self._set_basis(field, np.asarray(heights))
         if self.sharpest is not None:
+            if min(self.stages[self.stage :]) == 1 and 3 * spread <= _SHARP * self.sharpest:
+                self.stage = len(self.stages) - 1  # those between would be this one again
+            last = self.stage + 1 == len(self.stages)
             scale = jnp.asarray(self.sharpest if last else max(self.sharpest, 3 * spread), heights.dtype)
             self.problem = eqx.tree_at(lambda problem: problem.loss_scale, self.problem, scale)
         self.best = (math.inf, self.unknowns)
