@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -158,6 +159,10 @@ def fit(
         raise ValueError(
             f"fit: solver bfgs takes at most {BFGS_UNKNOWNS} unknowns, there are {count_unknowns(unknowns)}; take lbfgs"
         )
+    sampled = uncertainty is not None and uncertainty != "exact"
+    if (solver == "lm" or sampled) and dtype == np.float32 and jax.config.jax_enable_x64:  # pyright: ignore
+        # lineax's LSMR then mixes single with double precision, a TypeError from deep inside.
+        raise ValueError("fit: scenes must have float64 heights where JAX's x64 mode is on, theirs are float32")
     if uncertainty == "exact":
         require_small(unknowns, problem)
     run = Descent(

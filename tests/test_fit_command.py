@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -97,8 +98,8 @@ def pretended(options: dict, ends: bool = True):
             raise KeyboardInterrupt
         image = np.asarray(targets[0])
         return jaxhf.Fit(
-            heights=TRUTH, result=jaxhf.Stop.CONVERGED, std=np.where(TRUTH > 15, np.inf, 1.5), seen=TRUTH <= 15,
-            albedo=np.linspace(0, 1, 6).reshape(3, 2, 1), exposures=np.array([1.25]), offsets=None,
+            heights=jnp.asarray(TRUTH), result=jaxhf.Stop.CONVERGED, std=np.where(TRUTH > 15, np.inf, 1.5), seen=TRUTH <= 15,
+            albedo=jnp.linspace(0, 1, 6).reshape(3, 2, 1), exposures=jnp.array([1.25]), offsets=None,
             images=(image,), residuals=(0 * image,), history=steps,
             stats={"steps": 3, "accepted": 2, "seconds": 1.5, "loss": 0.001, "chi2": 0.99},
         )  # fmt: skip
