@@ -1,6 +1,7 @@
 from ._camera import Orthographic as Orthographic, Perspective as Perspective
 from ._cylinder import Cylinder as Cylinder
-from ._fit import Fit as Fit, Step as Step, Stop as Stop, fit as fit
+from ._descent import Step as Step, Stop as Stop
+from ._fit import Fit as Fit, fit as fit
 from ._heightfield import Heightfield as Heightfield, vertex_normals as vertex_normals
 from ._hit import Hit as Hit
 from ._light import Directional as Directional, Point as Point, Sky as Sky
@@ -17,5 +18,6 @@ from .io import (
     load_heights as load_heights,
     load_image as load_image,
     load_scene as load_scene,
+    save_heights as save_heights,
     save_image as save_image,
 )

@@ -24,8 +24,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         options.run(options)
-    except KeyboardInterrupt:
-        print("\njaxhf: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interruption:
+        print(f"\njaxhf: {str(interruption) or 'interrupted'}", file=sys.stderr)
         return 130
     except (ValueError, OSError) as error:
         print(f"jaxhf: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="jaxhf", description="Renders heightfields.")
+    parser = _Parser(prog="jaxhf", description="Renders heightfields, and recovers them from pictures.")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     render = commands.add_parser("render", help="render a scene to a picture", description="Render a scene to a picture.")
@@ -54,11 +54,16 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--max-depth", type=int, metavar="N", help="mirror bounces [4]")
     render.add_argument("--max-steps", type=int, metavar="N", help="step budget of a walk [as many as any ray needs]")
     render.add_argument("--chunk", type=int, metavar="RAYS", help="rays traced together [1024]")
-    render.add_argument(
-        "--devices", type=int, metavar="N", help="cores that share the work, each with a copy [all, at most 16]"
-    )
-    render.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
+    _add_machine(render)
     render.set_defaults(run=_render)
+
+    fit = commands.add_parser("fit", help="recover heights from pictures", description="Recover heights from pictures.")
+    fit.add_argument("case", metavar="CASE", help="a .toml file: a scene, its pictures, and what is known")
+    fit.add_argument("-o", "--output", required=True, metavar="OUT", help="the heights: .npy, .npz or .tif")
+    fit.add_argument("--report", metavar="PAGE", help="an .html page with plots of heights, pictures and convergence")
+    fit.add_argument("--resume", action="store_true", help="go on from OUT.checkpoint, if it is there")
+    _add_machine(fit)
+    fit.set_defaults(run=_fit)
 
     info = commands.add_parser("info", help="print what a scene holds", description="Print what a scene holds.")
     info.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
@@ -88,6 +93,13 @@ def _add_tradeoff(commands: Any) -> None:
     tradeoff.set_defaults(run=_tradeoff)
 
 
+def _add_machine(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--devices", type=int, metavar="N", help="cores that share the work, each with a copy [all, at most 16]"
+    )
+    command.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
+
+
 def _render(options: argparse.Namespace) -> None:
     from .io import require_writable, save_image
 
@@ -98,6 +110,16 @@ def _render(options: argparse.Namespace) -> None:
     image, report = _timed_render(scene, settings)
     save_image(options.output, image)
     print(f"{options.output}: {report}")
+
+
+def _fit(options: argparse.Namespace) -> None:
+    from pathlib import Path
+
+    from ._fit_command import Outputs, fit_file
+
+    outputs = Outputs(Path(options.output), Path(options.report) if options.report else None, options.resume)
+    _set_up_jax(options.precision, options.devices)
+    print(fit_file(options.case, outputs, options.precision))
 
 
 def _set_up_jax(precision: str, devices: int | None) -> None:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._problem import Problem
 from ._residuals import known_residuals, picture_residuals, robust_weight, simulate, unusual
+from ._solvers import placed
 from ._unknowns import Basis, Unknowns
 
 EXACT_ENTRIES = 2**24
@@ -33,18 +34,9 @@ def standard_deviations(
         (Papandreou and Yuille, Gaussian sampling by local perturbations, 2010), so each deviation is right to
         1 / √(2 · samples), however the heights are correlated.
       inner_steps: of LSMR, each; five times as many as in a step of the fit are allowed.
-
-    Raises:
-      ValueError: "exact" for a matrix above `EXACT_ENTRIES`.
     """
+    unknowns, problem = placed((unknowns, problem))
     if samples == "exact":
-        rows = sum(group.targets.size for group in problem.groups) + 4 * problem.basis.base.size
-        entries = rows * sum(leaf.size for leaf in jax.tree.leaves(unknowns))
-        if entries > EXACT_ENTRIES:
-            raise ValueError(
-                f"fit: uncertainty 'exact' takes at most {EXACT_ENTRIES} residuals times unknowns, they are {entries}; "
-                "give a number of samples"
-            )
         return np.sqrt(np.asarray(_exact_variance(unknowns, problem)))
     total = np.zeros(problem.basis.base.shape)
     for k in range(int(samples)):
@@ -53,13 +45,30 @@ def standard_deviations(
     return np.sqrt(total / int(samples))
 
 
-@eqx.filter_jit
+def require_small(unknowns: Unknowns, problem: Problem) -> None:
+    """Raises ValueError where "exact" would make a matrix above `EXACT_ENTRIES`."""
+    rows = sum(group.targets.size for group in problem.groups) + 4 * problem.basis.base.size
+    entries = rows * sum(leaf.size for leaf in jax.tree.leaves(unknowns))
+    if entries > EXACT_ENTRIES:
+        raise ValueError(
+            f"fit: uncertainty 'exact' takes at most {EXACT_ENTRIES} residuals times unknowns, they are {entries}; "
+            "give a number of samples"
+        )
+
+
 def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
     """The pictures, and how much each height moves a random sum of them; zero, exactly, for one that moves none, (ny, nx).
 
     The column of J of a vertex without influence is zero, and so is its product with any vector; that of another vertex with
     a random vector is zero with probability zero.
     """
+    return _pictures_and_influence(*placed((unknowns, problem)))
+
+
+@eqx.filter_jit
+def _pictures_and_influence(
+    unknowns: Unknowns, problem: Problem
+) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
     heights = problem.basis.heights(unknowns.waves)
 
     def pictures(heights: Float[Array, "ny nx"]) -> tuple[list[Array], list[Array]]:

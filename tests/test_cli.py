@@ -51,7 +51,7 @@ def test_help_is_quick():
         assert "info" in run.stdout
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["render", "--help"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["render", "--help"], ["fit", "--help"]])
 def test_help_does_not_import_jax(arguments):
     script = "import sys\nfrom jaxhf.__main__ import main\ntry: main(sys.argv[1:])\nfinally: print('jax' in sys.modules)"
     run = python("-c", script, *arguments)

@@ -7,9 +7,11 @@ import pytest
 import scipy.fft
 
 import jaxhf
-from jaxhf._fit import _stages
-from jaxhf._residuals import robust_weight, soften
-from jaxhf._unknowns import make_basis, resample
+from jaxhf import _descent
+from jaxhf._descent import make_stages
+from jaxhf._problem import Prior, Problem
+from jaxhf._residuals import known_residuals, robust_weight, soften
+from jaxhf._unknowns import Unknowns, make_basis, resample
 from jaxhf.io._procedural import fractal
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024)
@@ -76,6 +78,19 @@ def test_exposures_and_albedo_come_back_in_spite_of_outliers():
     assert found.albedo.shape == (1, 1, 1)
     shape = np.asarray(found.heights) - np.mean(found.heights) - (TRUTH - TRUTH.mean())
     assert rms(shape) < 0.02 * np.ptp(TRUTH)
+
+
+def test_what_is_known_beforehand_counts_in_standard_deviations():
+    """The prior at each height, and smoothness as the sum of differences to the neighbours: none on a slope but at its ends."""
+    x = np.arange(6.0)[None, :] + np.zeros((5, 1))
+    basis = make_basis(jaxhf.Heightfield(x), x)
+    prior = Prior(jnp.asarray(x - 1), jnp.asarray(np.full((5, 6), 1 / 4)))
+    problem = Problem((), basis, prior, jnp.asarray(1 / 2), jnp.asarray(1 / 8), None, "squares", SETTINGS)
+    factors = jnp.asarray(np.stack([x * x, x], axis=-1))
+    off, rough, rough_paint, _ = known_residuals(Unknowns(jnp.zeros((5, 6)), factors), problem)
+    np.testing.assert_allclose(off, 1 / 4)
+    np.testing.assert_allclose(rough, [[1 / 2, 0, 0, 0, 0, -1 / 2]] * 5)
+    np.testing.assert_allclose(rough_paint[:, 1:-1], 2 / 8)
 
 
 def noisy_fit(targets, rng, **options) -> jaxhf.Fit:
@@ -156,6 +171,11 @@ BAD = {
     r"solver must be one of lm, bfgs, lbfgs, adam; it is 'sgd'": ({}, {"solver": "sgd"}),
     r"levels must be shares above 0, the last of them 1": ({}, {"levels": [0.5]}),
     r"uncertainty must be None, 'exact' or a number": ({}, {"uncertainty": "some"}),
+    r"uncertainty 'exact' takes at most 16777216 residuals times": (
+        {"fine": True},
+        {"uncertainty": "exact"},
+    ),
+    r"scenes must have float64 heights where JAX's x64 mode is on, theirs are float32": ({"single": True}, {}),
     r"max_steps must be a whole number from 1 on, it is 0": ({}, {"max_steps": 0}),
     r"smoothness must be positive and finite, it is -1": ({}, {"smoothness": -1}),
 }
@@ -173,6 +193,10 @@ def test_bad_input_is_refused(message):
         measured[1] = np.zeros(changes["shape"])
     if "nan" in changes:
         measured[2][1, 2] = np.nan
+    if "single" in changes:
+        given = scenes(np.zeros((12, 12), np.float32))
+    if "fine" in changes:
+        given = scenes(np.zeros((64, 64)))
     if "other" in changes:
         given[1] = scenes(np.zeros((5, 5)))[1]
     with pytest.raises(ValueError, match=f"^fit: {message}"):
@@ -212,7 +236,25 @@ def test_resampling_keeps_a_plane():
     np.testing.assert_allclose(resample(2 * x - y, (9, 5)), 2 * fine_x - fine_y, atol=1e-12)
 
 
+@pytest.mark.parametrize(("spread", "stage", "scale"), [(2.0, 1, 6.0), (1.05, 4, 3.0), (0.5, 4, 3.0)])
+def test_a_robust_loss_that_is_sharp_already_goes_to_its_last_stage(monkeypatch, spread, stage, scale):
+    monkeypatch.setattr(_descent, "pictures_and_influence", lambda unknowns, problem: ([], np.zeros((5, 6))))
+    monkeypatch.setattr(_descent, "_spread", lambda pictures, problem: spread)
+    monkeypatch.setattr(_descent.Descent, "_lift", lambda self, pictures, pull: 1.0)
+    field = jaxhf.Heightfield(np.zeros((5, 6)))
+    problem = Problem((), make_basis(field, np.zeros((5, 6))), None, None, None, jnp.asarray(3.0), "geman", SETTINGS)
+    stages = [0.5, 1.0, 1.0, 1.0, 1.0]
+    run = _descent.Descent(problem, Unknowns(jnp.zeros((5, 6))), None, stages, 1e-4, 10, None, None, 10, "")
+    run.fresh = None
+    run._next_stage(field)
+    assert run.stage == 0  # there are still waves to come
+    run.best = (1.0, run.unknowns)
+    run._next_stage(field)
+    assert run.stage == stage
+    assert run.problem.loss_scale == scale
+
+
 def test_levels_double_from_eight_waves():
-    assert _stages((64, 40), "lm", None, "squares") == [0.125, 0.25, 0.5, 1.0]
-    assert _stages((12, 12), "lm", None, "huber") == [1.0, 1.0, 1.0, 1.0]
-    assert _stages((64, 64), "adam", None, "squares") == [1.0]
+    assert make_stages((64, 40), "lm", None, "squares") == [0.125, 0.25, 0.5, 1.0]
+    assert make_stages((12, 12), "lm", None, "huber") == [1.0, 1.0, 1.0, 1.0]
+    assert make_stages((64, 64), "adam", None, "squares") == [1.0]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxhf.io import Terrain, jacksboro, load_heights
+from jaxhf.io import Terrain, jacksboro, load_heights, save_heights
 from jaxhf.io._files import MAX_PIXELS
 from jaxhf.io._terrain import metres_per_degree
 
@@ -256,3 +256,48 @@ def test_a_missing_file_is_named(tmp_path):
 def test_terrain_checks_itself():
     with pytest.raises(ValueError, match="dy must be positive and finite, it is -1"):
         Terrain(np.zeros((2, 2)), dy=-1.0)
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz", ".tif"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_written_heights_are_read_back(tmp_path, ending, dtype):
+    if ending == ".tif":
+        pytest.importorskip("tifffile")
+    heights = np.array([[1, np.nan, 3], [4, 5, np.pi]], dtype)
+    terrain = Terrain(heights, 30.0, 20.5, 500000.25, 4.1e6)
+    save_heights(tmp_path / f"x{ending}", terrain)
+    again = load_heights(tmp_path / f"x{ending}")
+    np.testing.assert_array_equal(again.heights, heights)
+    assert again.heights.dtype == dtype
+    assert placed(again) == ((1, 1, 0, 0) if ending == ".npy" else placed(terrain))
+    assert [path.name for path in tmp_path.iterdir()] == [f"x{ending}"]
+
+
+@pytest.mark.parametrize("model", [PROJECTED, GEOGRAPHIC])
+@pytest.mark.parametrize("raster", [IS_AREA, IS_POINT])
+def test_a_geotiff_may_take_over_the_place_of_another(tmp_path, model, raster):
+    """The rows are flipped back, and every tag of its place is the other's."""
+    tifffile = pytest.importorskip("tifffile")
+    write_tiff(tmp_path / "a.tif", NORTH_FIRST, model=model, raster=raster, scale=(0.5, 0.25, 0), tie=(0, 1, 0, 7, 40, 0))
+    first = load_heights(tmp_path / "a.tif")
+    save_heights(tmp_path / "b.tif", Terrain(first.heights * 2), like=tmp_path / "a.tif")
+    second = load_heights(tmp_path / "b.tif")
+    np.testing.assert_array_equal(second.heights, SOUTH_FIRST * 2)
+    assert placed(second) == placed(first)
+    assert placed(second) != (1, 1, 0, 0)
+    with tifffile.TiffFile(tmp_path / "a.tif") as a, tifffile.TiffFile(tmp_path / "b.tif") as b:
+        assert a.pages[0].geotiff_tags == b.pages[0].geotiff_tags
+    with pytest.raises(ValueError, match=r"a\.tif: it must have the shape of the heights, \(3, 3\); it has \(2, 3\)"):
+        save_heights(tmp_path / "c.tif", Terrain(np.zeros((3, 3))), like=tmp_path / "a.tif")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "b.tif"]
+
+
+def test_where_heights_cannot_be_written(tmp_path):
+    terrain = Terrain(np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"x\.asc: cannot write heights with the ending '\.asc'"):
+        save_heights(tmp_path / "x.asc", terrain)
+    with pytest.raises(FileNotFoundError, match=r"x\.npy: there is no folder"):
+        save_heights(tmp_path / "none" / "x.npy", terrain)
+    (tmp_path / "x.npz").mkdir()
+    with pytest.raises(ValueError, match=r"x\.npz: heights cannot be written here, it is a folder"):
+        save_heights(tmp_path / "x.npz", terrain)

@@ -4,12 +4,20 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from .._scene import Scene
-from ._files import PathLike, by_ending, require_file
+from ._files import (
+    PathLike,
+    by_ending,
+    require_file,
+    require_writable_text as require_writable_text,
+    save_text as save_text,
+)
 from ._images import load_image as load_image, require_writable as require_writable, save_image as save_image
 from ._pbrt import load_pbrt
+from ._save_heights import require_writable_heights as require_writable_heights, save_heights as save_heights
 from ._source import SceneError as SceneError
 from ._terrain import Terrain as Terrain, jacksboro as jacksboro, load_heights as load_heights
 from ._toml import load_toml
+from ._toml_fit import Case as Case, load_case as load_case
 
 _READERS = {".toml": load_toml, ".pbrt": load_pbrt}
 

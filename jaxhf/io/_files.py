@@ -50,6 +50,22 @@ def reading(path: Path) -> Iterator[None]:
         raise ValueError(f"{path}: {error}") from error
 
 
+def require_folder(path: Path, what: str) -> None:
+    """Checks that a file can be put where `path` says.
+
+    Raises:
+      FileNotFoundError: the folder does not exist.
+      ValueError: `path` is a folder itself.
+      PermissionError: the folder cannot be written to.
+    """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: there is no folder {str(path.parent)!r}")
+    if path.is_dir():
+        raise ValueError(f"{path}: {what} cannot be written here, it is a folder")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: the folder {str(path.parent)!r} cannot be written to")
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong."""
@@ -60,6 +76,20 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_writable_text(path: PathLike, ending: str) -> Path:
+    """Checks that `save_text` can write to `path`, and that it has this ending; errors as those of `require_folder`."""
+    path = Path(path)
+    by_ending({ending: None}, path, "write a page with")
+    require_folder(path, "a page")
+    return path
+
+
+def save_text(path: PathLike, text: str) -> None:
+    """Writes a text as UTF-8; the file appears whole or not at all."""
+    with replacing(Path(path)) as temporary:
+        temporary.write_text(text, encoding="utf-8")
 
 
 def require_pixels(height: int, width: int) -> None:

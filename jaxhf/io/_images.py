@@ -4,7 +4,6 @@ In memory every image is linear, shape (h, w, 3), top row first. Sizes that a fi
 length and against `MAX_PIXELS` before anything is decoded.
 """
 
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from ._files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_pixels
+from ._files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_folder, require_pixels
 from ._png import read_png, samples_16
 
 
@@ -71,12 +70,7 @@ def require_writable(path: PathLike) -> Path:
     """
     path = Path(path)
     by_ending(_WRITERS, path, "write an image with")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: there is no folder {str(path.parent)!r}")
-    if path.is_dir():
-        raise ValueError(f"{path}: an image cannot be written here, it is a folder")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise PermissionError(f"{path}: the folder {str(path.parent)!r} cannot be written to")
+    require_folder(path, "an image")
     if path.suffix.lower() == ".exr":
         with reading(path):
             _openexr("writing")

@@ -193,10 +193,7 @@ def _read_png(path: Path) -> Raw:
 
 
 def _read_tiff(path: Path) -> Raw:
-    try:
-        import tifffile
-    except ImportError as error:
-        raise ValueError("reading .tif needs tifffile: pip install 'jaxhf[geo]'") from error
+    tifffile = require_tifffile("reading")
     with tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         require_pixels(page.imagelength, page.imagewidth)
@@ -217,6 +214,15 @@ def _read_tiff(path: Path) -> Raw:
         if scale is not None or tie is not None or matrix is not None:
             raise ValueError("its GeoTIFF tags must be ModelPixelScale with ModelTiepoint: rotated rasters are not read")
         return raw[::-1], {}, nodata
+
+
+def require_tifffile(doing: str) -> Any:
+    """The package; ValueError where it is not installed."""
+    try:
+        import tifffile
+    except ImportError as error:
+        raise ValueError(f"{doing} .tif needs tifffile: pip install 'jaxhf[geo]'") from error
+    return tifffile
 
 
 def _gdal_nodata(text: str) -> float:

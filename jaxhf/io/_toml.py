@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
+from .._camera import Camera
 from .._cylinder import Cylinder
 from .._heightfield import Heightfield
+from .._light import Light
 from .._scene import Object, Scene
 from .._texture import ImageTexture
 from .._transform import require_invertible
@@ -37,6 +39,18 @@ def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
     Raises:
       SceneError: anything is wrong in it; with its line.
     """
+    part = open_toml(path)
+    values = part.read(SCENE)
+    parts = {
+        "camera": read_camera(part.at("camera", table=values["camera"])),
+        "lights": read_lights(part, values["lights"]),
+        "objects": read_objects(part, values, np.dtype(dtype)),
+    }
+    return part.made(Scene, samples=values["samples"], **parts)
+
+
+def open_toml(path: Path) -> Part:
+    """The outermost table of a file; SceneError where it is not TOML."""
     text = ""
     try:
         text = path.read_text(encoding="utf-8")
@@ -47,18 +61,22 @@ def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
         raise SceneError(path, int(at[1]) if at else len(text.splitlines()), f"this is not TOML: {message}") from error
     except (UnicodeDecodeError, RecursionError) as error:
         raise SceneError(path, None, f"this is not TOML: {error}") from error
-    return _scene(Part(path, line_numbers(text), (), content), np.dtype(dtype))
+    return Part(path, line_numbers(text), (), content)
 
 
-def _scene(part: Part, dtype: np.dtype) -> Scene:
-    values = part.read(SCENE)
+def read_camera(part: Part) -> Camera:
+    return _variant(part, "type", CAMERAS)
+
+
+def read_lights(part: Part, tables: list[dict[str, Any]]) -> list[Light]:
+    """The lights in the list `lights` of `part`."""
+    return [_variant(part.at("lights", k, table=table), "type", LIGHTS) for k, table in enumerate(tables)]
+
+
+def read_objects(part: Part, values: dict[str, Any], dtype: np.dtype) -> list[Object]:
+    """The objects of a scene, with its textures."""
     textures = {name: _texture(part.at("textures", name, table=table)) for name, table in values["textures"].items()}
-    parts = {
-        "camera": _variant(part.at("camera", table=values["camera"]), "type", CAMERAS),
-        "lights": [_variant(part.at("lights", k, table=table), "type", LIGHTS) for k, table in enumerate(values["lights"])],
-        "objects": [_object(part.at("objects", k, table=table), textures, dtype) for k, table in enumerate(values["objects"])],
-    }
-    return part.made(Scene, samples=values["samples"], **parts)
+    return [_object(part.at("objects", k, table=table), textures, dtype) for k, table in enumerate(values["objects"])]
 
 
 def _variant(part: Part, key: str, variants: Any) -> Any:
@@ -74,10 +92,10 @@ def _texture(part: Part) -> ImageTexture:
         return ImageTexture(_variant(part, "source", TEXTURES))
     name = part.read({"image": Key(word)})["image"]
     # An image starts at its top, a texture at v = 0: so it lies on a map with the north up.
-    return part.at("image").made(lambda: ImageTexture(load_image(_file(part, name))[::-1]))
+    return part.at("image").made(lambda: ImageTexture(load_image(named_file(part, name))[::-1]))
 
 
-def _file(part: Part, name: str) -> Path:
+def named_file(part: Part, name: str) -> Path:
     return resolve_inside(part.path.parent, part.path.parent, name)
 
 
@@ -133,7 +151,7 @@ def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> Heightf
 
 def _loaded(part: Part, values: dict[str, Any], dtype: np.dtype) -> Heightfield:
     def load():
-        path = _file(part, values["file"]) if "file" in values else jacksboro_file()
+        path = named_file(part, values["file"]) if "file" in values else jacksboro_file()
         return load_heights(path, nodata=values.get("nodata"), **{name: values[name] for name in GRID})
 
     terrain = part.made(load)

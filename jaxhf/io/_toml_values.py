@@ -29,6 +29,33 @@ def word(value: Any) -> str:
     return value
 
 
+def flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError("true or false")
+    return value
+
+
+def number_or_word(value: Any) -> float | str:
+    if isinstance(value, str):
+        return value
+    try:
+        return number(value)
+    except ValueError:
+        raise ValueError("a finite number or a string") from None
+
+
+def whole_or_word(value: Any) -> int | str:
+    if not (_is_whole(value) or isinstance(value, str)):
+        raise ValueError("a whole number or a string")
+    return value
+
+
+def number_list(value: Any) -> list[float]:
+    if not isinstance(value, list) or not all(map(_is_number, value)):
+        raise ValueError("a list of finite numbers")
+    return [float(item) for item in value]
+
+
 def numbers(count: int) -> Callable[[Any], list[float]]:
     def kind(value: Any) -> list[float]:
         if not _is_list(value, count, _is_number):
