@@ -12,9 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Bool, Float
 
 from ._descent import Descent, Step, Stop, make_stages, print_step
+from ._devices import local_mesh
 from ._problem import Albedo, Asked, Loss, Problem, first_unknowns, make_groups, make_heights, make_prior
 from ._scene import Scene
 from ._settings import Settings
@@ -83,6 +85,7 @@ def fit(
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 10,
     resume: bool = False,
+    mesh: Mesh | None = None,
 ) -> Fit:
     """Recovers the heights of a terrain from pictures of it.
 
@@ -127,6 +130,7 @@ def fit(
       progress: called after each step; True prints a line to standard error.
       checkpoint: a file in which the state is kept every `checkpoint_every` steps and on Ctrl-C.
       resume: goes on from that file if it is there; the result is bitwise that of a fit that was not interrupted.
+      mesh: the devices that share each picture's tiles, see `render`.
 
     Returns:
       A `Fit`. It is returned however the fit ended; `result` says how.
@@ -154,6 +158,7 @@ def fit(
         None if loss == "squares" else jnp.asarray(loss_scale, dtype),
         loss,
         settings,
+        local_mesh() if mesh is None else mesh,
     )
     if solver == "bfgs" and count_unknowns(unknowns) > BFGS_UNKNOWNS:
         raise ValueError(

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ._material import Matte
@@ -55,6 +56,7 @@ class Problem(eqx.Module):
       loss_scale: from where on a residual, in standard deviations, counts less; changes with the level.
       loss: how much less.
       settings: how to render.
+      mesh: the devices that share the work.
     """
 
     groups: tuple[Group, ...]
@@ -65,6 +67,7 @@ class Problem(eqx.Module):
     loss_scale: Float[Array, ""] | None
     loss: str = eqx.field(static=True)
     settings: Settings = eqx.field(static=True)
+    mesh: Mesh = eqx.field(static=True)
 
     @property
     def count(self) -> int:

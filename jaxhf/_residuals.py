@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._devices import local_mesh
 from ._material import Matte
 from ._problem import Group, Problem
 from ._render import render_each
@@ -51,7 +50,7 @@ def _simulate(unknowns: Unknowns, problem: Problem, group: Group) -> Float[Array
         scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights)
         return scene if unknowns.albedo is None else _painted(scene, unknowns.albedo)
 
-    image = render_each(group.scenes, with_unknowns, problem.settings, local_mesh())
+    image = render_each(group.scenes, with_unknowns, problem.settings, problem.mesh)
     if group.targets.shape[-1] == 1:
         image = jnp.mean(image, axis=-1, keepdims=True)
     if unknowns.exposures is not None:

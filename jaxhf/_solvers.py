@@ -11,7 +11,7 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ._devices import local_mesh, on_every_device
+from ._devices import on_every_device
 from ._problem import Problem
 from ._residuals import half_squares, residuals
 from ._types import Flag, Scalar
@@ -81,18 +81,11 @@ _OPTIONS: dict[str, Any] = {}
 _TAGS: frozenset[object] = frozenset()
 
 
-def placed(tree: Any) -> Any:
-    """The same arrays on every device of this process.
-
-    What enters a compiled step and what leaves it must lie in the same places, or the next step is compiled again for the
-    other ones: 16 x 16 heights on two devices took 89 s of processor time before the first wave of the last level, not 30.
-    """
-    return on_every_device(tree, local_mesh())
-
-
 def begin(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
     """A solver's state before its first step. Its static parts must be those of the one state that is ever made."""
-    return _begin(solver, *placed((unknowns, problem)))
+    # What enters a compiled step and what leaves it must lie in the same places, or the next step is compiled again for the
+    # other ones: 16 x 16 heights on two devices took 89 s of processor time before the first wave of the last level, not 30.
+    return _begin(solver, *on_every_device((unknowns, problem), problem.mesh))
 
 
 @eqx.filter_jit
@@ -102,7 +95,7 @@ def _begin(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
     state = solver.init(function, unknowns, problem, _OPTIONS, shape, None, _TAGS)
     if isinstance(solver, LevenbergMarquardt):
         state = _with_step_size(state, jnp.asarray(1 / _FIRST_DAMPING, unknowns.waves.dtype))
-    return placed(state)
+    return on_every_device(state, problem.mesh)
 
 
 def _with_step_size(state: Any, step_size: Float[Array, ""]) -> Any:
@@ -123,7 +116,7 @@ def restarted(fresh: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None
 
 def advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tuple[Unknowns, Any, Outcome]:
     """One step: a trial of new unknowns, which are accepted or not."""
-    return _advance(solver, *placed((unknowns, state, problem)))
+    return _advance(solver, *on_every_device((unknowns, state, problem), problem.mesh))
 
 
 @eqx.filter_jit
@@ -142,7 +135,7 @@ def _advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> t
     moved = problem.basis.scale * (new.waves - unknowns.waves)  # orthonormal waves: the same length as that of the heights
     change = jnp.sqrt(jnp.mean(moved * moved))
     outcome = Outcome(loss.astype(dtype), accepted, converged, damping.astype(dtype), change, evaluated)
-    return placed((new, new_state, outcome))
+    return on_every_device((new, new_state, outcome), problem.mesh)
 
 
 def count_unknowns(unknowns: Unknowns) -> int:

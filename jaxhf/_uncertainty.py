@@ -10,9 +10,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from ._devices import on_every_device
 from ._problem import Problem
 from ._residuals import known_residuals, picture_residuals, robust_weight, simulate, unusual
-from ._solvers import placed
 from ._unknowns import Basis, Unknowns
 
 EXACT_ENTRIES = 2**24
@@ -35,7 +35,7 @@ def standard_deviations(
         1 / √(2 · samples), however the heights are correlated.
       inner_steps: of LSMR, each; five times as many as in a step of the fit are allowed.
     """
-    unknowns, problem = placed((unknowns, problem))
+    unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
     if samples == "exact":
         return np.sqrt(np.asarray(_exact_variance(unknowns, problem)))
     total = np.zeros(problem.basis.base.shape)
@@ -62,7 +62,7 @@ def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[F
     The column of J of a vertex without influence is zero, and so is its product with any vector; that of another vertex with
     a random vector is zero with probability zero.
     """
-    return _pictures_and_influence(*placed((unknowns, problem)))
+    return _pictures_and_influence(*on_every_device((unknowns, problem), problem.mesh))
 
 
 @eqx.filter_jit

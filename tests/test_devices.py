@@ -47,6 +47,13 @@ results["prepared"] = jaxhf.render(prepared)
 for name, edge_samples in (("slope", 0), ("slope with edges", 600)):
     settings = jaxhf.Settings(chunk=64, edge_samples=edge_samples)
     results[name] = jax.grad(lambda h: jnp.mean(jaxhf.render(scene.with_heights(h), settings, mesh=mesh) ** 2))(scene.heights)
+view = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.0, width=12, height=12)
+lights = [jaxhf.Directional(towards) for towards in ((1.0, 0.2, 0.7), (-0.4, 0.8, 0.7))]
+small = [jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights[:6, :6]))], view, [light]) for light in lights]
+settings = jaxhf.Settings(chunk=64)
+targets = [np.asarray(jaxhf.render(scene, settings, mesh=mesh)) for scene in small]
+found = jaxhf.fit(small, targets, settings=settings, start=0.0, levels=(1.0,), max_steps=3, mesh=mesh)
+results |= {"fitted": found.heights, "truth": heights[:6, :6]}
 if mesh is not None:
     try:
         jaxhf.render(prepared, mesh=jax.make_mesh((4,), ("other",), axis_types=auto[:1]))
@@ -105,6 +112,12 @@ def test_derivatives_agree_on_any_number_of_devices(one, many):
         assert np.linalg.norm(found["slope with edges"] - with_edges) < 0.1 * np.linalg.norm(with_edges)
     assert np.abs(slope).max() > 1e-5
     assert np.linalg.norm(with_edges - slope) > 0.2 * np.linalg.norm(slope)
+
+
+def test_fits_agree_on_any_number_of_devices(one, many):
+    for found in many:
+        np.testing.assert_allclose(found["fitted"], one["fitted"], atol=1e-4 * np.ptp(one["truth"]))
+    assert np.std(one["fitted"] - one["truth"]) < 0.5 * np.std(one["truth"])
 
 
 def test_a_prepared_scene_is_not_rendered_on_another_mesh(many):

@@ -9,6 +9,7 @@ import scipy.fft
 import jaxhf
 from jaxhf import _descent
 from jaxhf._descent import make_stages
+from jaxhf._devices import local_mesh
 from jaxhf._problem import Prior, Problem
 from jaxhf._residuals import known_residuals, robust_weight, soften
 from jaxhf._unknowns import Unknowns, make_basis, resample
@@ -85,7 +86,7 @@ def test_what_is_known_beforehand_counts_in_standard_deviations():
     x = np.arange(6.0)[None, :] + np.zeros((5, 1))
     basis = make_basis(jaxhf.Heightfield(x), x)
     prior = Prior(jnp.asarray(x - 1), jnp.asarray(np.full((5, 6), 1 / 4)))
-    problem = Problem((), basis, prior, jnp.asarray(1 / 2), jnp.asarray(1 / 8), None, "squares", SETTINGS)
+    problem = Problem((), basis, prior, jnp.asarray(1 / 2), jnp.asarray(1 / 8), None, "squares", SETTINGS, local_mesh())
     factors = jnp.asarray(np.stack([x * x, x], axis=-1))
     off, rough, rough_paint, _ = known_residuals(Unknowns(jnp.zeros((5, 6)), factors), problem)
     np.testing.assert_allclose(off, 1 / 4)
@@ -242,7 +243,9 @@ def test_a_robust_loss_that_is_sharp_already_goes_to_its_last_stage(monkeypatch,
     monkeypatch.setattr(_descent, "_spread", lambda pictures, problem: spread)
     monkeypatch.setattr(_descent.Descent, "_lift", lambda self, pictures, pull: 1.0)
     field = jaxhf.Heightfield(np.zeros((5, 6)))
-    problem = Problem((), make_basis(field, np.zeros((5, 6))), None, None, None, jnp.asarray(3.0), "geman", SETTINGS)
+    problem = Problem(
+        (), make_basis(field, np.zeros((5, 6))), None, None, None, jnp.asarray(3.0), "geman", SETTINGS, local_mesh()
+    )
     stages = [0.5, 1.0, 1.0, 1.0, 1.0]
     run = _descent.Descent(problem, Unknowns(jnp.zeros((5, 6))), None, stages, 1e-4, 10, None, None, 10, "")
     run.fresh = None
