@@ -9,7 +9,8 @@ from pathlib import Path
 
 import jaxhf
 from jaxhf._curves import require_matplotlib
-from jaxhf._tradeoff import Measured, Sweep, plan, run
+from jaxhf._sweeping import run
+from jaxhf._tradeoff import Measured, Sweep, plan
 
 SCENES = ("jacksboro", "landsea", "texture", "debug4x4")
 PRESETS = {"draft": jaxhf.Settings.draft(), "balanced": jaxhf.Settings.balanced(), "exact": jaxhf.Settings.exact()}

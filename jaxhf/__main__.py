@@ -250,7 +250,8 @@ def _info(options: argparse.Namespace) -> None:
 def _tradeoff(options: argparse.Namespace) -> None:
     from ._curves import require_matplotlib, save_plot
     from ._front import front_lines, markdown, recommend
-    from ._tradeoff import plan, run
+    from ._sweeping import run
+    from ._tradeoff import plan
 
     for name in ("error", "time", "repeats"):
         value = getattr(options, name)

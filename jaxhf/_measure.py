@@ -20,9 +20,7 @@ from ._worker import peak_mb, serve, timed
 from .io import load_scene
 from .io._sweep import load_reference, save_reference
 
-DERIVATIVE_PIXELS = (
-    160  # of the longer side: a derivative costs some times a picture, and needs no more to be told from another
-)
+DERIVATIVE_PIXELS = 160  # of the longer side: a derivative costs some times a picture
 WAVES = 8  # a side: the gradient is compared along the 8 x 8 smoothest changes of the heights
 FIT_HEIGHTS, FIT_PIXELS = 32, 64  # a side, at most
 

@@ -1,5 +1,6 @@
 """Strictness for every test: double precision is there, types do not promote by themselves, ranks neither."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -27,3 +28,17 @@ def peers() -> Path:
     if not PEERS.is_dir():
         pytest.skip("the peers' measurements are not on this machine")
     return PEERS
+
+
+@pytest.fixture
+def compilations() -> Iterator[list[str]]:
+    """JAX's events of compilation, since the test began: `clear` it before what must not compile."""
+    events = []
+
+    def listen(event, duration_secs, **_):
+        if event.startswith("/jax/core/compile/"):
+            events.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    yield events
+    jax.monitoring.unregister_event_duration_listener(listen)

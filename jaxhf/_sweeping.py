@@ -1,0 +1,165 @@
+"""Measures what a sweep lacks: error and cost of each configuration, in processes of their own, kept in a table."""
+
+import contextlib
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ._tradeoff import COLUMNS, FIGURES, FINEST_DERIVATIVE, Configuration, Sweep, describe
+from ._worker import MeasurementError, Worker
+from .io._sweep import append_row, load_reference
+
+
+def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Callable[[int, int, str], None]) -> list[str]:
+    """Measures what is missing; each configuration's row is in the table as soon as it is known.
+
+    As many configurations as there are devices (at most four) are compiled at once, each in its process; then their runs take
+    turns with those of the base, whose process lives through all of it, so that a machine whose speed drifts favours none.
+
+    Args:
+      repeats: how many runs each; those of a slow configuration end after 15 seconds, at the third run at the earliest.
+      tell: is given lines for the user: what will be done, and how long it should take.
+      progress: called with (done, of how many, what now).
+
+    Returns:
+      What failed, a line each: processes that died.
+
+    Raises:
+      MeasurementError: the base or the reference failed.
+    """
+    missing = sweep.missing()
+    if not missing:
+        return []
+    sweep.folder.mkdir(parents=True, exist_ok=True)
+    base = sweep.configurations[0]
+    failures = []
+    progress(0, len(missing), "the base")
+    begin = time.perf_counter()
+    with Worker("jaxhf._measure", _job(sweep, base)) as yardstick:
+        yardstick.answer()
+        start = time.perf_counter() - begin
+        frame = yardstick.ask("frame")["seconds"]
+        minutes = _minutes(sweep, missing, start, frame, repeats)
+        tell(
+            f"{sweep.path}: {len(missing)} of {len(sweep.configurations)} configurations to measure, "
+            f"{sweep.width} x {sweep.height} pixels; about {minutes} minutes"
+        )
+        _ensure_reference(sweep, lambda what: progress(0, len(missing), what))
+        together = _together(sweep)
+        for done in range(0, len(missing), together):
+            batch = missing[done : done + together]
+            names = [describe(one.task, one.knobs, base.knobs) for one in batch]
+            progress(done, len(missing), "; ".join(names))
+            for configuration, name, figures in zip(batch, names, _measure(sweep, batch, yardstick, repeats), strict=True):
+                if isinstance(figures, MeasurementError):
+                    failures.append(f"{name}: {figures}")
+                    continue
+                row = {"identity": sweep.identity, "task": configuration.task, **configuration.knobs}
+                row |= {name: f"{figures[name]:.9g}" if name in figures else "" for name in FIGURES}
+                append_row(sweep.table, COLUMNS, row)
+    return failures
+
+
+def _together(sweep: Sweep) -> int:
+    return min(sweep.devices, 4)
+
+
+def _measure(
+    sweep: Sweep, batch: Sequence[Configuration], yardstick: Worker, repeats: int
+) -> list[dict[str, float] | MeasurementError]:
+    """The figures of each, or why its process died."""
+    with contextlib.ExitStack() as stack:
+        workers = [stack.enter_context(Worker("jaxhf._measure", _job(sweep, one))) for one in batch]
+        found: list[dict[str, float] | MeasurementError] = [_attempt(worker.answer) for worker in workers]
+        runs: list[list[dict[str, float]]] = [[] for _ in workers]
+        base_runs: list[list[float]] = [[] for _ in workers]
+        for turn in range(repeats):
+            going = [k for k in range(len(batch)) if not isinstance(found[k], MeasurementError)]
+            going = [k for k in going if batch[k].task != "fit" or turn == 0]
+            going = [k for k in going if turn < 3 or sum(run["seconds"] for run in runs[k]) < 15]
+            for k in going:
+                frame = yardstick.ask("frame")["seconds"]
+                answer = _attempt(lambda worker=workers[k]: worker.ask("frame"))
+                if isinstance(answer, MeasurementError):
+                    found[k] = answer
+                else:
+                    base_runs[k].append(frame)
+                    runs[k].append(answer)
+        for k, first in enumerate(found):
+            if not isinstance(first, MeasurementError):
+                found[k] = _costs(first, runs[k], base_runs[k])
+                workers[k].send("errors")
+        for k, costs in enumerate(found):
+            if not isinstance(costs, MeasurementError):
+                errors = _attempt(workers[k].answer)
+                found[k] = errors if isinstance(errors, MeasurementError) else costs | errors
+        return found
+
+
+def _attempt(answer: Callable[[], dict[str, float]]) -> dict[str, float] | MeasurementError:
+    try:
+        return answer()
+    except MeasurementError as error:
+        return error
+
+
+def _costs(first: dict[str, float], runs: list[dict[str, float]], base_runs: list[float]) -> dict[str, float]:
+    seconds = np.array([run["seconds"] for run in runs])
+    return {
+        "seconds": float(np.median(seconds)),
+        "fastest": float(seconds.min()),
+        "cpu_seconds": float(np.median([run["cpu_seconds"] for run in runs])),
+        "against_base": float(np.median(seconds / np.array(base_runs))),
+        "compile_seconds": max(0.0, first["first_seconds"] - float(np.median(seconds))),
+        "peak_mb": first["peak_mb"],
+    }
+
+
+def _job(sweep: Sweep, configuration: Configuration) -> dict[str, Any]:
+    return {
+        **dataclasses.asdict(configuration),
+        "scene": str(sweep.path),
+        "width": sweep.width,
+        "height": sweep.height,
+        "devices": sweep.devices,
+        "reference": str(sweep.reference),
+        "identity": sweep.identity,
+    }
+
+
+def _ensure_reference(sweep: Sweep, progress: Callable[[str], None]) -> None:
+    """One that is there and is this sweep's has all parts that its configurations need, or is made again."""
+    base = sweep.configurations[0]
+    parts: dict[str, dict[str, Any]] = {"picture": {"samples": sweep.reference_samples}}
+    needed = {"picture", "hits"}
+    if any(configuration.task == "derivative" for configuration in sweep.configurations):
+        parts["derivative"] = FINEST_DERIVATIVE
+        needed.add("gradient")
+    try:
+        if needed <= load_reference(sweep.reference, sweep.identity).keys():
+            return
+    except (FileNotFoundError, ValueError):
+        pass  # of another scene, or damaged: it is made again
+    progress(f"the reference, in double precision, {sweep.reference_samples} samples a pixel")
+    job = _job(sweep, dataclasses.replace(base, precision="float64"))
+    with Worker("jaxhf._measure", job | {"task": "reference", "parts": parts}) as worker:
+        worker.answer()
+
+
+def _minutes(sweep: Sweep, missing: Sequence[Configuration], start: float, frame: float, repeats: int) -> int:
+    """About how long it takes, from the base's start (with compilation) and frame."""
+    samples = sweep.configurations[0].settings.samples or 1
+    starts, runs = 0.0, 0.0
+    for one in missing:
+        starts += {"picture": 1.5, "derivative": 8, "fit": 12}[one.task] * start
+        share = (one.settings.samples or 1) / samples * (2 if one.precision == "float64" else 1)
+        runs += (repeats + 1) * frame * (1 + (share if one.task == "picture" else 1))
+    total = starts / _together(sweep) + runs
+    if not sweep.reference.exists():
+        total += 2 * start + 2 * frame * sweep.reference_samples / samples
+        total += 8 * start if any(one.task == "derivative" for one in sweep.configurations) else 0
+    return max(1, math.ceil(total / 60))
