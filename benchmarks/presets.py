@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jaxhf
-from jaxhf._curves import require_matplotlib
+from jaxhf._curves import screenless_pyplot
 from jaxhf._sweeping import run
 from jaxhf._tradeoff import Measured, Sweep, plan
 
@@ -33,7 +33,7 @@ def table(found: dict[str, dict[int, dict[str, float]]]) -> str:
 
 
 def plot(found: dict[str, dict[int, dict[str, float]]], path: Path) -> None:
-    plt = require_matplotlib()
+    plt = screenless_pyplot()
     figure, (by_count, by_time) = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained", sharey=True)
     for scene, rows in found.items():
         errors = [figures["rmse"] for figures in rows.values()]

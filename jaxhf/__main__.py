@@ -248,8 +248,9 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _tradeoff(options: argparse.Namespace) -> None:
-    from ._curves import require_matplotlib, save_plot
+    from ._curves import save_plot
     from ._front import front_lines, markdown, recommend
+    from ._plots import require_matplotlib
     from ._sweeping import run
     from ._tradeoff import plan
 
@@ -257,7 +258,7 @@ def _tradeoff(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None and not value > 0:
             raise ValueError(f"--{name} must be positive, it is {value}")
-    require_matplotlib()
+    require_matplotlib("tradeoff draws with")
     sweep = plan(
         options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick,
         fits=options.fit,

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ._front import ERRORS, curves, front
+from ._plots import require_matplotlib
 from ._tradeoff import Measured, Sweep
 from .io._files import replacing
 
@@ -16,12 +17,11 @@ _LABELS = {
 }
 
 
-def require_matplotlib() -> Any:
+def screenless_pyplot() -> Any:
     """matplotlib's pyplot, without a screen; ValueError where it is not installed."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise ValueError("tradeoff draws with matplotlib: pip install 'jaxhf[plot]'") from error
+    require_matplotlib("tradeoff draws with")
+    import matplotlib
+
     matplotlib.use("agg")
     import matplotlib.pyplot
 
@@ -39,7 +39,7 @@ def save_plot(sweep: Sweep, measured: Sequence[Measured]) -> Path:
 
 def plot(measured: Sequence[Measured], title: str) -> Any:
     """A figure: for each task error over time with the Pareto front, then a panel for each knob."""
-    plt = require_matplotlib()
+    plt = screenless_pyplot()
     tasks = [task for task in ERRORS if any(row.task == task for row in measured)]
     knobs = [(task, knob, values) for task in tasks for knob, values in curves(measured, task).items()]
     columns = 4

@@ -45,8 +45,8 @@ def on_every_device(tree: Any, mesh: Mesh) -> Any:
 def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any) -> Any:
     """`fun(shared, item)` for one item after the other, dealt out in turn to the devices of a mesh, whatever its axes.
 
-    The results are those of one device, bit for bit; each device gets all. Derivatives with respect
-    to `shared` are sums over devices.
+    Each device gets all results. Pictures are those of one device, bit for bit; points on edges in single precision are not
+    always. Derivatives with respect to `shared` are sums over devices.
 
     Args:
       shared: a pytree of arrays.

@@ -9,7 +9,8 @@ import numpy as np
 
 from ._descent import Step
 from ._fit import Fit, fit
-from ._report import report, require_matplotlib
+from ._plots import require_matplotlib
+from ._report import report
 from .io import Case, Terrain, load_case, require_writable_heights, require_writable_text, save_heights, save_image, save_text
 
 
@@ -32,7 +33,7 @@ class Outputs:
             require_writable_heights(path)
         if self.report is not None:
             require_writable_text(self.report, ".html")
-            require_matplotlib()
+            require_matplotlib("a report needs")
         if self.checkpoint.exists() and not self.resume:
             raise ValueError(
                 f"{self.checkpoint}: an interrupted fit left this checkpoint; --resume goes on from it, to begin anew remove it"

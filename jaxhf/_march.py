@@ -20,7 +20,7 @@ _SKIPS = 2
 def march(walk: Walk, state: jax.Array, budget: int, count: bool) -> tuple[jax.Array, Index | None]:
     """The state in which a walk ends, and the number of its steps if they are to be counted.
 
-    Under `vmap` they go on until the last of them has ended. This has a rule of its own, as that of `while_loop` would count
+    Under `vmap` walks go on until the last of them has ended. This has a rule of its own, as that of `while_loop` would count
     the steps of each ray, and keep an ended one's state by a selection, both of which `Walk` does by itself.
     """
 
@@ -32,7 +32,6 @@ def march(walk: Walk, state: jax.Array, budget: int, count: bool) -> tuple[jax.A
     def run_many(axis_size: int, in_batched, walk: Walk, state: jax.Array):
         lanes, shared = eqx.partition(walk, in_batched[0])
         state = state if in_batched[1] else jnp.broadcast_to(state, (axis_size,))
-
         skip = jax.vmap(lambda lanes, state: eqx.combine(lanes, shared).skip(state))
         visit = jax.vmap(lambda lanes, state: eqx.combine(lanes, shared).visit(state))
         ended = _until_done(lambda state: skip(lanes, state), lambda state: visit(lanes, state), state, budget, count)

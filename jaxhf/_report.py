@@ -10,6 +10,7 @@ import numpy as np
 
 from ._fit import Fit
 from ._heightfield import Heightfield
+from ._plots import require_matplotlib
 
 _FAR = 4  # standard deviations at which the colours of residuals end
 _PAGE = """<!doctype html>
@@ -46,13 +47,6 @@ def report(
     return _PAGE.format(title=html.escape(title), facts=facts, figures=shown)
 
 
-def require_matplotlib() -> None:
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError as error:
-        raise ValueError("a report needs matplotlib: pip install 'jaxhf[plot]'") from error
-
-
 def _facts(found: Fit) -> list[tuple[str, str]]:
     ny, nx = found.heights.shape
     heights = np.asarray(found.heights)
@@ -76,7 +70,7 @@ def _facts(found: Fit) -> list[tuple[str, str]]:
 
 
 def _figure(rows: int, columns: int, height: float) -> tuple[Any, np.ndarray]:
-    require_matplotlib()
+    require_matplotlib("a report needs")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, height), layout="constrained")

@@ -12,7 +12,7 @@ FLOW = (
     "_film", "_heightfield", "_pyramid", "_grid", "_cylinder",
     "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade",
     "_silhouette", "_lottery", "_edges", "_boundaries", "_render", "io",
-    "_unknowns", "_problem", "_residuals", "_solvers", "_uncertainty", "_descent", "_fit", "_report", "_fit_command",
+    "_unknowns", "_problem", "_residuals", "_solvers", "_uncertainty", "_descent", "_fit", "_plots", "_report", "_fit_command",
     "_worker", "_measure", "_tradeoff", "_sweeping", "_front", "_curves", "__init__", "__main__",
 )  # fmt: skip
 

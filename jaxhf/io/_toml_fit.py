@@ -3,6 +3,7 @@
 import dataclasses
 import re
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -174,10 +175,7 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
 
 def _toml_base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     objects = read_objects(part, values, dtype)
-    camera = None
-    if values["camera"] is not None:
-        view = part.at("camera", table=values["camera"])
-        camera = lambda size: _sized(view, size)  # noqa: E731
+    camera = None if values["camera"] is None else partial(_sized, part.at("camera", table=values["camera"]))
     lights = read_lights(part, values["lights"])
     return _Base(tuple(objects), tuple(lights), values["samples"], camera, _like(part, values["objects"]))
 
