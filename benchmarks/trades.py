@@ -44,7 +44,7 @@ def without_bounds() -> None:
 
     def grid_of(*arguments: Any, **options: Any) -> Any:
         grid = make_grid(*arguments, **options)
-        return eqx.tree_at(lambda grid: grid.pyramid.bounds, grid, jnp.zeros(0, grid.z.dtype))
+        return eqx.tree_at(lambda grid: grid.pyramid.bounds, grid, jnp.zeros(0, grid.z_top.dtype))
 
     _march._SKIPS = 0
     _walk.Walk.skip = lambda self, state: state
@@ -60,14 +60,13 @@ def with_stored_triangles() -> None:
 
     class Triangles(eqx.Module):
         heights: jax.Array
-        shape: tuple[int, int] = eqx.field(static=True)
 
     corners, make_grid = _grid.corners, _shade.make_grid
 
-    def corners_of(values: Any, ix: jax.Array, iy: jax.Array) -> tuple[jax.Array, ...]:
+    def corners_of(values: Any, nx: int, ix: jax.Array, iy: jax.Array) -> tuple[jax.Array, ...]:
         if not isinstance(values, Triangles):
-            return corners(values, ix, iy)
-        first = 6 * (iy * (values.shape[1] - 1) + ix)
+            return corners(values, nx, ix, iy)
+        first = 6 * (iy * (nx - 1) + ix)
 
         def at(k: int) -> jax.Array:
             return values.heights.at[first + k].get(mode="promise_in_bounds", wrap_negative_indices=False)
@@ -79,7 +78,7 @@ def with_stored_triangles() -> None:
         z = grid.z
         z00, z10, z01, z11 = z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]
         stored = jax.numpy.stack([z00, z10, z11, z00, z11, z01], -1).reshape(-1)
-        return eqx.tree_at(lambda grid: grid.z, grid, Triangles(stored, (z.shape[0], z.shape[1])))
+        return eqx.tree_at(lambda grid: grid.rows, grid, Triangles(stored))
 
     _grid.corners = _walk.corners = corners_of
     _shade.make_grid = grid_of

@@ -44,7 +44,7 @@ def begin(
     """
     width, height = grid.pyramid.width, grid.pyramid.height
     if 3 + width.bit_length() + (height - 1).bit_length() > 32:
-        raise ValueError(f"Heightfield: at most 2**28 cells can be traced, heights have shape {grid.z.shape}")
+        raise ValueError(f"Heightfield: at most 2**28 cells can be traced, heights have shape {grid.shape}")
     valid = finite(ray.o) & finite(ray.d) & ((ray.d[0] != 0) | (ray.d[1] != 0) | (ray.d[2] != 0))
     dx, dy, dz = ray.d[0], ray.d[1], ray.d[2]
     inverse = inv_x, inv_y, inv_z = reciprocal(dx), reciprocal(dy), reciprocal(dz)
@@ -57,7 +57,7 @@ def begin(
     z_ray = jnp.clip(ray.o[2] + t_start * dz, 0, grid.z_top)
     if departure is not None:
         away, at = departure.active, departure
-        a, b, c = triangle_plane(grid.z, at.ix, at.iy, at.upper)
+        a, b, c = triangle_plane(grid, at.ix, at.iy, at.upper)
         on_triangle = c + a * (at.x - at.ix.astype(x.dtype)) + b * (at.y - at.iy.astype(y.dtype))
         enters, t_start = enters | away, jnp.where(away, 0, t_start)
         x, y, z_ray = jnp.where(away, at.x, x), jnp.where(away, at.y, y), jnp.where(away, on_triangle, z_ray)
@@ -70,7 +70,8 @@ def begin(
     rate = jnp.where(turned, jnp.abs(dx) + jnp.abs(dy), jnp.abs(dx) - jnp.abs(dy))
     begins_upper = (rate > 0) != back_x
     walk = Walk(
-        z=grid.z,
+        rows=grid.rows,
+        nx=grid.shape[1],
         pyramid=grid.pyramid,
         x=x,
         y=y,
@@ -101,7 +102,7 @@ def begin(
     flip_x, flip_y = walk.flip
     u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
     u, v = jnp.where(back_x, 1 - u, u), jnp.where(back_y, 1 - v, v)
-    a, b, c = triangle_plane(grid.z, ix ^ flip_x, iy ^ flip_y, v > u)
+    a, b, c = triangle_plane(grid, ix ^ flip_x, iy ^ flip_y, v > u)
     gap = z_ray - (c + a * u + b * v)
     gap = jnp.where(gap == 0, dz - a * dx - b * dy, gap)  # on the surface: where it goes
     above = jnp.where(through_end, dz < 0, gap >= 0)

@@ -145,7 +145,7 @@ def _departure(world: World, point: EdgePoint, away: Vector) -> Vertex:
         cell_x, cell_y = jnp.where(left, left_x, right_x), jnp.where(left, left_y, right_y)
         cell_x, cell_y = jnp.clip(cell_x, 0, grid.cells[0] - 1), jnp.clip(cell_y, 0, grid.cells[1] - 1)
         upper = jnp.where(left, left_upper, right_upper)
-        a, b, _ = triangle_plane(grid.z, cell_x, cell_y, upper)
+        a, b, _ = triangle_plane(grid, cell_x, cell_y, upper)
         side = jnp.where(local[2] - a * local[0] - b * local[1] >= 0, 1, -1).astype(jnp.int32)
         x, y = _between_ends(point, point.s)
         cells_x, cells_y = grid.cells
@@ -183,7 +183,7 @@ def _on_edge(world: World, point: EdgePoint, s: Scalar, lift: Scalar | None = No
         if isinstance(grid, Grid):
 
             def height(vertex: jax.Array, grid: Grid = grid) -> Scalar:
-                z = grid.z.at[vertex[1], vertex[0]].get(mode="clip")
+                z = grid.rows.at[vertex[1] * grid.shape[1] + vertex[0]].get(mode="clip")
                 return jnp.where(jnp.isfinite(z), z, 0)
 
             x, y = _between_ends(point, s)
@@ -215,7 +215,7 @@ def _fallen(world: World, point: EdgePoint, p: Vector) -> Vector:
             # From `near` on, which lies there but for its derivative: far distances would cancel.
             local = surface.grid_from_world.ray(Ray(near, away))
             cell = jnp.clip(point.cell, 0, jnp.array(surface.cells, jnp.int32) - 1)
-            a, b, c = triangle_plane(surface.z, cell[0], cell[1], point.upper)
+            a, b, c = triangle_plane(surface, cell[0], cell[1], point.upper)
             u, v = local.o[0] - cell[0].astype(p.dtype), local.o[1] - cell[1].astype(p.dtype)
             # At a length around one, as the derivative has the slope's square in it; a power of two changes no bit.
             size = largest_component(local.d)

@@ -20,20 +20,30 @@ class Grid(eqx.Module):
     power of two, so that the walk sees the same bits whatever the offset, and neither over- nor underflows. Where the
     frame lies (lowest height, scale) is held constant under differentiation, as any choice of it gives the same surface.
 
+    What rays look up lies in rows one after the other, as it is looked up: XLA adds a tile's derivatives to such an array in
+    place, and to one that is reshaped on the way by way of a whole array of them for every tile.
+
     Attributes:
-      z: heights, shape (ny, nx); a hole is nan.
+      rows: heights; a hole is nan.
       z_top: the largest of them.
       pyramid: bounds over blocks of cells.
-      normals: at the vertices, object frame, shape (ny, nx, 3); None where shading is flat.
+      normals: at the vertices, object frame; None where shading is flat.
+      shape: (ny, nx).
     """
 
-    z: Float[jax.Array, "ny nx"]
+    rows: Float[jax.Array, " vertices"]
     z_top: Scalar
     pyramid: Pyramid
-    normals: Float[jax.Array, "ny nx 3"] | None
+    normals: Float[jax.Array, "vertices 3"] | None
     world_from_grid: Affine
     grid_from_world: Affine
     object_from_world: Affine | None
+    shape: tuple[int, int] = eqx.field(static=True)
+
+    @property
+    def z(self) -> Float[jax.Array, "ny nx"]:
+        """The heights as an array of two axes."""
+        return self.rows.reshape(self.shape)
 
     @property
     def sure(self) -> Flag:
@@ -43,7 +53,7 @@ class Grid(eqx.Module):
     @property
     def cells(self) -> tuple[int, int]:
         """Cells along x and along y."""
-        ny, nx = self.z.shape
+        ny, nx = self.shape
         return nx - 1, ny - 1
 
 
@@ -59,7 +69,7 @@ def make_grid(
       levels: of the pyramid, above its finest; None for all.
     """
     heights = jnp.asarray(field.heights)
-    dtype = heights.dtype
+    (ny, nx), dtype = heights.shape, heights.dtype
     finite = jnp.isfinite(heights)
     known = lax.stop_gradient(jnp.where(finite, heights, 0))
     largest = jnp.max(jnp.abs(known))
@@ -81,33 +91,31 @@ def make_grid(
         grid_from_world = Affine(object_from_world.linear / cell[:, None], (object_from_world.offset - ground) / cell)
     at_vertices = None if normals is None else vertex_normals(heights, field.dx, field.dy, normals)
     pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels)
-    return Grid(z, z_top, pyramid, at_vertices, world_from_grid, grid_from_world, object_from_world)
+    normal_rows = None if at_vertices is None else at_vertices.reshape(-1, 3)
+    return Grid(z.reshape(-1), z_top, pyramid, normal_rows, world_from_grid, grid_from_world, object_from_world, (ny, nx))
 
 
-def corners(values: Float[jax.Array, "ny nx *rest"], ix: Index, iy: Index) -> tuple[jax.Array, ...]:
-    """What stands at the vertices 00, 10, 01, 11 of a cell that is in range."""
-    nx = values.shape[1]
+def corners(rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index) -> tuple[jax.Array, ...]:
+    """What stands at the vertices 00, 10, 01, 11 of a cell that is in range; rows have nx vertices."""
     first = iy * nx + ix
-    return tuple(_at(values, first + further) for further in (0, 1, nx, nx + 1))
+    return tuple(_at(rows, first + further) for further in (0, 1, nx, nx + 1))
 
 
 def triangle_corners(
-    values: Float[jax.Array, "ny nx *rest"], ix: Index, iy: Index, upper: Flag
+    rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index, upper: Flag
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """What stands at the vertices of a triangle of a cell in range: 00, that between (10, or 01 in the upper), and 11."""
-    nx = values.shape[1]
     first = iy * nx + ix
-    return _at(values, first), _at(values, first + jnp.where(upper, nx, 1)), _at(values, first + nx + 1)
+    return _at(rows, first), _at(rows, first + jnp.where(upper, nx, 1)), _at(rows, first + nx + 1)
 
 
-def _at(values: Float[jax.Array, "ny nx *rest"], place: Index) -> jax.Array:
-    ny, nx = values.shape[:2]
-    flat = values.reshape(ny * nx, *values.shape[2:])
-    return flat.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+def _at(rows: Float[jax.Array, "vertices *rest"], place: Index) -> jax.Array:
+    return rows.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def triangle_plane(z: Float[jax.Array, "ny nx"], ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
+def triangle_plane(grid: Grid, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """(a, b, c) of the triangle's plane c + a u + b v, with u and v from the cell's vertex 00; finite in a hole too."""
-    z00, between, z11 = (jnp.where(jnp.isfinite(value), value, 0) for value in triangle_corners(z, ix, iy, upper))
+    heights = triangle_corners(grid.rows, grid.shape[1], ix, iy, upper)
+    z00, between, z11 = (jnp.where(jnp.isfinite(height), height, 0) for height in heights)
     first, second = between - z00, z11 - between
     return jnp.where(upper, second, first), jnp.where(upper, first, second), z00

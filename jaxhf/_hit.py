@@ -99,7 +99,7 @@ def leave(grid: Grid, hit: Hit, d: Vector) -> tuple[Ray, Origin]:
     side = jnp.where(ahead == 0, hit.side, jnp.where(ahead > 0, 1, -1).astype(hit.side.dtype))
     origin = Origin(eqx.tree_at(lambda hit: hit.side, hit, side), jnp.ones((), bool))
     at = origin.departure(grid)
-    a, b, c = triangle_plane(grid.z, at.ix, at.iy, at.upper)
+    a, b, c = triangle_plane(grid, at.ix, at.iy, at.upper)
     u, v = at.x - at.ix.astype(at.x.dtype), at.y - at.iy.astype(at.y.dtype)
     p = grid.world_from_grid.point(jnp.stack([at.x, at.y, c + a * u + b * v]))
     return Ray(p, jnp.where(hit.status == int(Status.HIT), d, 0)), origin
@@ -138,7 +138,7 @@ def intersect(
     )
     found = stored(found, surface.sure)
     met = found.status == int(Status.HIT)
-    hit = only_where(met, surface_interaction, surface, local, found)
+    hit = surface_interaction(surface, local, found)
     t = jnp.where(met, hit.t / scale, jnp.inf)
     hit = dataclasses.replace(hit, t=t, status=found.status, steps=found.steps)
     return stored(hit, surface.sure)
@@ -170,12 +170,31 @@ def blocked(
 
 
 def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
-    """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray (grid frame)."""
-    t = distance(grid, ray, found)
+    """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray (grid frame).
+
+    What stands at the vertices is fetched before the conditional, which in a reverse derivative would return the derivative
+    of all heights and normals once a tile.
+    """
+    plane = triangle_plane(grid, found.ix, found.iy, found.upper)
+    normals = None
+    if grid.normals is not None:
+        normals = triangle_corners(grid.normals, grid.shape[1], found.ix, found.iy, found.upper)
+    met = found.status == int(Status.HIT)
+    return only_where(met, _interaction, grid, ray, found, plane, normals)
+
+
+def _interaction(
+    grid: Grid,
+    ray: Ray,
+    found: CellHit,
+    plane: tuple[Scalar, Scalar, Scalar],
+    normals: tuple[Vector, Vector, Vector] | None,
+) -> Hit:
+    """As `surface_interaction`, from the triangle's plane and the normals at its vertices."""
+    t = distance(plane, ray, found)
     dtype = t.dtype
     place = ray(t)
     u, v = place[0] - found.ix.astype(dtype), place[1] - found.iy.astype(dtype)
-    plane = triangle_plane(grid.z, found.ix, found.iy, found.upper)
     t, place, u, v, (a, b, c) = stored((t, place, u, v, plane), grid.sure)
     p = grid.world_from_grid.point(jnp.stack([place[0], place[1], c + a * u + b * v]))
     one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
@@ -183,7 +202,7 @@ def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
     cells_x, cells_y = grid.cells
     per_u = grid.world_from_grid.vector(jnp.stack([one, zero, a])) * cells_x
     per_v = grid.world_from_grid.vector(jnp.stack([zero, one, b])) * cells_y
-    ns, dn_du, dn_dv = _shading_normal(grid, found, u, v, n)
+    ns, dn_du, dn_dv = _shading_normal(grid, found.upper, normals, u, v, n)
     dp_du, dp_dv = _orthogonal(per_u, per_v, ns)
     met = found.status == int(Status.HIT)
     return Hit(
@@ -204,13 +223,15 @@ def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
     )
 
 
-def _shading_normal(grid: Grid, found: CellHit, u: Scalar, v: Scalar, n: Vector) -> tuple[Vector, Vector, Vector]:
+def _shading_normal(
+    grid: Grid, upper: Flag, normals: tuple[Vector, Vector, Vector] | None, u: Scalar, v: Scalar, n: Vector
+) -> tuple[Vector, Vector, Vector]:
     """The barycentric mean of the triangle's three vertex normals (Phong 1975), and its derivatives by cells."""
-    if grid.normals is None:
+    if normals is None:
         return n, jnp.zeros_like(n), jnp.zeros_like(n)
-    n00, between, n11 = triangle_corners(grid.normals, found.ix, found.iy, found.upper)
+    n00, between, n11 = normals
     first, second = between - n00, n11 - between
-    per_u, per_v = jnp.where(found.upper, second, first), jnp.where(found.upper, first, second)
+    per_u, per_v = jnp.where(upper, second, first), jnp.where(upper, first, second)
     mean = n00 + u * per_u + v * per_v
     if grid.object_from_world is not None:
         mean, per_u, per_v = (grid.object_from_world.covector(normal) for normal in (mean, per_u, per_v))

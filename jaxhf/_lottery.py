@@ -44,7 +44,7 @@ def sources(world: World, settings: Settings) -> tuple[Source, ...]:
         if not isinstance(surface, Grid):
             continue
         for light in (None, *casting):
-            ny, nx = surface.z.shape
+            ny, nx = surface.shape
             found.append(Source(k, light, first, ny, nx))
             first = found[-1].end
     return tuple(found)

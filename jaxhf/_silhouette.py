@@ -75,7 +75,7 @@ def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
 
 
 def _vertices(grid: Grid) -> tuple[jax.Array, jax.Array]:
-    ny, nx = grid.z.shape
+    ny, nx = grid.shape
     x, y = jnp.meshgrid(jnp.arange(nx, dtype=grid.z.dtype), jnp.arange(ny, dtype=grid.z.dtype))
     return x, y
 

@@ -58,14 +58,14 @@ def enough_steps(grid: Grid) -> int:
     return sum(math.ceil(cells_x / 2**level) + math.ceil(cells_y / 2**level) - 1 for level in levels)
 
 
-def distance(grid: Grid, ray: Ray, found: CellHit) -> Scalar:
-    """t at which `ray` (in the grid's frame) meets the plane of the triangle that was found.
+def distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: CellHit) -> Scalar:
+    """t at which `ray` (in the grid's frame) meets the plane of the triangle that was found, see `triangle_plane`.
 
     Plain arithmetic that is differentiable in the heights and in the ray. It starts at the cell, as the subtraction
     of far heights would cancel; t is clamped to the part of the ray over the triangle, without touching its derivative. A
     ray that lies in the plane meets it all along: then t is that of the cell, with the derivative zero.
     """
-    a, b, c = triangle_plane(grid.z, found.ix, found.iy, found.upper)
+    a, b, c = plane
     o, d = ray(found.t_near), ray.d
     u, v = o[0] - found.ix.astype(o.dtype), o[1] - found.iy.astype(o.dtype)
     slope = d[2] - a * d[0] - b * d[1]
@@ -83,5 +83,6 @@ def occluded(
     found = first_hit(grid, ray, max_steps=max_steps, active=active, departure=departure, t_max=t_max)
     blocked = found.status == int(Status.HIT)
     if t_max is not None:
-        blocked = blocked & (distance(grid, ray, found) < t_max)
+        plane = triangle_plane(grid, found.ix, found.iy, found.upper)
+        blocked = blocked & (distance(plane, ray, found) < t_max)
     return blocked, found.status == int(Status.EXHAUSTED)

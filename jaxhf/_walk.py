@@ -81,7 +81,7 @@ class Walk(eqx.Module):
     within a width that is a power of two (that of the pyramid), a block stays a block.
 
     Attributes:
-      z, pyramid: the grid's.
+      rows, nx, pyramid: the grid's heights, how many are in a row, its bounds.
       x, y, z_ray: where the walk begins.
       dx, dy, dz: the ray's direction.
       inv_x, inv_y: 1 / dx and 1 / dy, see `reciprocal`.
@@ -96,7 +96,8 @@ class Walk(eqx.Module):
         where g is all rounding, and a neighbour in the same plane would be met.
     """
 
-    z: Float[jax.Array, "ny nx"]
+    rows: Float[jax.Array, " vertices"]
+    nx: int = eqx.field(static=True)
     pyramid: Pyramid
     x: Scalar
     y: Scalar
@@ -183,7 +184,7 @@ class Walk(eqx.Module):
         above, ix, iy, size = self._unpack(state)
         near, out_x, out_y = self._passage(ix, iy, size)
         flip_x, flip_y = self.flip
-        z00, z10, z01, z11 = corners(self.z, ix ^ flip_x, iy ^ flip_y)
+        z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ flip_x, iy ^ flip_y)
         whole = jnp.isfinite(z00 + z10 + z01 + z11)
         through_x = out_x <= out_y
         out = lesser(out_x, out_y)

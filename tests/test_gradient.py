@@ -4,6 +4,8 @@ No leaf is named here: they are found in the pytree, so that a new one is tested
 """
 
 import functools
+import math
+import re
 from typing import Any, get_args
 
 import equinox as eqx
@@ -111,6 +113,21 @@ def forward(scene: jaxhf.Scene, change: jaxhf.Scene, settings: jaxhf.Settings) -
 @functools.partial(jax.jit, static_argnames=("settings",))
 def reverse(scene: jaxhf.Scene, weights: jax.Array, settings: jaxhf.Settings) -> jaxhf.Scene:
     return jax.vjp(lambda scene: jaxhf.render(scene, settings), scene)[1](weights)[0]
+
+
+def test_reverse_mode_keeps_no_heights_a_tile():
+    """A conditional that returned the derivative of all heights or normals would cost every tile a pass over them."""
+    scene = parallel()
+    place = scene.objects[0].world_from_object
+    field = jaxhf.Heightfield(waves(37, 53, 5, 0.06))
+    scene = jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(0.5), place)], scene.camera, scene.lights)
+    gradient = jax.jit(jax.grad(lambda heights: jnp.sum(jaxhf.render(scene.with_heights(heights), SETTINGS))))
+    program = gradient.lower(jnp.asarray(scene.heights)).compile().as_text()
+    assert program is not None
+    results = [line.split(" conditional(")[0] for line in program.splitlines() if " conditional(" in line]
+    sizes = [math.prod(map(int, shape.split(","))) for result in results for shape in re.findall(r"\[([\d,]+)\]", result)]
+    assert sizes
+    assert max(sizes) < 37 * 53
 
 
 @pytest.mark.parametrize("name", SCENES)

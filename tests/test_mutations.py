@@ -70,8 +70,8 @@ MUTATIONS = {
     ),
     "derivative of the hit": Mutation(
         "_hit.py",
-        "t = distance(grid, ray, found)",
-        "t = lax.stop_gradient(distance(grid, ray, found))",
+        "t = distance(plane, ray, found)",
+        "t = lax.stop_gradient(distance(plane, ray, found))",
         "test_gradient.py::test_every_leaf_pixel_by_pixel[parallel]",
     ),
 }
