@@ -78,7 +78,7 @@ def common(options: argparse.Namespace) -> None:
     truth = work.terrain(64).astype(np.float64)
     field = jaxhf.Object(jaxhf.Heightfield(np.full((64, 64), 0.1, options.dtype)), jaxhf.Matte(work.ALBEDO))
     scenes = [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in data["lights"]][: options.images]
-    settings = jaxhf.Settings(normals="six-angle", samples=options.samples)
+    settings = jaxhf.Settings(normals="six-angle", samples=options.samples, edge_samples=options.edge_samples)
     found, seconds = timed(
         scenes, list(data["images"])[: options.images], settings=settings, loss=options.loss, solver=options.solver,
         max_steps=options.max_steps, progress=options.verbose,
@@ -136,6 +136,7 @@ def main() -> None:
     parser.add_argument("--light", default="std", choices=("std", "low"))
     parser.add_argument("--images", type=int, default=4)
     parser.add_argument("--samples", type=int, default=4)
+    parser.add_argument("--edge-samples", type=int, default=0, help="of the derivative, a picture")
     parser.add_argument("--solver", default="lm")
     parser.add_argument("--loss", default="squares")
     parser.add_argument("--max-steps", type=int, default=100)
