@@ -99,6 +99,14 @@ def mitsuba_scene(
     return MitsubaScene(dr, mi, scene, mi.traverse(scene), positions)
 
 
+def mitsuba_picture(
+    heights: np.ndarray, view: View, towards: Sequence[float], pixels: int, samples: int, albedo: float
+) -> np.ndarray:
+    """A grey picture (pixels, pixels) of heights over the unit square under one directional light."""
+    _, mi, scene, _, _ = mitsuba_scene(heights, view, towards, pixels, "direct", samples, albedo)
+    return np.array(mi.render(scene, spp=samples))[..., 0]
+
+
 def camera_rays(view: View, pixels: int) -> np.ndarray:
     """Unit directions (pixels * pixels, 3) through the pixels' centres, row after row from the top left."""
     eye, target, fov = view

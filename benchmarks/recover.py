@@ -1,8 +1,8 @@
 """Recovers terrains from pictures and prints how near to the truth, and in what time.
 
 `flat`: noise-free pictures of our own, four lights, no shadows. `common`: the common recovery of `--peers`, whose pictures
-Mitsuba made. `jacksboro`: the Jacksboro terrain from a smoothed prior and three noisy pictures at another sample count. One
-case a process: the times include compilation, as a user meets it.
+Mitsuba made, or makes (pip install mitsuba) for other cameras and sizes. `jacksboro`: the Jacksboro terrain from a smoothed
+prior and three noisy pictures at another sample count. One case a process: the times include compilation, as a user meets it.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from peers import common_work
+from peers import common_work, mitsuba_picture
 
 import jaxhf
 from jaxhf.io._procedural import fractal
@@ -72,18 +72,24 @@ def flat(options: argparse.Namespace) -> None:
 
 def common(options: argparse.Namespace) -> None:
     work = common_work(options.peers)
-    data = np.load(options.peers / f"targets_D_{options.light}.npz")
-    eye, target, fov = work.CAMERAS["D"]
-    camera = jaxhf.Perspective.look_at(eye, target, fov=fov, width=128, height=128)
-    truth = work.terrain(64).astype(np.float64)
-    field = jaxhf.Object(jaxhf.Heightfield(np.full((64, 64), 0.1, options.dtype)), jaxhf.Matte(work.ALBEDO))
-    scenes = [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in data["lights"]][: options.images]
+    view = eye, target, fov = work.CAMERAS[options.camera]
+    camera = jaxhf.Perspective.look_at(eye, target, fov=fov, width=options.pixels, height=options.pixels)
+    truth = work.terrain(options.size).astype(np.float64)
+    stored = options.peers / f"targets_{options.camera}_{options.light}.npz"
+    if stored.exists() and (options.size, options.pixels) == (64, 128):
+        lights, targets = (np.load(stored)[name] for name in ("lights", "images"))
+    else:
+        lights = work.turned_lights(options.light, 4)
+        targets = [mitsuba_picture(truth, view, towards, options.pixels, 256, work.ALBEDO) for towards in lights]
+    field = jaxhf.Object(jaxhf.Heightfield(np.full(truth.shape, 0.1, options.dtype)), jaxhf.Matte(work.ALBEDO))
+    scenes = [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in lights][: options.images]
     settings = jaxhf.Settings(normals="six-angle", samples=options.samples, edge_samples=options.edge_samples)
     found, seconds = timed(
-        scenes, list(data["images"])[: options.images], settings=settings, loss=options.loss, solver=options.solver,
+        scenes, list(targets)[: options.images], settings=settings, loss=options.loss, solver=options.solver,
         max_steps=options.max_steps, progress=options.verbose,
     )  # fmt: skip
-    report(f"common, camera D, {options.light}, {options.images} images, {options.loss}:", found, truth, seconds)
+    name = f"common, {options.size}² heights, {options.pixels}² pixels, camera {options.camera}, {options.light}"
+    report(f"{name}, {options.images} images, {options.loss}:", found, truth, seconds)
 
 
 def jacksboro(options: argparse.Namespace) -> None:
@@ -133,6 +139,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("case", choices=("flat", "common", "jacksboro"))
     parser.add_argument("--peers", type=Path, help="folder of common_work.py and of its targets")
+    parser.add_argument("--camera", default="D", choices=("A", "B", "C", "D"))
+    parser.add_argument("--size", type=int, default=64, help="heights a side of the common recovery")
+    parser.add_argument("--pixels", type=int, default=128)
     parser.add_argument("--light", default="std", choices=("std", "low"))
     parser.add_argument("--images", type=int, default=4)
     parser.add_argument("--samples", type=int, default=4)

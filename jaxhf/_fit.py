@@ -93,8 +93,8 @@ def fit(
     + Σ (Laplacian / smoothness)² / 2 over the heights and what else is unknown, from coarse to fine, by Levenberg-Marquardt
     steps that never form a matrix. Every term is in standard deviations, so that the result's are those of the heights.
 
-    The derivative is `render`'s, which does not know that shadows and silhouettes move. What shows in nothing else (the
-    height of a plain under a vertical view) stays where it began.
+    The derivative is `render`'s, which knows that shadows, silhouettes and the terrain's border move where the settings ask
+    for it by `edge_samples`. What shows in nothing (the height of a plain under a vertical view) stays where it began.
 
     Args:
       scenes: one a picture. Their first heightfields share shape, precision, spacing and origin, and are what is sought.
