@@ -12,6 +12,7 @@ reference, and timed.
 """
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -201,7 +202,9 @@ def main() -> None:
     parser.add_argument("--interior", action="store_true", help="the interior derivative's error, in place of the whole's")
     parser.add_argument("--untimed", action="store_true", help="accuracy alone, where the machine is not quiet")
     parser.add_argument("--mitsuba", type=int, default=0, metavar="SAMPLES")
+    parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="of the CPU")
     options = parser.parse_args()
+    jax.config.update("jax_num_cpu_devices", options.devices)
     work = common_work(options.peers)
     if options.cost:
         cost(work, options.cost, options.edge_samples)

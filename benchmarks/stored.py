@@ -17,7 +17,7 @@ from jaxhf._devices import local_mesh
 from jaxhf._render import settle
 from jaxhf._scene import localise
 
-USERS = (jaxhf._heightfield, jaxhf._hit, jaxhf._render, jaxhf._shade)
+USERS = (jaxhf._boundaries, jaxhf._heightfield, jaxhf._hit, jaxhf._render, jaxhf._shade)
 FORMS: dict[str, Callable] = {
     "stored": jaxhf._store.stored,
     "nothing": lambda tree, sure: tree,
