@@ -54,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--max-depth", type=int, metavar="N", help="mirror bounces [4]")
     render.add_argument("--max-steps", type=int, metavar="N", help="step budget of a walk [as many as any ray needs]")
     render.add_argument("--chunk", type=int, metavar="RAYS", help="rays traced together [1024]")
+    render.add_argument("--detail", type=float, metavar="PIXELS", help="by how much hits may be off [they are exact]")
     _add_machine(render)
     render.set_defaults(run=_render)
 
@@ -137,7 +138,7 @@ def _set_up_jax(precision: str, devices: int | None) -> None:
 def _settings(options: argparse.Namespace) -> "Settings":
     from ._settings import Settings
 
-    names = ("samples", "traversal", "shading", "normals", "shadows", "max_depth", "max_steps", "chunk")
+    names = ("samples", "traversal", "shading", "normals", "shadows", "max_depth", "max_steps", "chunk", "detail")
     return Settings(**{name: getattr(options, name) for name in names if getattr(options, name) is not None})
 
 

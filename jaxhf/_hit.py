@@ -5,6 +5,7 @@ arithmetic, so the derivative costs no memory a step and works in forward and in
 """
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ from ._begin import Departure
 from ._cylinder import Tube, tube_distance
 from ._grid import Grid, triangle_corners, triangle_plane
 from ._lanes import only_where
-from ._ray import Ray
+from ._ray import Footprint, Ray
 from ._settings import Settings
 from ._store import stored
 from ._transform import dot, finite, largest_component, power_of_two, unit
@@ -112,6 +113,7 @@ def intersect(
     origin: Origin | None = None,
     active: Flag | None = None,
     count_steps: bool = False,
+    footprint: Footprint | None = None,
 ) -> Hit:
     """The first hit of a world-frame ray on one surface.
 
@@ -122,6 +124,7 @@ def intersect(
       origin: None for rays that start in free space.
       active: False spares the ray the search: it ends as a miss.
       count_steps: whether to count the steps of the search.
+      footprint: how far, in world units, a hit on a heightfield may be off, see docs/level-of-detail.md; None: it is exact.
     """
     valid = finite(ray.o) & finite(ray.d)
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
@@ -135,10 +138,11 @@ def intersect(
         active=active,
         departure=None if origin is None else stored(origin.departure(surface), surface.sure),
         count_steps=count_steps,
+        footprint=None if footprint is None else _in_heights(surface, footprint, scale),
     )
     found = stored(found, surface.sure)
     met = found.status == int(Status.HIT)
-    hit = surface_interaction(surface, local, found)
+    hit = surface_interaction(surface, local, found, near_surface=footprint is not None)
     t = jnp.where(met, hit.t / scale, jnp.inf)
     hit = dataclasses.replace(hit, t=t, status=found.status, steps=found.steps)
     return stored(hit, surface.sure)
@@ -156,6 +160,14 @@ def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
     return stored((Ray(local.o, local.d / scale), scale), grid.sure)
 
 
+def _in_heights(grid: Grid, footprint: Footprint, scale: Scalar) -> Footprint:
+    """How far apart heights of the grid may be, along a ray of `_in_grid`, to be no further apart than `footprint`."""
+    up = grid.world_from_grid.linear[:, 2]
+    largest = largest_component(up)
+    length = largest * jnp.sqrt(dot(up / largest, up / largest))
+    return stored(Footprint(footprint.width / length, footprint.spread / (length * scale)), grid.sure)
+
+
 def blocked(
     surface: Surface, ray: Ray, settings: Settings, origin: Origin, active: Flag, t_max: Scalar | None
 ) -> tuple[Flag, Flag]:
@@ -169,8 +181,10 @@ def blocked(
     return occluded(surface, local, max_steps=settings.max_steps, active=active, departure=departure, t_max=t_max)
 
 
-def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
+def surface_interaction(grid: Grid, ray: Ray, found: CellHit, near_surface: bool = False) -> Hit:
     """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray (grid frame).
+
+    Where a walk may also end near the surface, `p` is the point straight above or below the ray's; see `distance`.
 
     What stands at the vertices is fetched before the conditional, which in a reverse derivative would return the derivative
     of all heights and normals once a tile.
@@ -180,10 +194,11 @@ def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
     if grid.normals is not None:
         normals = triangle_corners(grid.normals, grid.shape[1], found.ix, found.iy, found.upper)
     met = found.status == int(Status.HIT)
-    return only_where(met, _interaction, grid, ray, found, plane, normals)
+    return only_where(met, functools.partial(_interaction, near_surface), grid, ray, found, plane, normals)
 
 
 def _interaction(
+    near_surface: bool,
     grid: Grid,
     ray: Ray,
     found: CellHit,
@@ -191,7 +206,7 @@ def _interaction(
     normals: tuple[Vector, Vector, Vector] | None,
 ) -> Hit:
     """As `surface_interaction`, from the triangle's plane and the normals at its vertices."""
-    t = distance(plane, ray, found)
+    t = distance(plane, ray, found, grid.z_top if near_surface else None)
     dtype = t.dtype
     place = ray(t)
     u, v = place[0] - found.ix.astype(dtype), place[1] - found.iy.astype(dtype)

@@ -68,6 +68,7 @@ checkpoint_every = 3
 [settings]
 shadows = false
 samples = 9
+detail = 0.5
 """
 )
 
@@ -95,7 +96,7 @@ def test_every_key_arrives(folder):
     assert found.noise == (0.5, 0.02)
     np.testing.assert_array_equal(found.weights[0], np.arange(12).reshape(3, 4) > 5)
     np.testing.assert_array_equal(found.weights[1], np.arange(12).reshape(3, 4) / 4)
-    assert found.settings == jaxhf.Settings(shadows=False, samples=9)
+    assert found.settings == jaxhf.Settings(shadows=False, samples=9, detail=0.5)
     np.testing.assert_array_equal(found.options.pop("prior"), np.arange(9).reshape(3, 3))
     assert found.options == {
         "start": 3, "prior_std": 0.5, "smoothness": 2, "albedo": "map", "albedo_smoothness": 1, "exposures": True,
