@@ -8,6 +8,7 @@ import jax
 from forward import report, scene, terrain
 
 import jaxhf
+from jaxhf import _boundaries, _heightfield, _hit, _render, _shade
 import jaxhf._heightfield
 import jaxhf._hit
 import jaxhf._render
@@ -17,7 +18,7 @@ from jaxhf._devices import local_mesh
 from jaxhf._render import settle
 from jaxhf._scene import localise
 
-USERS = (jaxhf._boundaries, jaxhf._heightfield, jaxhf._hit, jaxhf._render, jaxhf._shade)
+USERS = (_boundaries, _heightfield, _hit, _render, _shade)
 FORMS: dict[str, Callable] = {
     "stored": jaxhf._store.stored,
     "nothing": lambda tree, sure: tree,
