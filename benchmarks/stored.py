@@ -8,19 +8,14 @@ import jax
 from forward import report, scene, terrain
 
 import jaxhf
-from jaxhf import _boundaries, _heightfield, _hit, _render, _shade
-import jaxhf._heightfield
-import jaxhf._hit
-import jaxhf._render
-import jaxhf._shade
-import jaxhf._store
+from jaxhf import _boundaries, _heightfield, _hit, _render, _shade, _store
 from jaxhf._devices import local_mesh
 from jaxhf._render import settle
 from jaxhf._scene import localise
 
 USERS = (_boundaries, _heightfield, _hit, _render, _shade)
 FORMS: dict[str, Callable] = {
-    "stored": jaxhf._store.stored,
+    "stored": _store.stored,
     "nothing": lambda tree, sure: tree,
     "optimization_barrier": lambda tree, sure: jax.lax.optimization_barrier(tree),
 }
@@ -32,7 +27,7 @@ def compiled(base: jaxhf.Scene, settings: jaxhf.Settings, form: Callable) -> tup
         vars(module)["stored"] = form
     jax.clear_caches()
     local = localise(base)
-    program = jaxhf._render._trace_all.lower(local, settle(settings, base), (), local_mesh(), None).compile()
+    program = _render._trace_all.lower(local, settle(settings, base), (), local_mesh(), None).compile()
     bodies = re.findall(r"^%?fused_computation\S* .*?\{\n(.*?)^\}", program.as_text() or "", re.M | re.S)
     return lambda: jax.block_until_ready(program(local)), sum(body.count("\n") for body in bodies)
 
