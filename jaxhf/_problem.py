@@ -10,12 +10,13 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
+from ._heightfield import Heightfield
 from ._material import Matte
 from ._render import settle
 from ._scene import Scene, localise
 from ._settings import Settings
 from ._texture import ImageTexture
-from ._unknowns import Basis, Unknowns, resample
+from ._unknowns import Basis, Unknowns, cosines, resample
 
 Albedo = Literal["known", "constant", "map"]
 Loss = Literal["squares", "huber", "cauchy", "geman"]
@@ -38,10 +39,17 @@ class Group(eqx.Module):
 
 
 class Prior(eqx.Module):
-    """Heights that are known beforehand, and 1 / their standard deviation, both of shape (ny, nx)."""
+    """Heights that are known beforehand, and how well.
+
+    Attributes:
+      heights: shape (ny, nx).
+      weight: 1 / their standard deviation; where errors hang together, times what makes `reach` leave it so, shape (ny, nx).
+      reach: squares of the distance over which errors hang together, in cells along y and x; None: they do not.
+    """
 
     heights: Float[Array, "ny nx"]
     weight: Float[Array, "ny nx"]
+    reach: Float[Array, "2"] | None = None
 
 
 class Problem(eqx.Module):
@@ -81,6 +89,7 @@ class Asked(NamedTuple):
     noise: Any
     prior: Any
     prior_std: Any
+    prior_length: float | None
     smoothness: float | None
     albedo: str
     albedo_smoothness: float | None
@@ -163,10 +172,13 @@ def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray
     return np.where(weight > 0, target, 0), weight
 
 
-def make_prior(shape: tuple[int, ...], dtype: Any, prior: Any, std: Any) -> Prior | None:
+def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None) -> Prior | None:
+    """The prior of the heights of `field`; `length` is that of `fit`'s prior_length."""
+    shape, dtype = field.heights.shape, field.heights.dtype
     if prior is None:
-        if std is not None:
-            raise ValueError("fit: prior_std must stand with a prior, there is none")
+        for name, value in (("prior_std", std), ("prior_length", length)):
+            if value is not None:
+                raise ValueError(f"fit: {name} must stand with a prior, there is none")
         return None
     if std is None:
         raise ValueError("fit: prior must stand with prior_std, how far it may be off")
@@ -174,7 +186,23 @@ def make_prior(shape: tuple[int, ...], dtype: Any, prior: Any, std: Any) -> Prio
     if std.shape not in ((), shape) or not (std > 0).all():
         raise ValueError(f"fit: prior_std must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}")
     heights = make_heights("prior", prior, shape)
-    return Prior(jnp.asarray(heights, dtype), jnp.asarray(np.broadcast_to(1 / std, shape), dtype))
+    weight, reach = np.broadcast_to(1 / std, shape), None
+    if length is not None:
+        reach = np.array([(length / field.dy) ** 2, (length / field.dx) ** 2])
+        weight = weight * np.sqrt(_spread_of_correlated(shape, reach))
+        reach = jnp.asarray(reach, dtype)
+    return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), reach)
+
+
+def _spread_of_correlated(shape: tuple[int, ...], reach: Float[np.ndarray, "2"]) -> Float[np.ndarray, "ny nx"]:
+    """The variance, at each vertex, of (1 - reach · second differences)⁻¹ times independent normal numbers.
+
+    Cosines diagonalise it. It is larger at the border, where a vertex has fewer neighbours.
+    """
+    (ny, nx), (rows, columns) = shape, (cosines(n) for n in shape)
+    steps = [2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (ny, nx)]
+    gain = 1 / (1 + reach[0] * steps[0][:, None] + reach[1] * steps[1][None, :])
+    return (rows**2).T @ gain**2 @ columns**2
 
 
 def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:

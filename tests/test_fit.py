@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.fft
+import scipy.special
 
 import jaxhf
 from jaxhf import _descent
 from jaxhf._descent import make_stages
 from jaxhf._devices import local_mesh
-from jaxhf._problem import Prior, Problem
+from jaxhf._problem import Prior, Problem, make_prior
 from jaxhf._residuals import known_residuals, robust_weight, soften
 from jaxhf._unknowns import Unknowns, make_basis, resample
 from jaxhf.io._procedural import fractal
@@ -94,6 +95,26 @@ def test_what_is_known_beforehand_counts_in_standard_deviations():
     np.testing.assert_allclose(rough_paint[:, 1:-1], 2 / 8)
 
 
+def test_errors_of_a_prior_hang_together_as_whittle_said():
+    """Its covariance as a matrix: prior_std at every vertex, and between two of them by the distance in world units."""
+    ny, nx, std = 25, 31, np.linspace(1, 3, 25 * 31).reshape(25, 31)
+    field = jaxhf.Heightfield(np.zeros((ny, nx)), dx=0.5, dy=1.0)
+    basis = make_basis(field, np.zeros((ny, nx)))
+    problem = Problem((), basis, make_prior(field, 0.0, std, 3.0), None, None, None, "squares", SETTINGS, local_mesh())
+    still = jnp.zeros((ny, nx))
+    rows = jax.jacfwd(lambda waves: known_residuals(Unknowns(waves), problem)[0])(still).reshape(ny * nx, -1)
+    heights = jax.jacfwd(basis.heights)(still).reshape(ny * nx, -1)
+    root = np.asarray(heights) @ np.linalg.inv(rows)
+    covariance = root @ root.T
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std.ravel(), rtol=1e-10)
+    correlation = (covariance / np.outer(std, std)).reshape(ny, nx, ny, nx)[12, 15]
+    y, x = np.mgrid[-6:7, -7:8]  # away from the border, at which errors are mirrored
+    r = np.hypot(y, x / 2) / 3
+    r[6, 7] = 1e-9
+    # The kernel is that of a plane without cells and borders: off by 0.03
+    np.testing.assert_allclose(correlation[6:19, 8:23], r * scipy.special.k1(r), atol=0.04)
+
+
 def noisy_fit(targets, rng, **options) -> jaxhf.Fit:
     """A draw of the truth from the prior, as well as of the noise."""
     noisy = [target + 0.01 * rng.standard_normal(target.shape) for target in targets]
@@ -168,6 +189,8 @@ BAD = {
     r"scenes\[1\]: the heights must have the shape of the first scene's, \(12, 12\); it is \(5, 5\)": ({"other": True}, {}),
     r"prior must stand with prior_std": ({}, {"prior": 0.0}),
     r"prior_std must stand with a prior": ({}, {"prior_std": 1.0}),
+    r"prior_length must stand with a prior": ({}, {"prior_length": 1.0}),
+    r"prior_length must be positive and finite, it is 0": ({}, {"prior": 0.0, "prior_std": 1.0, "prior_length": 0}),
     r"start must be finite, row 0 column 1": ({}, {"start": [[0.0, np.inf], [0.0, 0.0]]}),
     r"solver must be one of lm, bfgs, lbfgs, adam; it is 'sgd'": ({}, {"solver": "sgd"}),
     r"levels must be shares above 0, the last of them 1": ({}, {"levels": [0.5]}),
