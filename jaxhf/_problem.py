@@ -43,13 +43,14 @@ class Prior(eqx.Module):
 
     Attributes:
       heights: shape (ny, nx).
-      weight: 1 / their standard deviation; where errors hang together, times what makes `reach` leave it so, shape (ny, nx).
-      reach: squares of the distance over which errors hang together, in cells along y and x; None: they do not.
+      weight: 1 / their standard deviation; shape (ny, nx). Where errors hang together, times what `stiffness`
+        takes away.
+      stiffness: 1 / the amplitude of each cosine in the errors over their deviation; None: they do not hang together.
     """
 
     heights: Float[Array, "ny nx"]
     weight: Float[Array, "ny nx"]
-    reach: Float[Array, "2"] | None = None
+    stiffness: Float[Array, "ny nx"] | None = None
 
 
 class Problem(eqx.Module):
@@ -90,6 +91,7 @@ class Asked(NamedTuple):
     prior: Any
     prior_std: Any
     prior_length: float | None
+    prior_exponent: float
     smoothness: float | None
     albedo: str
     albedo_smoothness: float | None
@@ -172,8 +174,8 @@ def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray
     return np.where(weight > 0, target, 0), weight
 
 
-def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None) -> Prior | None:
-    """The prior of the heights of `field`; `length` is that of `fit`'s prior_length."""
+def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, exponent: float) -> Prior | None:
+    """The prior of the heights of `field`; `length` and `exponent` are `fit`'s prior_length and prior_exponent."""
     shape, dtype = field.heights.shape, field.heights.dtype
     if prior is None:
         for name, value in (("prior_std", std), ("prior_length", length)):
@@ -186,23 +188,21 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None) -
     if std.shape not in ((), shape) or not (std > 0).all():
         raise ValueError(f"fit: prior_std must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}")
     heights = make_heights("prior", prior, shape)
-    weight, reach = np.broadcast_to(1 / std, shape), None
+    weight, stiffness = np.broadcast_to(1 / std, shape), None
     if length is not None:
-        reach = np.array([(length / field.dy) ** 2, (length / field.dx) ** 2])
-        weight = weight * np.sqrt(_spread_of_correlated(shape, reach))
-        reach = jnp.asarray(reach, dtype)
-    return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), reach)
+        stiffness = _stiffness(field, length, exponent)
+        weight = weight * np.sqrt(cosines(shape[0]).T ** 2 @ stiffness**-2 @ cosines(shape[1]) ** 2)
+        stiffness = jnp.asarray(stiffness, dtype)
+    return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), stiffness)
 
 
-def _spread_of_correlated(shape: tuple[int, ...], reach: Float[np.ndarray, "2"]) -> Float[np.ndarray, "ny nx"]:
-    """The variance, at each vertex, of (1 - reach · second differences)⁻¹ times independent normal numbers.
-
-    Cosines diagonalise it. It is larger at the border, where a vertex has fewer neighbours.
-    """
-    (ny, nx), (rows, columns) = shape, (cosines(n) for n in shape)
-    steps = [2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in (ny, nx)]
-    gain = 1 / (1 + reach[0] * steps[0][:, None] + reach[1] * steps[1][None, :])
-    return (rows**2).T @ gain**2 @ columns**2
+def _stiffness(field: Heightfield, length: float, exponent: float) -> Float[np.ndarray, "ny nx"]:
+    """(1 - length² · Laplacian)^(exponent / 2) of each cosine, the Laplacian being that of second differences."""
+    steps = [
+        (2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2
+        for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True)
+    ]
+    return (1 + length**2 * (steps[0][:, None] + steps[1][None, :])) ** (exponent / 2)
 
 
 def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:

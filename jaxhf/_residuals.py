@@ -79,7 +79,8 @@ def known_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
     parts: list[Array] = []
     if problem.prior is not None:
         off = problem.prior.weight * (heights - problem.prior.heights)
-        parts.append(off if problem.prior.reach is None else off - laplacian(off, problem.prior.reach))
+        stiffness = problem.prior.stiffness
+        parts.append(off if stiffness is None else stiffness * problem.basis.amplitudes(off))
     if problem.smoothness is not None:
         parts.append(problem.smoothness * laplacian(heights))
     if problem.albedo_smoothness is not None and unknowns.albedo is not None:
@@ -92,13 +93,10 @@ def unusual(unknowns: Unknowns, problem: Problem) -> Float[Array, "ny nx"]:
     return unknowns.waves / problem.basis.usual
 
 
-def laplacian(values: Float[Array, "ny nx"], weights: Float[Array, "2"] | None = None) -> Float[Array, "ny nx"]:
-    """The sum of the differences to the neighbours that a vertex has; `weights` are those of neighbours along y and x."""
+def laplacian(values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
+    """The sum of the differences to the neighbours that a vertex has."""
     padded = jnp.pad(values, 1, mode="edge")
-    along_y, along_x = padded[2:, 1:-1] + padded[:-2, 1:-1], padded[1:-1, 2:] + padded[1:-1, :-2]
-    if weights is None:
-        return along_y + along_x - 4 * values
-    return weights[0] * (along_y - 2 * values) + weights[1] * (along_x - 2 * values)
+    return padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2] - 4 * values
 
 
 def soften(residual: Array, loss: str, scale: Float[Array, ""] | None) -> Array:

@@ -55,6 +55,10 @@ class Basis(eqx.Module):
         # Two products of matrices cost less than 1 % of a picture up to 256 x 256 heights, and are real throughout.
         return self.base + _product(self.rows.T, _product(self.scale * waves, self.columns))
 
+    def amplitudes(self, values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
+        """Of the orthonormal cosines whose sum is `values`."""
+        return _product(self.rows, _product(values, self.columns.T))
+
 
 def _product(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
