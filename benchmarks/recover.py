@@ -15,7 +15,6 @@ from typing import Any
 
 import jax
 import numpy as np
-import scipy.fft
 import scipy.optimize
 from peers import View, common_work, mitsuba_scene
 
@@ -157,37 +156,34 @@ def _by_mitsuba(heights: np.ndarray, view: View, towards: Any, extent: tuple[flo
 
 
 def _missing(whole: np.ndarray, coarse: np.ndarray, part: Any) -> tuple[float, float, float]:
-    """What a smoothed map misses in this part, from the map itself and a survey of all the rest.
+    """What such a map misses, from a survey of all but this part of the terrain.
 
-    The map misses most where it is rough: as its Laplacian there to that in the rest. How its errors hang together is read
-    from their spectra in all tiles of the part's size beside it.
+    The amplitudes of the waves in what it misses are taken from tiles of the part's size, under a Hann window, without which
+    the jump between opposite borders would pass for short waves.
 
     Returns:
       `fit`'s prior_std, prior_length (in cells) and prior_exponent.
     """
-    rest, powers, n = np.ones(whole.shape, bool), [], 64
+    error, n = coarse - whole, 64
+    rest, powers = np.ones(whole.shape, bool), []
     rest[part] = False
+    hann = np.hanning(n + 2)[1:-1]
+    window = np.outer(hann, hann) / np.mean(hann**2)
     for row in range(0, whole.shape[0] - n + 1, 16):
         for column in range(0, whole.shape[1] - n + 1, 16):
             tile = np.s_[row : row + n, column : column + n]
             if rest[tile].all():
-                powers.append(np.square(scipy.fft.dctn((coarse - whole)[tile], norm="ortho")))
-    steps = 2 - 2 * np.cos(np.pi * np.arange(n) / n)
+                powers.append(np.abs(np.fft.fft2(window * (error[tile] - error[tile].mean()), norm="ortho")) ** 2)
+    steps = 2 - 2 * np.cos(2 * np.pi * np.arange(n) / n)
     square = (steps[:, None] + steps[None, :]).ravel()[1:]
-    power = np.mean(powers, axis=0).ravel()[1:]
+    amplitude = np.log(np.mean(powers, axis=0).ravel()[1:]) / 2
 
     def off(x: np.ndarray) -> np.ndarray:
-        return (np.log(power) / 2 - (x[0] - x[2] / 2 * np.log1p(np.exp(2 * x[1]) * square))) / np.sqrt(square)
+        # Over the frequency, as there are as many more of the short ones.
+        return (amplitude - (x[0] - x[2] / 2 * np.log1p(np.exp(2 * x[1]) * square))) / np.sqrt(square)
 
-    _, length, exponent = scipy.optimize.least_squares(off, [np.log(power[0]) / 2, np.log(CELLS / 1.4), 2.0]).x
-    bend = np.square(_laplacian(coarse))
-    size = np.mean((whole - coarse)[rest] ** 2) * np.mean(bend[part]) / np.mean(bend[rest])
-    return float(np.sqrt(size)), float(np.exp(length)), float(exponent)
-
-
-def _laplacian(heights: np.ndarray) -> np.ndarray:
-    padded = np.pad(heights, 1, mode="edge")
-    return padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2] - 4 * heights
+    _, length, exponent = scipy.optimize.least_squares(off, [amplitude[0], np.log(CELLS / 1.4), 2.0]).x
+    return float(np.sqrt(np.mean(error[rest] ** 2))), float(np.exp(length)), float(exponent)
 
 
 def shadow(options: argparse.Namespace) -> None:
