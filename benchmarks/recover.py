@@ -107,7 +107,7 @@ def jacksboro(options: argparse.Namespace) -> None:
     if options.targets is not None and options.targets.exists():
         pictures = dict(np.load(options.targets))
     else:
-        pictures = {
+        pictures: dict[str, Any] = {
             name: np.stack([_by_mitsuba(whole[part], views[name], light.towards, extent) for light in lights])
             for name, part in parts.items()
         }
@@ -151,7 +151,7 @@ def jacksboro(options: argparse.Namespace) -> None:
 
 
 def _by_mitsuba(heights: np.ndarray, view: View, towards: Any, extent: tuple[float, float]) -> np.ndarray:
-    made = mitsuba_scene(heights, view, np.asarray(towards), 128, "direct", 1024, albedo=0.7, extent=extent)
+    made = mitsuba_scene(heights, view, [float(v) for v in towards], 128, "direct", 1024, albedo=0.7, extent=extent)
     return np.asarray(made.mi.render(made.scene))[..., 0]
 
 
