@@ -21,10 +21,10 @@ def common_work(peers: Path) -> Any:
     return work
 
 
-def mesh_of(heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) over the unit square and triangles (m, 3)."""
+def mesh_of(heights: np.ndarray, extent: tuple[float, float] = (1.0, 1.0)) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (n, 3) of a square array of heights over a footprint of this extent in x and y, and triangles (m, 3)."""
     size = len(heights)
-    x, y = np.meshgrid(np.linspace(0, 1, size), np.linspace(0, 1, size))
+    x, y = np.meshgrid(np.linspace(0, extent[0], size), np.linspace(0, extent[1], size))
     corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
     lower, upper = [corner, corner + 1, corner + size + 1], [corner, corner + size + 1, corner + size]
     faces = np.concatenate([np.stack(lower, 1), np.stack(upper, 1)])
@@ -62,8 +62,9 @@ def mitsuba_scene(
     integrator: str,
     samples: int = 1,
     albedo: float | None = None,
+    extent: tuple[float, float] = (1.0, 1.0),
 ) -> MitsubaScene:
-    """Heights over the unit square under one directional light.
+    """Heights over a footprint of this extent in x and y, under one directional light.
 
     Args:
       towards: the light.
@@ -71,7 +72,7 @@ def mitsuba_scene(
     """
     dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")
     mi.set_variant("llvm_ad_rgb")
-    vertices, faces = mesh_of(heights)
+    vertices, faces = mesh_of(heights, extent)
     mesh = mi.Mesh("terrain", len(vertices), len(faces), has_vertex_normals=True)
     parameters = mi.traverse(mesh)
     positions = vertices.ravel()
@@ -90,6 +91,7 @@ def mitsuba_scene(
             "sensor": {
                 "type": "perspective",
                 "fov": fov,
+                "far_clip": 1e6,  # its default is 1e4
                 "to_world": mi.ScalarTransform4f().look_at(origin=list(eye), target=list(target), up=[0, 0, 1]),
                 "film": {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}},
                 "sampler": {"type": "independent", "sample_count": samples},

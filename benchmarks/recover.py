@@ -1,8 +1,9 @@
 """Recovers terrains from pictures and prints how near to the truth, and in what time.
 
 `flat`: noise-free pictures of our own, four lights, no shadows. `common`: the common recovery of `--peers`, whose pictures
-Mitsuba made, or makes (pip install mitsuba) for other cameras and sizes. `jacksboro`: the Jacksboro terrain from a smoothed
-prior and three noisy pictures at another sample count. One case a process: the times include compilation, as a user meets it.
+Mitsuba made, or makes for other cameras and sizes (pip install mitsuba). `jacksboro`: parts of the Jacksboro terrain from a
+map smoothed over 8 cells and three noisy pictures that Mitsuba made (`--targets` keeps them). `shadow`: a hill that no
+picture shows, from its shadow. One case a process: the times include compilation, as a user meets it.
 """
 
 import argparse
@@ -14,7 +15,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from peers import common_work, mitsuba_picture
+import scipy.optimize
+from peers import View, common_work, mitsuba_picture, mitsuba_scene
 
 import jaxhf
 from jaxhf.io._procedural import fractal
@@ -83,7 +85,7 @@ def common(options: argparse.Namespace) -> None:
         targets = [mitsuba_picture(truth, view, towards, options.pixels, 256, work.ALBEDO) for towards in lights]
     field = jaxhf.Object(jaxhf.Heightfield(np.full(truth.shape, 0.1, options.dtype)), jaxhf.Matte(work.ALBEDO))
     scenes = [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in lights][: options.images]
-    settings = jaxhf.Settings(normals="six-angle", samples=options.samples, edge_samples=options.edge_samples)
+    settings = jaxhf.Settings(normals="six-angle", samples=options.samples, edge_samples=options.edge_samples or 0)
     found, seconds = timed(
         scenes, list(targets)[: options.images], settings=settings, loss=options.loss, solver=options.solver,
         max_steps=options.max_steps, progress=options.verbose,
@@ -92,37 +94,147 @@ def common(options: argparse.Namespace) -> None:
     report(f"{name}, {options.images} images, {options.loss}:", found, truth, seconds)
 
 
+CORNERS = ((100, 100), (200, 50), (20, 300))  # row and column of the south-western vertex of each part
+CELLS = 8  # over which the map was smoothed: standard deviation of a Gaussian
+
+
 def jacksboro(options: argparse.Namespace) -> None:
+    """64 x 64 heights of each part, 128 x 128 pixels; the map is all that is known, and what maps like it miss elsewhere."""
     terrain = jaxhf.jacksboro()
-    truth = terrain.heights[100:164, 100:164].astype(options.dtype)
-    extent = 63 * max(terrain.dx, terrain.dy)
-    middle = (31.5 * terrain.dx, 31.5 * terrain.dy, float(truth.mean()))
-    camera = jaxhf.Orthographic.look_at(
-        (middle[0], middle[1] - 0.3 * extent, middle[2] + 2 * extent), middle, extent=1.1 * extent, width=128, height=128
-    )
+    whole = terrain.heights.astype(np.float64)
+    coarse = smoothed(whole, CELLS)
+    extent = (63 * terrain.dx, 63 * terrain.dy)
     lights = [jaxhf.Directional.from_angles(azimuth=azimuth, altitude=35) for azimuth in (315, 75, 195)]
+    parts = {f"{row},{column}": np.s_[row : row + 64, column : column + 64] for row, column in CORNERS}
+    # From three sides: the height of everything shows in parallax only, and is one number, which would decide for all cells.
+    eyes = ((0.0, -8000.0, 13000.0), (7000.0, 4000.0, 13000.0), (-7000.0, 4000.0, 13000.0))
+    views: dict[str, list[View]] = {}
+    for name, part in parts.items():
+        middle = (extent[0] / 2, extent[1] / 2, float(coarse[part].mean()))
+        views[name] = [((middle[0] + x, middle[1] + y, middle[2] + z), middle, 24.0) for x, y, z in eyes]
+    if options.targets is not None and options.targets.exists():
+        pictures = dict(np.load(options.targets))
+    else:
+        pictures: dict[str, Any] = {
+            name: np.stack(
+                [_by_mitsuba(whole[part], view, light.towards, extent) for view, light in zip(views[name], lights, strict=True)]
+            )
+            for name, part in parts.items()
+        }
+        if options.targets is not None:
+            np.savez(options.targets, **pictures)
+    for name in options.parts:
+        part = parts[name]
+        truth, prior, exact = whole[part], coarse[part], pictures[name]
+        cameras = [jaxhf.Perspective.look_at(eye, at, fov=fov, width=128, height=128) for eye, at, fov in views[name]]
+        field = jaxhf.Heightfield(prior.astype(options.dtype), dx=terrain.dx, dy=terrain.dy)
+        ground = jaxhf.Object(field, jaxhf.Matte(0.7))
+        scenes = [jaxhf.Scene([ground], camera, [light]) for camera, light in zip(cameras, lights, strict=True)]
+        settings, fine = (jaxhf.Settings(normals="six-angle", samples=n) for n in (options.samples, 64))
+        noise = 0.01 * float(np.mean([image.max() for image in exact]))
+        targets = exact + noise * np.random.default_rng(0).standard_normal(exact.shape)
+        # The terrain's border moves in the picture as only edge derivatives know: pixels within two cells of it do not count.
+        places = np.stack([jaxhf.render(scene, settings, aovs=("uv",))[1]["uv"] for scene in scenes])
+        weights = np.all((places > 2 / 63) & (places < 61 / 63), axis=-1).astype(float)
+        # What the few samples of the fit's pictures leave out is noise too, as large as in pictures of the map.
+        few, many = (np.stack([jaxhf.render(scene, some)[..., 0] for scene in scenes]) for some in (settings, fine))
+        sampling = float(np.sqrt(np.mean((few - many)[weights > 0] ** 2)))
+        spread, length, exponent = _missing(whole, coarse, part)
+        found, seconds = timed(
+            scenes, targets, settings=settings, weights=weights, noise=float(np.hypot(noise, sampling)), prior=prior,
+            prior_std=spread, prior_length=None if options.independent else float(length * np.sqrt(terrain.dx * terrain.dy)),
+            prior_exponent=exponent, loss=options.loss, uncertainty=options.uncertainty, max_steps=options.max_steps,
+            progress=options.verbose,
+        )  # fmt: skip
+        error = np.asarray(found.heights, np.float64) - truth
+        before = np.sqrt(np.mean((prior - truth) ** 2))
+        more = {
+            "noise": noise, "of sampling": sampling, "prior_std": spread, "length in cells": length, "exponent": exponent,
+            "prior RMSE": before,
+            "prior RMSE/RMSE": before / np.sqrt(np.mean(error**2)),
+        }  # fmt: skip
+        if found.std is not None:
+            more |= {f"within {k} std": np.mean(np.abs(error) <= k * found.std) for k in (1, 2)}
+        report(f"jacksboro by Mitsuba, {name}, 3 images, 1 % noise:", found, truth, seconds, **more)
+        if options.out is not None:
+            kept = {"heights": found.heights, "truth": truth, "prior": prior, "targets": targets, "images": found.images}
+            np.savez(options.out / f"jacksboro {name}.npz", **kept, std=0 if found.std is None else found.std, weights=weights)
 
-    def scenes(heights: np.ndarray) -> list[jaxhf.Scene]:
-        field = jaxhf.Object(jaxhf.Heightfield(heights, dx=terrain.dx, dy=terrain.dy))
-        return [jaxhf.Scene([field], camera, [light]) for light in lights]
 
-    rng = np.random.default_rng(0)
-    targets = [np.asarray(jaxhf.render(scene, jaxhf.Settings(samples=64)))[..., 0] for scene in scenes(truth)]
-    noise = 0.01 * float(np.mean([image.max() for image in targets]))
-    targets = [image + noise * rng.standard_normal(image.shape) for image in targets]
-    prior = smoothed(truth.astype(np.float64), 8)
-    spread = float((prior - truth).std())
-    found, seconds = timed(
-        scenes(prior.astype(options.dtype)), targets, settings=jaxhf.Settings(samples=options.samples), noise=noise,
-        prior=prior, prior_std=spread, loss=options.loss, uncertainty=options.uncertainty, max_steps=options.max_steps,
-        progress=options.verbose,
-    )  # fmt: skip
-    error = np.asarray(found.heights, np.float64) - truth
-    before = np.sqrt(np.mean((prior - truth) ** 2))
-    more = {"prior RMSE/RMSE": before / np.sqrt(np.mean(error**2))}
-    if found.std is not None:
-        more |= {f"within {k} std": np.mean(np.abs(error) <= k * found.std) for k in (1, 2)}
-    report("jacksboro, 3 images, 1 % noise:", found, truth, seconds, **more)
+def _by_mitsuba(heights: np.ndarray, view: View, towards: Any, extent: tuple[float, float]) -> np.ndarray:
+    made = mitsuba_scene(heights, view, [float(v) for v in towards], 128, "direct", 1024, albedo=0.7, extent=extent)
+    return np.asarray(made.mi.render(made.scene))[..., 0]
+
+
+def _missing(whole: np.ndarray, coarse: np.ndarray, part: Any) -> tuple[float, float, float]:
+    """What such a map misses, from a survey of all but this part of the terrain.
+
+    The amplitudes of the waves in what it misses are taken from tiles of the part's size, under a Hann window, without which
+    the jump between opposite borders would pass for short waves.
+
+    Returns:
+      `fit`'s prior_std, prior_length (in cells) and prior_exponent.
+    """
+    error, n = coarse - whole, 64
+    rest, powers = np.ones(whole.shape, bool), []
+    rest[part] = False
+    hann = np.hanning(n + 2)[1:-1]
+    window = np.outer(hann, hann) / np.mean(hann**2)
+    for row in range(0, whole.shape[0] - n + 1, 16):
+        for column in range(0, whole.shape[1] - n + 1, 16):
+            tile = np.s_[row : row + n, column : column + n]
+            if rest[tile].all():
+                powers.append(np.abs(np.fft.fft2(window * (error[tile] - error[tile].mean()), norm="ortho")) ** 2)
+    steps = 2 - 2 * np.cos(2 * np.pi * np.arange(n) / n)
+    square = (steps[:, None] + steps[None, :]).ravel()[1:]
+    amplitude = np.log(np.mean(powers, axis=0).ravel()[1:]) / 2
+
+    def off(x: np.ndarray) -> np.ndarray:
+        # Over the frequency, as there are as many more of the short ones.
+        return (amplitude - (x[0] - x[2] / 2 * np.log1p(np.exp(2 * x[1]) * square))) / np.sqrt(square)
+
+    _, length, exponent = scipy.optimize.least_squares(off, [amplitude[0], np.log(CELLS / 1.4), 2.0]).x
+    return float(np.sqrt(np.mean(error[rest] ** 2))), float(np.exp(length)), float(exponent)
+
+
+def shadow(options: argparse.Namespace) -> None:
+    """A hill beside the frame, which a map shows at 60 % of its height, from its shadow on surveyed ground.
+
+    The ground is a heightfield of its own; the picture, from straight above, shows nothing else. The map is said to be off by
+    about as much as it shows, by all of the hill together. With and without points on edges.
+    """
+    x, y = np.meshgrid(np.linspace(0, 0.4, 13), np.linspace(0, 1, 25))
+    truth = 0.12 * np.exp(-(((x - 0.2) / 0.06) ** 2) / 2 - ((y - 0.5) / 0.12) ** 2 / 2)
+    known = 0.6 * truth
+    x, y = np.meshgrid(np.linspace(0, 0.6, 13), np.linspace(0, 1, 21))
+    ground = jaxhf.Heightfield((0.01 * x * np.sin(6 * y)).astype(options.dtype), dx=0.05, dy=0.05, x0=0.4)
+    frame = np.array([[1.0, 0, 0, 0.67], [0, 1, 0, 0.5], [0, 0, -1, 2], [0, 0, 0, 1]])
+    camera = jaxhf.Orthographic(frame, 0.5, width=24, height=24)
+
+    def scene(heights: np.ndarray) -> jaxhf.Scene:
+        hill = jaxhf.Heightfield(heights.astype(options.dtype), dx=0.4 / 12, dy=1 / 24)
+        objects = [jaxhf.Object(field, jaxhf.Matte(0.7)) for field in (hill, ground)]
+        return jaxhf.Scene(objects, camera, [jaxhf.Directional((-1, 0.1, 0.25))])
+
+    exact = np.asarray(jaxhf.render(scene(truth), jaxhf.Settings(samples=1024)))[..., 0]
+    noise = 0.01 * float(exact.max())
+    target = exact + noise * np.random.default_rng(0).standard_normal(exact.shape)
+    top = np.unravel_index(truth.argmax(), truth.shape)
+    for points in (0, 1000 if options.edge_samples is None else options.edge_samples):
+        settings = jaxhf.Settings(samples=16, edge_samples=points)
+        found, seconds = timed(
+            [scene(known)], [target], settings=settings, noise=noise, prior=known, prior_std=0.0003 + known, prior_length=1.0,
+            levels=[1.0], uncertainty=options.uncertainty, max_steps=options.max_steps, progress=options.verbose,
+        )  # fmt: skip
+        highest = np.asarray(found.heights)[top]
+        more = {"top at the start": known[top] / truth[top] - 1, "top": highest / truth[top] - 1}
+        if found.std is not None:
+            more |= {"std of the top": found.std[top] / truth[top]}
+        report(f"hill beside the frame, {points} points on edges:", found, truth, seconds, **more)
+        if options.out is not None:
+            start = jaxhf.render(scene(known), settings)[..., 0]
+            kept = {"heights": found.heights, "truth": truth, "start": start, "target": target, "image": found.images[0]}
+            np.savez(options.out / f"shadow {points}.npz", **kept)
 
 
 def smoothed(heights: np.ndarray, cells: float) -> np.ndarray:
@@ -137,7 +249,13 @@ def smoothed(heights: np.ndarray, cells: float) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("case", choices=("flat", "common", "jacksboro"))
+    parser.add_argument("case", choices=("flat", "common", "jacksboro", "shadow"))
+    parser.add_argument(
+        "--targets", type=Path, help="an .npz file with Mitsuba's pictures of jacksboro; made where it is not there"
+    )
+    parser.add_argument("--parts", nargs="+", default=[f"{row},{column}" for row, column in CORNERS], help="of Jacksboro")
+    parser.add_argument("--independent", action="store_true", help="a prior of jacksboro whose errors do not hang together")
+    parser.add_argument("--out", type=Path, help="a folder for what jacksboro and shadow find, as .npz")
     parser.add_argument("--peers", type=Path, help="folder of common_work.py and of its targets")
     parser.add_argument("--camera", default="D", choices=("A", "B", "C", "D"))
     parser.add_argument("--size", type=int, default=64, help="heights a side of the common recovery")
@@ -145,7 +263,7 @@ def main() -> None:
     parser.add_argument("--light", default="std", choices=("std", "low"))
     parser.add_argument("--images", type=int, default=4)
     parser.add_argument("--samples", type=int, default=4)
-    parser.add_argument("--edge-samples", type=int, default=0, help="of the derivative, a picture")
+    parser.add_argument("--edge-samples", type=int, help="a picture [shadow: 1000, common: none]")
     parser.add_argument("--solver", default="lm")
     parser.add_argument("--loss", default="squares")
     parser.add_argument("--max-steps", type=int, default=100)
@@ -159,7 +277,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", options.precision == "float64")
     jax.config.update("jax_num_cpu_devices", options.devices)
     options.dtype = np.dtype(options.precision)
-    {"flat": flat, "common": common, "jacksboro": jacksboro}[options.case](options)
+    {"flat": flat, "common": common, "jacksboro": jacksboro, "shadow": shadow}[options.case](options)
 
 
 if __name__ == "__main__":

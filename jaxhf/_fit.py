@@ -68,6 +68,8 @@ def fit(
     start: Any = None,
     prior: Any = None,
     prior_std: Any = None,
+    prior_length: float | int | None = None,
+    prior_exponent: float | int = 2.0,
     smoothness: float | int | None = None,
     albedo: Albedo | str = "known",
     albedo_smoothness: float | int | None = None,
@@ -108,6 +110,10 @@ def fit(
         first scene.
       prior: heights known beforehand, as `start`; None: nothing.
       prior_std: how far they may be off, a number or shape (ny, nx), height units.
+      prior_length: over what distance L they are off together, in units of dx and dy; None: each by itself. For a terrain
+        that was smoothed by a Gaussian of standard deviation s, L is about s / √2, see docs/fitting.md.
+      prior_exponent: the amplitudes of the waves in these errors, over prior_std, go as (1 + (L · frequency)²)^(-exponent / 2)
+        (Matérn's family). 2 is Whittle's of 1954, with the correlation (r/L) K₁(r/L) at the distance r; 3 is smoother.
       smoothness: standard deviation of the sum of a height's differences to its four neighbours, height units; None: no
         such term.
       albedo: "known"; "constant", one unknown factor on the heightfield's albedo; "map", a factor for each texel of its image,
@@ -141,7 +147,8 @@ def fit(
     """
     scenes, targets = tuple(scenes), tuple(targets)
     asked = Asked(
-        weights, noise, prior, prior_std, smoothness, albedo, albedo_smoothness, exposures, offsets, loss, loss_scale
+        weights, noise, prior, prior_std, prior_length, prior_exponent, smoothness, albedo, albedo_smoothness, exposures,
+        offsets, loss, loss_scale,
     )  # fmt: skip
     _check_choices(asked, solver, levels, max_steps, inner_steps, checkpoint_every, tolerance, uncertainty)
     groups = make_groups(scenes, targets, settings, asked)
@@ -152,7 +159,7 @@ def fit(
     problem = Problem(
         groups,
         make_basis(first.heightfields[0], heights),
-        make_prior(shape, dtype, prior, prior_std),
+        make_prior(first.heightfields[0], prior, prior_std, prior_length, prior_exponent),
         None if smoothness is None else jnp.asarray(1 / smoothness, dtype),
         None if albedo_smoothness is None else jnp.asarray(1 / albedo_smoothness, dtype),
         None if loss == "squares" else jnp.asarray(loss_scale, dtype),
@@ -198,8 +205,8 @@ def _check_choices(asked, solver, levels, max_steps, inner_steps, every, toleran
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
             raise ValueError(f"fit: {name} must be a whole number from 1 on, it is {value!r}")
     numbers = {
-        "smoothness": asked.smoothness, "albedo_smoothness": asked.albedo_smoothness, "loss_scale": asked.loss_scale,
-        "tolerance": tolerance,
+        "prior_length": asked.prior_length, "prior_exponent": asked.prior_exponent, "smoothness": asked.smoothness,
+        "albedo_smoothness": asked.albedo_smoothness, "loss_scale": asked.loss_scale, "tolerance": tolerance,
     }  # fmt: skip
     for name, value in numbers.items():
         if value is not None and not (math.isfinite(value) and value > 0):

@@ -10,12 +10,13 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
+from ._heightfield import Heightfield
 from ._material import Matte
 from ._render import settle
 from ._scene import Scene, localise
 from ._settings import Settings
 from ._texture import ImageTexture
-from ._unknowns import Basis, Unknowns, resample
+from ._unknowns import Basis, Unknowns, cosines, resample
 
 Albedo = Literal["known", "constant", "map"]
 Loss = Literal["squares", "huber", "cauchy", "geman"]
@@ -38,10 +39,18 @@ class Group(eqx.Module):
 
 
 class Prior(eqx.Module):
-    """Heights that are known beforehand, and 1 / their standard deviation, both of shape (ny, nx)."""
+    """Heights that are known beforehand, and how well.
+
+    Attributes:
+      heights: shape (ny, nx).
+      weight: 1 / their standard deviation; shape (ny, nx). Where errors hang together, times what `stiffness`
+        takes away.
+      stiffness: 1 / the amplitude of each cosine in the errors over their deviation; None: they do not hang together.
+    """
 
     heights: Float[Array, "ny nx"]
     weight: Float[Array, "ny nx"]
+    stiffness: Float[Array, "ny nx"] | None = None
 
 
 class Problem(eqx.Module):
@@ -81,6 +90,8 @@ class Asked(NamedTuple):
     noise: Any
     prior: Any
     prior_std: Any
+    prior_length: float | None
+    prior_exponent: float
     smoothness: float | None
     albedo: str
     albedo_smoothness: float | None
@@ -163,10 +174,13 @@ def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray
     return np.where(weight > 0, target, 0), weight
 
 
-def make_prior(shape: tuple[int, ...], dtype: Any, prior: Any, std: Any) -> Prior | None:
+def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, exponent: float) -> Prior | None:
+    """The prior of the heights of `field`; `length` and `exponent` are `fit`'s prior_length and prior_exponent."""
+    shape, dtype = field.heights.shape, field.heights.dtype
     if prior is None:
-        if std is not None:
-            raise ValueError("fit: prior_std must stand with a prior, there is none")
+        for name, value in (("prior_std", std), ("prior_length", length)):
+            if value is not None:
+                raise ValueError(f"fit: {name} must stand with a prior, there is none")
         return None
     if std is None:
         raise ValueError("fit: prior must stand with prior_std, how far it may be off")
@@ -174,7 +188,21 @@ def make_prior(shape: tuple[int, ...], dtype: Any, prior: Any, std: Any) -> Prio
     if std.shape not in ((), shape) or not (std > 0).all():
         raise ValueError(f"fit: prior_std must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}")
     heights = make_heights("prior", prior, shape)
-    return Prior(jnp.asarray(heights, dtype), jnp.asarray(np.broadcast_to(1 / std, shape), dtype))
+    weight, stiffness = np.broadcast_to(1 / std, shape), None
+    if length is not None:
+        stiffness = _stiffness(field, length, exponent)
+        weight = weight * np.sqrt(cosines(shape[0]).T ** 2 @ stiffness**-2 @ cosines(shape[1]) ** 2)
+        stiffness = jnp.asarray(stiffness, dtype)
+    return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), stiffness)
+
+
+def _stiffness(field: Heightfield, length: float, exponent: float) -> Float[np.ndarray, "ny nx"]:
+    """(1 - length² · Laplacian)^(exponent / 2) of each cosine, the Laplacian being that of second differences."""
+    steps = [
+        (2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2
+        for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True)
+    ]
+    return (1 + length**2 * (steps[0][:, None] + steps[1][None, :])) ** (exponent / 2)
 
 
 def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:

@@ -78,7 +78,9 @@ def known_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
     heights = problem.basis.heights(unknowns.waves)
     parts: list[Array] = []
     if problem.prior is not None:
-        parts.append(problem.prior.weight * (heights - problem.prior.heights))
+        off = problem.prior.weight * (heights - problem.prior.heights)
+        stiffness = problem.prior.stiffness
+        parts.append(off if stiffness is None else stiffness * problem.basis.amplitudes(off))
     if problem.smoothness is not None:
         parts.append(problem.smoothness * laplacian(heights))
     if problem.albedo_smoothness is not None and unknowns.albedo is not None:

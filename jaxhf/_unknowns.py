@@ -55,6 +55,10 @@ class Basis(eqx.Module):
         # Two products of matrices cost less than 1 % of a picture up to 256 x 256 heights, and are real throughout.
         return self.base + _product(self.rows.T, _product(self.scale * waves, self.columns))
 
+    def amplitudes(self, values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
+        """Of the orthonormal cosines whose sum is `values`."""
+        return _product(self.rows, _product(values, self.columns.T))
+
 
 def _product(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
@@ -77,10 +81,11 @@ def make_basis(field: Heightfield, base: Float[np.ndarray, "ny nx"], cut: float 
     usual = 1 / (1 + frequency)
     scale[0, 0] *= lift
     usual[0, 0] /= lift
-    return Basis(*(jnp.asarray(value, dtype) for value in (_cosines(ny), _cosines(nx), scale * kept, usual, base)))
+    return Basis(*(jnp.asarray(value, dtype) for value in (cosines(ny), cosines(nx), scale * kept, usual, base)))
 
 
-def _cosines(n: int) -> Float[np.ndarray, "n n"]:
+def cosines(n: int) -> Float[np.ndarray, "n n"]:
+    """The orthonormal DCT-II of n values, a cosine each row, from the constant one up."""
     k = np.arange(n)
     waves = np.sqrt(2 / n) * np.cos(np.pi / n * k[:, None] * (k[None, :] + 0.5))
     waves[0] /= np.sqrt(2)

@@ -1,17 +1,20 @@
 """Recovering heights from pictures: small terrains, no shadows, so that the derivative is that of the picture."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.fft
+import scipy.special
 
 import jaxhf
 from jaxhf import _descent
 from jaxhf._descent import make_stages
 from jaxhf._devices import local_mesh
-from jaxhf._problem import Prior, Problem
+from jaxhf._problem import Prior, Problem, make_prior
 from jaxhf._residuals import known_residuals, robust_weight, soften
+from jaxhf._solvers import Outcome
 from jaxhf._unknowns import Unknowns, make_basis, resample
 from jaxhf.io._procedural import fractal
 
@@ -94,6 +97,26 @@ def test_what_is_known_beforehand_counts_in_standard_deviations():
     np.testing.assert_allclose(rough_paint[:, 1:-1], 2 / 8)
 
 
+def test_errors_of_a_prior_hang_together_as_whittle_said():
+    """Its covariance as a matrix: prior_std at every vertex, and between two of them by the distance in world units."""
+    ny, nx, std = 25, 31, np.linspace(1, 3, 25 * 31).reshape(25, 31)
+    field = jaxhf.Heightfield(np.zeros((ny, nx)), dx=0.5, dy=1.0)
+    basis = make_basis(field, np.zeros((ny, nx)))
+    problem = Problem((), basis, make_prior(field, 0.0, std, 3.0, 2.0), None, None, None, "squares", SETTINGS, local_mesh())
+    still = jnp.zeros((ny, nx))
+    rows = jax.jacfwd(lambda waves: known_residuals(Unknowns(waves), problem)[0])(still).reshape(ny * nx, -1)
+    heights = jax.jacfwd(basis.heights)(still).reshape(ny * nx, -1)
+    root = np.asarray(heights) @ np.linalg.inv(rows)
+    covariance = root @ root.T
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std.ravel(), rtol=1e-10)
+    correlation = (covariance / np.outer(std, std)).reshape(ny, nx, ny, nx)[12, 15]
+    y, x = np.mgrid[-6:7, -7:8]  # away from the border, at which errors are mirrored
+    r = np.hypot(y, x / 2) / 3
+    r[6, 7] = 1e-9
+    # The kernel is that of a plane without cells and borders.
+    np.testing.assert_allclose(correlation[6:19, 8:23], r * scipy.special.k1(r), atol=0.04)
+
+
 def noisy_fit(targets, rng, **options) -> jaxhf.Fit:
     """A draw of the truth from the prior, as well as of the noise."""
     noisy = [target + 0.01 * rng.standard_normal(target.shape) for target in targets]
@@ -148,6 +171,52 @@ def test_other_solvers_come_near(targets, solver):
     assert rms(shape) < 0.3 * TRUTH.std()
 
 
+def test_a_map_of_the_albedo_comes_back():
+    """Three pictures say for each place its slopes and its albedo: no prior is needed."""
+    y, x = np.mgrid[0:1:12j, 0:1:12j]
+    factor = 1 + 0.3 * np.sin(5 * x + 3 * y)
+    painted = pictures(albedo=jaxhf.ImageTexture(0.7 * factor[..., None].repeat(3, axis=-1)))
+    found = jaxhf.fit(scenes(), painted, settings=SETTINGS, albedo="map", max_steps=40, tolerance=1e-6)
+    assert found.albedo is not None
+    assert found.albedo.shape == (12, 12, 1)
+    inner = np.s_[1:-1, 1:-1]  # of the border the pictures show little
+    np.testing.assert_allclose(np.asarray(found.albedo)[..., 0][inner], factor[inner], rtol=0.02)
+    assert rms(np.asarray(found.heights) - np.mean(found.heights) - TRUTH + TRUTH.mean()) < 0.02 * np.ptp(TRUTH)
+
+
+def test_exposures_and_offsets_come_back_apart():
+    exposures, offsets = np.array([1.0, 1.2, 0.9]), np.array([0.02, -0.01, 0.05])
+    measured = [e * picture + o for picture, e, o in zip(pictures(), exposures, offsets, strict=True)]
+    found = jaxhf.fit(scenes(), measured, settings=SETTINGS, exposures=True, offsets=True, max_steps=40, tolerance=1e-6)
+    assert found.exposures is not None
+    assert found.offsets is not None
+    # They trade against each other where slopes are small: after 40 steps they are off by 0.8 % and 0.0046.
+    np.testing.assert_allclose(found.exposures, exposures, rtol=0.015)
+    np.testing.assert_allclose(found.offsets, offsets, atol=0.008)
+
+
+def test_a_fit_that_stalls_says_so_and_keeps_the_best(targets, monkeypatch):
+    """Steps as a solver may make them: to a better place, to a worse one, then nowhere any more."""
+    losses = iter([7.0, 5.0, 6.0])
+
+    def advance(solver, unknowns, state, problem):
+        loss = next(losses, None)
+        if loss is not None:
+            unknowns = eqx.tree_at(lambda u: u.waves, unknowns, unknowns.waves.at[1, 2].add(0.01))
+        number = jnp.asarray(loss or 6.0)
+        return unknowns, state, Outcome(number, jnp.asarray(loss is not None), jnp.asarray(False), number, number, unknowns)
+
+    monkeypatch.setattr(_descent, "advance", advance)
+    found = jaxhf.fit(scenes(), targets, settings=SETTINGS)
+    assert found.result is jaxhf.Stop.STALLED
+    assert found.stats["steps"] == 3 + 8
+    assert found.stats["loss"] == 5
+    basis = make_basis(scenes()[0].heightfields[0], np.full((12, 12), 0.05))
+    expected = basis.heights(jnp.zeros((12, 12)).at[1, 2].set(0.02))
+    np.testing.assert_allclose(found.heights, expected, atol=1e-12)
+    assert np.ptp(expected) > 1e-3
+
+
 def test_a_loss_that_is_not_finite_stops_the_fit(targets):
     wild = [targets[0].copy(), *targets[1:]]
     wild[0][3, 3] = 1e200
@@ -168,7 +237,10 @@ BAD = {
     r"scenes\[1\]: the heights must have the shape of the first scene's, \(12, 12\); it is \(5, 5\)": ({"other": True}, {}),
     r"prior must stand with prior_std": ({}, {"prior": 0.0}),
     r"prior_std must stand with a prior": ({}, {"prior_std": 1.0}),
+    r"prior_length must stand with a prior": ({}, {"prior_length": 1.0}),
+    r"prior_length must be positive and finite, it is 0": ({}, {"prior": 0.0, "prior_std": 1.0, "prior_length": 0}),
     r"start must be finite, row 0 column 1": ({}, {"start": [[0.0, np.inf], [0.0, 0.0]]}),
+    r"start must be finite, row 2 column 3 is nan": ({"hole": True}, {}),
     r"solver must be one of lm, bfgs, lbfgs, adam; it is 'sgd'": ({}, {"solver": "sgd"}),
     r"levels must be shares above 0, the last of them 1": ({}, {"levels": [0.5]}),
     r"uncertainty must be None, 'exact' or a number": ({}, {"uncertainty": "some"}),
@@ -196,6 +268,8 @@ def test_bad_input_is_refused(message):
         measured[2][1, 2] = np.nan
     if "single" in changes:
         given = scenes(np.zeros((12, 12), np.float32))
+    if "hole" in changes:
+        given = scenes(np.where(np.arange(144).reshape(12, 12) == 27, np.nan, 0.05))
     if "fine" in changes:
         given = scenes(np.zeros((64, 64)))
     if "other" in changes:

@@ -50,6 +50,8 @@ noise = 0.02
 start = 3
 prior = "prior.npy"
 prior_std = 0.5
+prior_length = 4
+prior_exponent = 3
 smoothness = 2
 albedo = "map"
 albedo_smoothness = 1
@@ -99,8 +101,9 @@ def test_every_key_arrives(folder):
     assert found.settings == jaxhf.Settings(shadows=False, samples=9, detail=0.5)
     np.testing.assert_array_equal(found.options.pop("prior"), np.arange(9).reshape(3, 3))
     assert found.options == {
-        "start": 3, "prior_std": 0.5, "smoothness": 2, "albedo": "map", "albedo_smoothness": 1, "exposures": True,
-        "offsets": False, "loss": "huber", "loss_scale": 2, "solver": "bfgs", "levels": [0.5, 1], "max_steps": 7,
+        "start": 3, "prior_std": 0.5, "prior_length": 4, "prior_exponent": 3, "smoothness": 2, "albedo": "map",
+        "albedo_smoothness": 1, "exposures": True, "offsets": False, "loss": "huber", "loss_scale": 2, "solver": "bfgs",
+        "levels": [0.5, 1], "max_steps": 7,
         "inner_steps": 8, "tolerance": 1e-3, "uncertainty": "exact", "checkpoint_every": 3,
     }  # fmt: skip
     first, second = found.scenes

@@ -1,4 +1,4 @@
-"""Each part of the derivative has a test that fails without it.
+"""Each part of the derivative and of a fit has a test that fails without it.
 
 A copy of the package loses one part, and the named test is run there in a process of its own. It has to be a test of the
 default run.
@@ -73,6 +73,126 @@ MUTATIONS = {
         "t = distance(plane, ray, found)",
         "t = lax.stop_gradient(distance(plane, ray, found))",
         "test_gradient.py::test_every_leaf_pixel_by_pixel[parallel]",
+    ),
+    "masks": Mutation(
+        "_residuals.py",
+        "group.weights * (image - group.targets)",
+        "jnp.max(group.weights) * (image - group.targets)",
+        "test_fit.py::test_heights_come_back_from_a_flat_start",
+    ),
+    "prior": Mutation(
+        "_residuals.py",
+        "problem.prior.weight * (heights",
+        "0 * (heights",
+        "test_fit.py::test_what_is_known_beforehand_counts_in_standard_deviations",
+    ),
+    "smoothness": Mutation(
+        "_residuals.py",
+        "problem.smoothness * laplacian(heights)",
+        "0 * laplacian(heights)",
+        "test_fit.py::test_what_is_known_beforehand_counts_in_standard_deviations",
+    ),
+    "smoothness at the border": Mutation(
+        "_residuals.py",
+        'mode="edge"',
+        'mode="constant"',
+        "test_fit.py::test_what_is_known_beforehand_counts_in_standard_deviations",
+    ),
+    "errors of a prior that hang together": Mutation(
+        "_residuals.py",
+        "stiffness * problem.basis.amplitudes(off)",
+        "problem.basis.amplitudes(off)",
+        "test_fit.py::test_errors_of_a_prior_hang_together_as_whittle_said",
+    ),
+    "their spread at the border": Mutation(
+        "_problem.py",
+        "cosines(shape[0]).T ** 2 @ stiffness**-2 @ cosines(shape[1]) ** 2",
+        "np.mean(stiffness**-2)",
+        "test_fit.py::test_errors_of_a_prior_hang_together_as_whittle_said",
+    ),
+    "robust weight": Mutation(
+        "_residuals.py",
+        "1 / (1 + square) ** 2",
+        "1 / (1 + square)",
+        "test_fit.py::test_softened_residuals_square_to_the_robust_loss[geman]",
+    ),
+    "exposures": Mutation(
+        "_residuals.py",
+        "jnp.stack([unknowns.exposures[k] for",
+        "jnp.stack([1 + 0 * unknowns.exposures[k] for",
+        "test_fit.py::test_exposures_and_offsets_come_back_apart",
+    ),
+    "offsets": Mutation(
+        "_residuals.py",
+        "jnp.stack([unknowns.offsets[k] for",
+        "jnp.stack([0 * unknowns.offsets[k] for",
+        "test_fit.py::test_exposures_and_offsets_come_back_apart",
+    ),
+    "albedo of each texel": Mutation(
+        "_residuals.py",
+        "jnp.broadcast_to(factor, shape)",
+        "jnp.broadcast_to(jnp.mean(factor), shape)",
+        "test_fit.py::test_a_map_of_the_albedo_comes_back",
+    ),
+    "sign of the damping": Mutation(
+        "_solvers.py",
+        "high_constant=4.0, low_constant=0.25",
+        "high_constant=0.25, low_constant=4.0",
+        "test_fit.py::test_heights_come_back_from_a_flat_start",
+    ),
+    "constant wave at the last level only": Mutation(
+        "_unknowns.py",
+        "kept[0, 0] = cut >= 1",
+        "kept[0, 0] = True",
+        "test_fit.py::test_the_basis_is_the_cosine_transform",
+    ),
+    "best heights": Mutation(
+        "_descent.py",
+        "and loss <= self.best[0]",
+        "and loss <= math.inf",
+        "test_fit.py::test_a_fit_that_stalls_says_so_and_keeps_the_best",
+    ),
+    "stalling": Mutation(
+        "_descent.py",
+        "_REJECTIONS = 8",
+        "_REJECTIONS = 200",
+        "test_fit.py::test_a_fit_that_stalls_says_so_and_keeps_the_best",
+    ),
+    "interval of checkpoints": Mutation(
+        "_descent.py",
+        "len(self.history) % self.every == 0",
+        "len(self.history) % 1000 == 0",
+        "test_fit_checkpoint.py::test_a_killed_process_loses_at_most_one_interval",
+    ),
+    "damping of a checkpoint": Mutation(
+        "_descent.py",
+        "restarted(self.fresh, self.unknowns, state)",
+        "restarted(self.fresh, self.unknowns)",
+        "test_fit_checkpoint.py::test_after_ctrl_c_it_goes_on_to_the_same_bits[4]",
+    ),
+    "prior in the deviations": Mutation(
+        "_uncertainty.py",
+        "known(change), rest(change)",
+        "[0 * part for part in known(change)], rest(change)",
+        "test_fit.py::test_as_many_heights_lie_within_their_deviations_as_should",
+    ),
+    "pictures in the deviations": Mutation(
+        "_uncertainty.py",
+        "[root * part for",
+        "[0 * root * part for",
+        "test_fit.py::test_as_many_heights_lie_within_their_deviations_as_should",
+    ),
+    "draws of their own": Mutation(
+        "_uncertainty.py",
+        "jax.random.key(k)",
+        "jax.random.key(0 * k)",
+        "test_fit.py::test_sampled_deviations_are_the_exact_ones",
+    ),
+    "what is not seen": Mutation(
+        "_fit.py",
+        "np.asarray(influence) != 0",
+        "np.isfinite(np.asarray(influence))",
+        "test_fit.py::test_what_no_picture_shows_is_marked",
     ),
 }
 

@@ -46,7 +46,10 @@ _PICTURE: Keys = {
 _FIT: Keys = {
     "noise": Key(number, 0.01),
     **{name: Key(number_or_word, None) for name in ("start", "prior", "prior_std")},
-    **{name: Key(number, None) for name in ("smoothness", "albedo_smoothness", "loss_scale", "tolerance")},
+    **{
+        name: Key(number, None)
+        for name in ("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", "loss_scale", "tolerance")
+    },
     **{name: Key(word, None) for name in ("albedo", "loss", "solver")},
     **{name: Key(flag, None) for name in ("exposures", "offsets")},
     **{name: Key(whole, None) for name in ("max_steps", "inner_steps", "checkpoint_every")},
