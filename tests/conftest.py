@@ -14,6 +14,13 @@ SEEDS = Path(__file__).parents[2] / "shared" / "pbrt"
 PEERS = Path(__file__).parents[2] / "shared" / "peers"
 
 
+@pytest.fixture(autouse=True, scope="module")
+def unload_programs() -> Iterator[None]:
+    """A compiled program holds some hundred and fifty mappings of memory, and Linux allows a process 65530: it aborts there."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def seeds() -> Path:
     """The folder of the seed scenes and of their references by pbrt-v2, which lie beside the project, not in it."""
