@@ -70,8 +70,8 @@ MUTATIONS = {
     ),
     "derivative of the hit": Mutation(
         "_hit.py",
-        "t = distance(plane, ray, found)",
-        "t = lax.stop_gradient(distance(plane, ray, found))",
+        "t = distance(plane, ray, found, grid.z_top if near_surface else None)",
+        "t = lax.stop_gradient(distance(plane, ray, found, grid.z_top if near_surface else None))",
         "test_gradient.py::test_every_leaf_pixel_by_pixel[parallel]",
     ),
     "masks": Mutation(
