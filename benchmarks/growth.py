@@ -24,7 +24,7 @@ from jaxhf._worker import MeasurementError, Worker, peak_mb, serve, timed
 
 BASE = {"heights": 1024, "pixels": 512, "samples": 1, "images": 1}
 UNITS = {"heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores"}
-# At the peak, for each device, which has the scene to itself: 63 measured at 8192 x 8192 heights with one, 107 with two.
+# At the peak, for each device, which has the scene to itself: 54 to 63 measured with one, 107 with two.
 BYTES_A_HEIGHT = 66
 
 

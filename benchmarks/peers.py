@@ -102,11 +102,17 @@ def mitsuba_scene(
 
 
 def mitsuba_picture(
-    heights: np.ndarray, view: View, towards: Sequence[float], pixels: int, samples: int, albedo: float
+    heights: np.ndarray,
+    view: View,
+    towards: Sequence[float],
+    pixels: int,
+    samples: int,
+    albedo: float,
+    extent: tuple[float, float] = (1.0, 1.0),
 ) -> np.ndarray:
-    """A grey picture (pixels, pixels) of heights over the unit square under one directional light."""
-    _, mi, scene, _, _ = mitsuba_scene(heights, view, towards, pixels, "direct", samples, albedo)
-    return np.array(mi.render(scene, spp=samples))[..., 0]
+    """A grey picture (pixels, pixels) of the heights of `mitsuba_scene`."""
+    made = mitsuba_scene(heights, view, towards, pixels, "direct", samples, albedo, extent)
+    return np.array(made.mi.render(made.scene))[..., 0]
 
 
 def camera_rays(view: View, pixels: int) -> np.ndarray:

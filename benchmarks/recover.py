@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 import scipy.optimize
-from peers import View, common_work, mitsuba_picture, mitsuba_scene
+from peers import View, common_work, mitsuba_picture
 
 import jaxhf
 from jaxhf.io._procedural import fractal
@@ -81,7 +81,7 @@ def common(options: argparse.Namespace) -> None:
     if stored.exists() and (options.size, options.pixels) == (64, 128):
         lights, targets = (np.load(stored)[name] for name in ("lights", "images"))
     else:
-        lights = work.turned_lights(options.light, 4)
+        lights = work.turned_lights(options.light, 4)[: options.images]
         targets = [mitsuba_picture(truth, view, towards, options.pixels, 256, work.ALBEDO) for towards in lights]
     field = jaxhf.Object(jaxhf.Heightfield(np.full(truth.shape, 0.1, options.dtype)), jaxhf.Matte(work.ALBEDO))
     scenes = [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in lights][: options.images]
@@ -117,7 +117,10 @@ def jacksboro(options: argparse.Namespace) -> None:
     else:
         pictures: dict[str, Any] = {
             name: np.stack(
-                [_by_mitsuba(whole[part], view, light.towards, extent) for view, light in zip(views[name], lights, strict=True)]
+                [
+                    mitsuba_picture(whole[part], view, np.asarray(light.towards).tolist(), 128, 1024, 0.7, extent)
+                    for view, light in zip(views[name], lights, strict=True)
+                ]
             )
             for name, part in parts.items()
         }
@@ -159,11 +162,6 @@ def jacksboro(options: argparse.Namespace) -> None:
         if options.out is not None:
             kept = {"heights": found.heights, "truth": truth, "prior": prior, "targets": targets, "images": found.images}
             np.savez(options.out / f"jacksboro {name}.npz", **kept, std=0 if found.std is None else found.std, weights=weights)
-
-
-def _by_mitsuba(heights: np.ndarray, view: View, towards: Any, extent: tuple[float, float]) -> np.ndarray:
-    made = mitsuba_scene(heights, view, [float(v) for v in towards], 128, "direct", 1024, albedo=0.7, extent=extent)
-    return np.asarray(made.mi.render(made.scene))[..., 0]
 
 
 def _missing(whole: np.ndarray, coarse: np.ndarray, part: Any) -> tuple[float, float, float]:

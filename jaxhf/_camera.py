@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._ray import Footprint, Ray
-from ._transform import Affine, affine, dot, largest_component, require_invertible, unit
+from ._transform import Affine, affine, dot, largest_component, length, require_invertible, unit
 from ._types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
 
 
@@ -82,8 +82,8 @@ class Perspective(eqx.Module):
         sx, sy = _screen(self, x, y)
         half = jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2)
         c = jnp.stack([sx * half, sy * half, jnp.ones_like(half)])
-        k = share * _pixel(self, half) / _length(c)
-        spread = k / (1 + k) / (_length(world.vector(c)) * _most_stretched(world.inverse()))
+        k = share * _pixel(self, half) / length(c)
+        spread = k / (1 + k) / (length(world.vector(c)) * _most_stretched(world.inverse()))
         return Footprint(jnp.zeros_like(spread), spread)
 
     def film_from_world(self) -> Projection:
@@ -161,12 +161,6 @@ def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
 def _pixel(camera: Camera, half: Scalar) -> Scalar:
     """The side of a pixel, in the units of `half`, to which the shorter side's half of the screen corresponds."""
     return 2 * half / min(camera.width, camera.height)
-
-
-def _length(v: Vector) -> Scalar:
-    largest = largest_component(v)
-    v = v / largest
-    return largest * jnp.sqrt(dot(v, v))
 
 
 def _most_stretched(camera: Affine) -> Scalar:

@@ -20,7 +20,7 @@ from ._lanes import only_where
 from ._ray import Footprint, Ray
 from ._settings import Settings
 from ._store import stored
-from ._transform import dot, finite, largest_component, power_of_two, unit
+from ._transform import dot, finite, largest_component, length, power_of_two, unit
 from ._traverse import distance, first_hit, occluded
 from ._types import Flag, Index, Point2, Scalar, Vector
 from ._walk import CellHit, Status
@@ -162,10 +162,8 @@ def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
 
 def _in_heights(grid: Grid, footprint: Footprint, scale: Scalar) -> Footprint:
     """How far apart heights of the grid may be, along a ray of `_in_grid`, to be no further apart than `footprint`."""
-    up = grid.world_from_grid.linear[:, 2]
-    largest = largest_component(up)
-    length = largest * jnp.sqrt(dot(up / largest, up / largest))
-    return stored(Footprint(footprint.width / length, footprint.spread / (length * scale)), grid.sure)
+    unit_height = length(grid.world_from_grid.linear[:, 2])
+    return stored(Footprint(footprint.width / unit_height, footprint.spread / (unit_height * scale)), grid.sure)
 
 
 def blocked(

@@ -48,6 +48,13 @@ def unit(v: Vector) -> Vector:
     return v / jnp.sqrt(jnp.where(zero, 1, dot(v, v)))
 
 
+def length(v: Vector) -> Scalar:
+    """Of a vector that is not zero; neither over- nor underflows on the way."""
+    largest = largest_component(v)
+    v = v / largest
+    return largest * jnp.sqrt(dot(v, v))
+
+
 def power_of_two(value: Float[jax.Array, "*shape"]) -> Float[jax.Array, "*shape"]:
     """The power of two next below positive numbers, clamped to 2^-100..2^100, so that its reciprocal is normal and exact.
 
