@@ -316,8 +316,13 @@ def test_sweep_can_be_interrupted_and_gone_on_with(tmp_path):
     ]  # fmt: skip
     environment = {**os.environ, "PYTHONPATH": str(SCENES.parent)}
     pipes = {"cwd": tmp_path, "env": environment, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    # A suite in the background hands on that it ignores Ctrl-C.
-    with subprocess.Popen(command, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **pipes) as sweep:
+    # A suite in the background would hand on that it ignores Ctrl-C; a signal with a handler starts a program as default.
+    ours = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        sweep = subprocess.Popen(command, **pipes)
+    finally:
+        signal.signal(signal.SIGINT, ours)
+    with sweep:
         while not (table.exists() and table.read_text().count("\n") > 1):
             assert sweep.poll() is None, sweep.communicate()
             time.sleep(0.02)
