@@ -131,21 +131,21 @@ class Descent:
     def _next_stage(self, field: Any) -> None:
         """Puts what is known by now into the base, and varies more waves about it, or weighs outliers more sharply."""
         self.unknowns = self.best[1]
-        heights = self.problem.basis.heights(self.unknowns.waves)
+        surface = self.problem.basis.surface(self.unknowns.waves)
         self.unknowns = eqx.tree_at(lambda u: u.waves, self.unknowns, jnp.zeros_like(self.unknowns.waves))
         self.stage += 1
         self.stage_start = len(self.history)
-        self._set_basis(field, np.asarray(heights))
-        pictures, pull = pictures_and_influence(self.unknowns, self.problem)
+        self._set_basis(field, np.asarray(surface))
+        pictures, influence = pictures_and_influence(self.unknowns, self.problem)
         spread = _spread(pictures, self.problem)
         if self.stages[self.stage] == 1:
-            self.lift = self._lift(pictures, np.asarray(pull))
-            self._set_basis(field, np.asarray(heights))
+            self.lift = self._lift(field, pictures, np.asarray(influence))
+            self._set_basis(field, np.asarray(surface))
         if self.sharpest is not None:
             if min(self.stages[self.stage :]) == 1 and 3 * spread <= _SHARP * self.sharpest:
                 self.stage = len(self.stages) - 1  # those between would be this one again
             last = self.stage + 1 == len(self.stages)
-            scale = jnp.asarray(self.sharpest if last else max(self.sharpest, 3 * spread), heights.dtype)
+            scale = jnp.asarray(self.sharpest if last else max(self.sharpest, 3 * spread), surface.dtype)
             self.problem = eqx.tree_at(lambda problem: problem.loss_scale, self.problem, scale)
         self.best = (math.inf, self.unknowns)
         self.state = restarted(self.fresh, self.unknowns)
@@ -154,17 +154,18 @@ class Descent:
         basis = make_basis(field, base, self.stages[self.stage], self.lift)
         self.problem = eqx.tree_at(lambda problem: problem.basis, self.problem, basis)
 
-    def _lift(self, pictures: list[jax.Array], pull: np.ndarray) -> float:
+    def _lift(self, field: Any, pictures: list[jax.Array], influence: np.ndarray) -> float:
         """How many times less the pictures change by the constant wave than by one like any other.
 
         Without it the solver's linear problem has one direction that is a hundred times weaker than the rest.
         """
-        basis = self.problem.basis
+        basis = make_basis(field, np.asarray(self.problem.basis.base))
         scale, rows, columns = np.asarray(basis.scale), np.asarray(basis.rows), np.asarray(basis.columns)
-        usual = np.sqrt(np.median((scale * (rows @ pull @ columns.T)) ** 2) / 0.455)  # the median of a squared normal
+        pull = rows @ np.pad(influence, [(n, n) for n in basis.margin]) @ columns.T
+        usual = np.sqrt(np.median((scale * pull) ** 2) / 0.455)  # the median of a squared normal
         size = math.sqrt(np.finfo(scale.dtype).eps) * scale[0, 0]
         raised = eqx.tree_at(lambda u: u.waves, self.unknowns, self.unknowns.waves.at[0, 0].add(size / scale[0, 0]))
-        moved, _ = pictures_and_influence(raised, self.problem)
+        moved, _ = pictures_and_influence(raised, eqx.tree_at(lambda p: p.basis, self.problem, basis))
         pairs = zip(self.problem.groups, moved, pictures, strict=True)
         change = np.concatenate([np.ravel(group.weights * (a - b)) for group, a, b in pairs]) / (size / scale[0, 0])
         # A few pixels on edges jump: their share is bounded by that of the others.

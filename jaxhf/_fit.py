@@ -17,13 +17,13 @@ from jaxtyping import Bool, Float
 
 from ._descent import Descent, Step, Stop, make_stages, print_step
 from ._devices import local_mesh
-from ._problem import Albedo, Asked, Loss, Problem, first_unknowns, make_groups, make_heights, make_prior
+from ._problem import Albedo, Asked, Loss, Problem, first_unknowns, make_groups, make_heights, make_prior, prior_margin
 from ._scene import Scene
 from ._settings import Settings
 from ._solvers import BFGS_UNKNOWNS, Solver, count_unknowns, make_solver
 from ._types import AnyArray
 from ._uncertainty import pictures_and_influence, require_small, standard_deviations
-from ._unknowns import make_basis
+from ._unknowns import beyond, make_basis
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -155,11 +155,14 @@ def fit(
     first = scenes[0]
     shape, dtype = first.heights.shape, first.heights.dtype
     heights = make_heights("start", np.asarray(first.heights) if start is None else start, shape)
-    unknowns = first_unknowns(first, max(group.targets.shape[-1] for group in groups), len(scenes), asked)
+    known = make_prior(first.heightfields[0], prior, prior_std, prior_length, prior_exponent)
+    margin = prior_margin(first.heightfields[0], prior_length)
+    basis = make_basis(first.heightfields[0], beyond(heights, margin))
+    unknowns = first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), asked)
     problem = Problem(
         groups,
-        make_basis(first.heightfields[0], heights),
-        make_prior(first.heightfields[0], prior, prior_std, prior_length, prior_exponent),
+        basis,
+        known,
         None if smoothness is None else jnp.asarray(1 / smoothness, dtype),
         None if albedo_smoothness is None else jnp.asarray(1 / albedo_smoothness, dtype),
         None if loss == "squares" else jnp.asarray(loss_scale, dtype),
@@ -191,7 +194,7 @@ def fit(
     )
     result = run.go(first, resume)
     # Whatever the level at which it stopped, all waves are in doubt.
-    basis = make_basis(first.heightfields[0], np.asarray(run.problem.basis.heights(run.unknowns.waves)))
+    basis = make_basis(first.heightfields[0], np.asarray(run.problem.basis.surface(run.unknowns.waves)))
     run.problem = eqx.tree_at(lambda problem: problem.basis, run.problem, basis)
     run.unknowns = eqx.tree_at(lambda unknowns: unknowns.waves, run.unknowns, jnp.zeros_like(run.unknowns.waves))
     return _report(run, result, targets, uncertainty, inner_steps)
@@ -247,7 +250,7 @@ def _report(run: Descent, result: Stop, targets: Sequence[Any], uncertainty: int
         "chi2": square / count,
     }
     return Fit(
-        heights=problem.basis.base,
+        heights=problem.basis.inside(problem.basis.base),
         result=result,
         std=std,
         seen=seen,

@@ -1,5 +1,6 @@
 """What a fit is given, checked and laid out for tracing."""
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +17,7 @@ from ._render import settle
 from ._scene import Scene, localise
 from ._settings import Settings
 from ._texture import ImageTexture
-from ._unknowns import Basis, Unknowns, cosines, resample
+from ._unknowns import Basis, Unknowns, beyond, cosines, resample
 
 Albedo = Literal["known", "constant", "map"]
 Loss = Literal["squares", "huber", "cauchy", "geman"]
@@ -42,15 +43,15 @@ class Prior(eqx.Module):
     """Heights that are known beforehand, and how well.
 
     Attributes:
-      heights: shape (ny, nx).
-      weight: 1 / their standard deviation; shape (ny, nx). Where errors hang together, times what `stiffness`
+      heights: shape (my, mx), see `Basis.margin`.
+      weight: 1 / their standard deviation; shape (my, mx). Where errors hang together, times what `stiffness`
         takes away.
       stiffness: 1 / the amplitude of each cosine in the errors over their deviation; None: they do not hang together.
     """
 
-    heights: Float[Array, "ny nx"]
-    weight: Float[Array, "ny nx"]
-    stiffness: Float[Array, "ny nx"] | None = None
+    heights: Float[Array, "my mx"]
+    weight: Float[Array, "my mx"]
+    stiffness: Float[Array, "my mx"] | None = None
 
 
 class Problem(eqx.Module):
@@ -187,21 +188,35 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, e
     std = np.asarray(std, np.float64)
     if std.shape not in ((), shape) or not (std > 0).all():
         raise ValueError(f"fit: prior_std must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}")
-    heights = make_heights("prior", prior, shape)
-    weight, stiffness = np.broadcast_to(1 / std, shape), None
+    margin = prior_margin(field, length)
+    heights = beyond(make_heights("prior", prior, shape), margin)
+    weight, stiffness = beyond(np.broadcast_to(1 / std, shape), margin), None
     if length is not None:
-        stiffness = _stiffness(field, length, exponent)
-        weight = weight * np.sqrt(cosines(shape[0]).T ** 2 @ stiffness**-2 @ cosines(shape[1]) ** 2)
+        stiffness = _stiffness(field, heights.shape, length, exponent)
+        rows, columns = (cosines(n) ** 2 for n in heights.shape)
+        weight = weight * np.sqrt(rows.T @ stiffness**-2 @ columns)
         stiffness = jnp.asarray(stiffness, dtype)
     return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), stiffness)
 
 
-def _stiffness(field: Heightfield, length: float, exponent: float) -> Float[np.ndarray, "ny nx"]:
+def prior_margin(field: Heightfield, length: float | None) -> tuple[int, int]:
+    """How many vertices beyond the border take part, so that errors need not be level there as cosines are at their ends.
+
+    A border is mirrored in the new end, at twice the margin. Whatever its exponent, Matérn's correlation has its inflection at
+    0 to 2 lengths, where slopes no longer hang together; so one length is enough for them, and less than the distances
+    at which the errors themselves do not (Lindgren, Rue and Lindström, 2011, A.4), which cost twice as many steps. At most
+    half of the terrain's own size.
+    """
+    if length is None:
+        return 0, 0
+    steps = (field.dy, field.dx)
+    y, x = (min(math.ceil(length / d), n // 2) for n, d in zip(field.heights.shape, steps, strict=True))
+    return y, x
+
+
+def _stiffness(field: Heightfield, shape: tuple[int, ...], length: float, exponent: float) -> Float[np.ndarray, "my mx"]:
     """(1 - length² · Laplacian)^(exponent / 2) of each cosine, the Laplacian being that of second differences."""
-    steps = [
-        (2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2
-        for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True)
-    ]
+    steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, (field.dy, field.dx), strict=True)]
     return (1 + length**2 * (steps[0][:, None] + steps[1][None, :])) ** (exponent / 2)
 
 
@@ -218,7 +233,7 @@ def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndar
     return heights if heights.shape == shape else resample(heights, shape)
 
 
-def first_unknowns(scene: Scene, channels: int, count: int, asked: Asked) -> Unknowns:
+def first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, asked: Asked) -> Unknowns:
     """Those from which a fit starts: no waves, the albedo of the scene, exposure 1 and offset 0."""
     shape, dtype = scene.heights.shape, scene.heights.dtype
     if asked.albedo == "known":
@@ -235,7 +250,7 @@ def first_unknowns(scene: Scene, channels: int, count: int, asked: Asked) -> Unk
             texels = shape if asked.albedo == "map" else (1, 1)
         albedo = jnp.ones((*texels, channels), dtype)
     return Unknowns(
-        jnp.zeros(shape, dtype),
+        jnp.zeros_like(basis.base),
         albedo,
         jnp.ones(count, dtype) if asked.exposures else None,
         jnp.zeros(count, dtype) if asked.offsets else None,

@@ -75,20 +75,20 @@ def _painted(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
 
 def known_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
     """What was known before any picture: the prior, and that terrain is smooth."""
-    heights = problem.basis.heights(unknowns.waves)
+    surface = problem.basis.surface(unknowns.waves)
     parts: list[Array] = []
     if problem.prior is not None:
-        off = problem.prior.weight * (heights - problem.prior.heights)
+        off = problem.prior.weight * (surface - problem.prior.heights)
         stiffness = problem.prior.stiffness
         parts.append(off if stiffness is None else stiffness * problem.basis.amplitudes(off))
     if problem.smoothness is not None:
-        parts.append(problem.smoothness * laplacian(heights))
+        parts.append(problem.smoothness * laplacian(problem.basis.inside(surface)))
     if problem.albedo_smoothness is not None and unknowns.albedo is not None:
         parts += [problem.albedo_smoothness * laplacian(unknowns.albedo[..., c]) for c in range(unknowns.albedo.shape[-1])]
     return parts
 
 
-def unusual(unknowns: Unknowns, problem: Problem) -> Float[Array, "ny nx"]:
+def unusual(unknowns: Unknowns, problem: Problem) -> Float[Array, "my mx"]:
     """The waves in units of their usual size."""
     return unknowns.waves / problem.basis.usual
 

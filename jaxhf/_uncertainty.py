@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ._devices import on_every_device
 from ._problem import Problem
 from ._residuals import known_residuals, picture_residuals, robust_weight, simulate, unusual
-from ._unknowns import Basis, Unknowns
+from ._unknowns import Unknowns
 
 EXACT_ENTRIES = 2**24
 """Up to so many residuals times unknowns the matrix is formed where "exact" is asked for: 128 MiB in double precision."""
@@ -38,7 +38,7 @@ def standard_deviations(
     unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
     if samples == "exact":
         return np.sqrt(np.asarray(_exact_variance(unknowns, problem)))
-    total = np.zeros(problem.basis.base.shape)
+    total = np.zeros(problem.basis.inside(problem.basis.base).shape)
     for k in range(int(samples)):
         draw = np.asarray(_draw(unknowns, problem, jax.random.key(k), 5 * inner_steps), np.float64)
         total += draw * draw
@@ -69,18 +69,17 @@ def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[F
 def _pictures_and_influence(
     unknowns: Unknowns, problem: Problem
 ) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
-    heights = problem.basis.heights(unknowns.waves)
+    surface = problem.basis.surface(unknowns.waves)
 
-    def pictures(heights: Float[Array, "ny nx"]) -> tuple[list[Array], list[Array]]:
-        basis = Basis(problem.basis.rows, problem.basis.columns, jnp.zeros_like(heights), problem.basis.usual, heights)
-        still = eqx.tree_at(lambda problem: problem.basis, problem, basis)
+    def pictures(surface: Float[Array, "my mx"]) -> tuple[list[Array], list[Array]]:
+        still = eqx.tree_at(lambda p: (p.basis.scale, p.basis.base), problem, (jnp.zeros_like(surface), surface))
         images = simulate(unknowns, still)
         return [group.weights * image for group, image in zip(problem.groups, images, strict=True)], images
 
-    parts, pull_back, images = jax.vjp(pictures, heights, has_aux=True)
+    parts, pull_back, images = jax.vjp(pictures, surface, has_aux=True)
     keys = jax.random.split(jax.random.key(0), len(parts))
     draws = [jax.random.normal(key, part.shape, part.dtype) for key, part in zip(keys, parts, strict=True)]
-    return images, pull_back(draws)[0]
+    return images, problem.basis.inside(pull_back(draws)[0])
 
 
 def _operator(unknowns: Unknowns, problem: Problem) -> tuple[lx.AbstractLinearOperator, Any]:
@@ -105,7 +104,8 @@ def _draw(unknowns: Unknowns, problem: Problem, key: PRNGKeyArray, steps: int) -
     leaves, tree = jax.tree.flatten(structure)
     keys = jax.random.split(key, len(leaves))
     z = jax.tree.unflatten(tree, [jax.random.normal(k, leaf.shape, leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)])
-    solver = lx.LSMR(rtol=1e-4, atol=0.0, max_steps=steps, conlim=1e16)
+    # Its tolerance is a share of the matrix's Frobenius norm, far above what a height changes that no picture shows.
+    solver = lx.LSMR(rtol=1e-7, atol=0.0, max_steps=steps, conlim=1e16)
     change = lx.linear_solve(operator, z, solver, throw=False).value
     return _height_change(problem, change.waves)
 
@@ -120,8 +120,8 @@ def _exact_variance(unknowns: Unknowns, problem: Problem) -> Float[Array, "ny nx
     scale, rows, columns = problem.basis.scale, problem.basis.rows, problem.basis.columns
     cosines = (rows[:, None, :, None] * columns[None, :, None, :] * scale[:, :, None, None]).reshape(n, -1)
     spread = jnp.matmul(cosines.T, inverse[:n], precision=lax.Precision.HIGHEST)
-    return jnp.sum(spread * spread, axis=1).reshape(problem.basis.base.shape)
+    return problem.basis.inside(jnp.sum(spread * spread, axis=1).reshape(problem.basis.base.shape))
 
 
-def _height_change(problem: Problem, waves: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
-    return problem.basis.heights(waves) - problem.basis.base
+def _height_change(problem: Problem, waves: Float[Array, "my mx"]) -> Float[Array, "ny nx"]:
+    return problem.basis.heights(waves) - problem.basis.inside(problem.basis.base)

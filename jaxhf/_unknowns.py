@@ -1,5 +1,7 @@
 """What a fit varies: heights as a sum of cosines of all wavelengths, and what else is unknown about the pictures."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,13 +20,14 @@ class Unknowns(eqx.Module):
     """What a solver varies; None for what is known.
 
     Attributes:
-      waves: amplitudes of the cosines that are added to the heights, in units of `Basis.scale`, shape (ny, nx).
+      waves: amplitudes of the cosines that are added to the heights, in units of `Basis.scale`, shape (my, mx): that of
+        the heights, or more, see `Basis.margin`.
       albedo: a factor for each texel of the albedo (or for all of them: (1, 1)) in each channel, shape (ty, tx, c).
       exposures: a factor for each picture, shape (pictures,).
       offsets: added to each picture, radiance, shape (pictures,).
     """
 
-    waves: Float[Array, "ny nx"]
+    waves: Float[Array, "my mx"]
     albedo: Float[Array, "ty tx c"] | None = None
     exposures: Float[Array, " pictures"] | None = None
     offsets: Float[Array, " pictures"] | None = None
@@ -38,24 +41,38 @@ class Basis(eqx.Module):
     et al., Large steps in inverse rendering of geometry (2021), whose (I + λL)⁻¹ is diagonal here, with the power that fits
     shading; as a change of variables it serves solvers that take no preconditioner.
 
+    Every cosine is level where the surface ends. Where that would say too much (a prior whose errors hang together),
+    the surface goes on beyond the terrain by `margin` vertices on each side, which no picture shows.
+
     Attributes:
-      rows, columns: the orthonormal cosines, a row each, shapes (ny, ny) and (nx, nx).
-      scale: the height of a wave of amplitude 1; zero for those that are left out, shape (ny, nx).
-      usual: the amplitude that a wave may have in some terrain, in those units, shape (ny, nx).
-      base: heights where all amplitudes are zero, shape (ny, nx).
+      rows, columns: the orthonormal cosines, a row each, shapes (my, my) and (mx, mx).
+      scale: the height of a wave of amplitude 1; zero for those that are left out, shape (my, mx).
+      usual: the amplitude that a wave may have in some terrain, in those units, shape (my, mx).
+      base: the surface where all amplitudes are zero, shape (my, mx).
+      margin: (my - ny) / 2 and (mx - nx) / 2.
     """
 
-    rows: Float[Array, "ny ny"]
-    columns: Float[Array, "nx nx"]
-    scale: Float[Array, "ny nx"]
-    usual: Float[Array, "ny nx"]
-    base: Float[Array, "ny nx"]
+    rows: Float[Array, "my my"]
+    columns: Float[Array, "mx mx"]
+    scale: Float[Array, "my mx"]
+    usual: Float[Array, "my mx"]
+    base: Float[Array, "my mx"]
+    margin: tuple[int, int] = eqx.field(static=True)
 
-    def heights(self, waves: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
+    def heights(self, waves: Float[Array, "my mx"]) -> Float[Array, "ny nx"]:
+        return self.inside(self.surface(waves))
+
+    def surface(self, waves: Float[Array, "my mx"]) -> Float[Array, "my mx"]:
         # Two products of matrices cost less than 1 % of a picture up to 256 x 256 heights, and are real throughout.
         return self.base + _product(self.rows.T, _product(self.scale * waves, self.columns))
 
-    def amplitudes(self, values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
+    def inside(self, surface: Any) -> Any:
+        """What lies on the terrain, of an array of shape (my, mx)."""
+        y, x = self.margin
+        my, mx = surface.shape
+        return surface[y : my - y, x : mx - x]
+
+    def amplitudes(self, values: Float[Array, "my mx"]) -> Float[Array, "my mx"]:
         """Of the orthonormal cosines whose sum is `values`."""
         return _product(self.rows, _product(values, self.columns.T))
 
@@ -64,9 +81,10 @@ def _product(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
-def make_basis(field: Heightfield, base: Float[np.ndarray, "ny nx"], cut: float = 1.0, lift: float = 1.0) -> Basis:
+def make_basis(field: Heightfield, base: Float[np.ndarray, "my mx"], cut: float = 1.0, lift: float = 1.0) -> Basis:
     """The waves up to a share `cut` of the highest frequency, about `base`; `lift` enlarges the constant one's unit."""
-    ny, nx = field.heights.shape
+    ny, nx = base.shape
+    margin = ((ny - field.heights.shape[0]) // 2, (nx - field.heights.shape[1]) // 2)
     dtype = field.heights.dtype
     longest = max((ny - 1) * field.dy, (nx - 1) * field.dx)
     # Half periods that fit into the longer side.
@@ -81,7 +99,14 @@ def make_basis(field: Heightfield, base: Float[np.ndarray, "ny nx"], cut: float 
     usual = 1 / (1 + frequency)
     scale[0, 0] *= lift
     usual[0, 0] /= lift
-    return Basis(*(jnp.asarray(value, dtype) for value in (cosines(ny), cosines(nx), scale * kept, usual, base)))
+    unit = jnp.asarray(scale * kept, dtype)
+    rows, columns = jnp.asarray(cosines(ny), dtype), jnp.asarray(cosines(nx), dtype)
+    return Basis(rows, columns, unit, jnp.asarray(usual, dtype), jnp.asarray(base, dtype), margin)
+
+
+def beyond(heights: Float[np.ndarray, "ny nx"], margin: tuple[int, int]) -> Float[np.ndarray, "my mx"]:
+    """Goes on as at the border for `margin` vertices on each side."""
+    return np.pad(heights, [(n, n) for n in margin], mode="edge")
 
 
 def cosines(n: int) -> Float[np.ndarray, "n n"]:

@@ -82,14 +82,14 @@ MUTATIONS = {
     ),
     "prior": Mutation(
         "_residuals.py",
-        "problem.prior.weight * (heights",
-        "0 * (heights",
+        "problem.prior.weight * (surface",
+        "0 * (surface",
         "test_fit.py::test_what_is_known_beforehand_counts_in_standard_deviations",
     ),
     "smoothness": Mutation(
         "_residuals.py",
-        "problem.smoothness * laplacian(heights)",
-        "0 * laplacian(heights)",
+        "problem.smoothness * laplacian(",
+        "0 * laplacian(",
         "test_fit.py::test_what_is_known_beforehand_counts_in_standard_deviations",
     ),
     "smoothness at the border": Mutation(
@@ -106,8 +106,14 @@ MUTATIONS = {
     ),
     "their spread at the border": Mutation(
         "_problem.py",
-        "cosines(shape[0]).T ** 2 @ stiffness**-2 @ cosines(shape[1]) ** 2",
+        "rows.T @ stiffness**-2 @ columns",
         "np.mean(stiffness**-2)",
+        "test_fit.py::test_errors_of_a_prior_hang_together_as_whittle_said",
+    ),
+    "their slope at the border": Mutation(
+        "_problem.py",
+        "math.ceil(length / d)",
+        "0 * math.ceil(length / d)",
         "test_fit.py::test_errors_of_a_prior_hang_together_as_whittle_said",
     ),
     "robust weight": Mutation(
