@@ -1,5 +1,10 @@
 """Recovering heights from pictures: small terrains, no shadows, so that the derivative is that of the picture."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -65,6 +70,26 @@ def test_heights_come_back_from_a_flat_start(targets):
         assert image.shape == residual.shape == (SIZE, SIZE)
         np.testing.assert_allclose(image, target, atol=1e-6)
     assert np.all(found.residuals[0][4:7, 5:9] == 0)
+
+
+@pytest.mark.slow
+def test_single_precision_finds_the_heights_to_its_own():
+    """In a process in which double precision is off, as it is unless a user asks for it."""
+    script = (
+        "import numpy as np, jaxhf, test_fit\n"
+        "heights = test_fit.TRUTH.astype(np.float32)\n"
+        "targets = [np.asarray(jaxhf.render(scene, test_fit.SETTINGS))[..., 0] for scene in test_fit.scenes(heights)]\n"
+        "found = jaxhf.fit(test_fit.scenes(np.full_like(heights, 0.05)), targets, settings=test_fit.SETTINGS)\n"
+        "assert found.heights.dtype == np.float32\n"
+        "print(found.result.name, test_fit.rms(np.asarray(found.heights) - heights) / np.ptp(heights))"
+    )
+    here = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(here.parent), str(here))), "JAX_ENABLE_X64": "0"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    result, error = done.stdout.split()
+    assert result == "CONVERGED"
+    assert float(error) < 1e-3
 
 
 def test_exposures_and_albedo_come_back_in_spite_of_outliers():
