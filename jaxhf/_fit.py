@@ -183,7 +183,7 @@ def fit(
     run = Descent(
         problem,
         unknowns,
-        make_solver(solver, tolerance, inner_steps),
+        make_solver(solver, tolerance, inner_steps, known is not None),
         make_stages(shape, solver, levels, loss),
         tolerance,
         max_steps,

@@ -204,7 +204,7 @@ def prior_margin(field: Heightfield, length: float | None) -> tuple[int, int]:
 
     A border is mirrored in the new end, at twice the margin. Whatever its exponent, Matérn's correlation has its inflection at
     0 to 2 lengths, where slopes no longer hang together; so one length is enough for them, and less than the distances
-    at which the errors themselves do not (Lindgren, Rue and Lindström, 2011, A.4), which cost twice as many steps. At most
+    at which the errors themselves do not (Lindgren, Rue and Lindström, 2011, A.4), which cost more steps. At most
     half of the terrain's own size.
     """
     if length is None:

@@ -23,9 +23,10 @@ Solver = Literal["lm", "bfgs", "lbfgs", "adam"]
 # BFGS keeps a dense matrix of this many rows at most: 128 MiB in double precision.
 BFGS_UNKNOWNS = 4096
 _FIRST_DAMPING = 1e-2
-# Of LSMR, as a share of the matrix's Frobenius norm, which is far above what a height changes that no picture shows: with
-# 1e-3 such heights wandered off, and came back over twice as many steps as with 1e-4.
-_INNER_TOLERANCE = 1e-4
+# Of LSMR, as a share of the matrix's Frobenius norm. That is far above what a height changes that no picture shows: where a
+# prior is to say how high it is, such heights wandered off with 1e-3, and came back over twice as many steps as with 1e-4.
+_INNER_TOLERANCE = 1e-3
+_INNER_TOLERANCE_WITH_PRIOR = 1e-4
 _RATE = 0.02  # of Adam, in units of a wave's usual size
 
 
@@ -43,12 +44,13 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     search: Any
     verbose: Callable[..., None]
 
-    def __init__(self, tolerance: float, inner_steps: int):
+    def __init__(self, tolerance: float, inner_steps: int, prior: bool):
+        inner_tolerance = _INNER_TOLERANCE_WITH_PRIOR if prior else _INNER_TOLERANCE
         self.rtol = self.atol = tolerance
         self.norm = optx.rms_norm
         # LSMR (Fong and Saunders 2011) works on J itself; conjugate gradients on JᵀJ, whose condition is squared, went
         # non-finite in single precision. Its limit on the condition is lifted: the damping bounds it.
-        self.descent = optx.DampedNewtonDescent(lx.LSMR(rtol=_INNER_TOLERANCE, atol=0.0, max_steps=inner_steps, conlim=1e16))
+        self.descent = optx.DampedNewtonDescent(lx.LSMR(rtol=inner_tolerance, atol=0.0, max_steps=inner_steps, conlim=1e16))
         self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=4.0, low_constant=0.25)
         self.verbose = _silent
 
@@ -108,9 +110,10 @@ class Outcome(NamedTuple):
     unknowns: Unknowns
 
 
-def make_solver(name: str, tolerance: float, inner_steps: int) -> Any:
+def make_solver(name: str, tolerance: float, inner_steps: int, prior: bool) -> Any:
+    """The solver of a name; `prior` is whether the problem has one."""
     if name == "lm":
-        return LevenbergMarquardt(tolerance, inner_steps)
+        return LevenbergMarquardt(tolerance, inner_steps, prior)
     if name == "adam":
         return optx.OptaxMinimiser(optax.adam(_RATE), rtol=tolerance, atol=tolerance, norm=optx.rms_norm)
     if name == "bfgs":

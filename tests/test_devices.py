@@ -74,7 +74,7 @@ def _run(folder: Path, devices: int, processes: int = 1) -> list[dict[str, np.nd
         for process, path in enumerate(paths)
     ]
     try:
-        assert [process.wait(timeout=300) for process in running] == [0] * processes
+        assert [process.wait(timeout=600) for process in running] == [0] * processes
     finally:
         for process in running:
             process.kill()
