@@ -181,13 +181,13 @@ def test_sampled_deviations_are_the_exact_ones():
         jaxhf.fit(
             scenes(TRUTH, camera=HALF), measured, settings=SETTINGS, levels=[1.0], max_steps=1, uncertainty=samples, **known
         ).std
-        for samples in ("exact", 40)
+        for samples in ("exact", 200)
     )
     assert exact is not None
     assert sampled is not None
     assert exact[4:8, 1:5].max() < 0.5 * exact[:, 9:].min()
     for half in np.s_[:, :7], np.s_[:, 9:]:
-        assert rms((sampled / exact - 1)[half]) < 2 / np.sqrt(2 * 40)  # each has a spread of 1 / sqrt(80)
+        assert rms((sampled / exact - 1)[half]) < 2 / np.sqrt(2 * 200)  # each has a spread of 1 / sqrt(400)
 
 
 def test_what_no_picture_shows_is_marked():
