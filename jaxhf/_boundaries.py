@@ -38,10 +38,7 @@ def moving_boundaries(
     image: Float[jax.Array, "h w 3"],
 ) -> Float[jax.Array, "h w 3"]:
     """An image that means nothing, but whose derivative is what is to be added to that of the picture `image`."""
-    chunks = math.ceil(settings.edge_samples / (_ROUNDS * settings.chunk))
-    size = math.ceil(settings.edge_samples / (_ROUNDS * chunks))
-    points, crossings, flows = lax.stop_gradient(_draw_edges(world, camera, settings, key, mesh, chunks, size))
-    points = eqx.tree_at(lambda points: points.valid, points, (flows != 0).any((2, 3)))
+    drawn = draw_boundaries(world, camera, settings, key, mesh)
 
     @jax.checkpoint
     def carry(world: World, camera: Camera, point: EdgePoint, flow: jax.Array):
@@ -51,32 +48,67 @@ def moving_boundaries(
     def chunk(seen: tuple[World, Camera], drawn: tuple[EdgePoint, jax.Array]):
         return jax.vmap(carry, in_axes=(None, None, 0, 0))(*seen, *drawn)
 
-    light = map_over(mesh, chunk, (world, camera), (points, flows)).reshape(-1, 3)
+    light = map_over(mesh, chunk, (world, camera), (drawn.points, drawn.flows)).reshape(-1, 3)
+    flat = image.reshape(-1, 3)
+    finer = _finer(world, camera, settings, mesh, drawn.pixels) - flat[drawn.pixels]
+    return jnp.zeros_like(flat).at[drawn.place].add(light).at[drawn.pixels].add(finer).reshape(image.shape)
+
+
+class Boundaries(eqx.Module):
+    """Points on moving boundaries, without a derivative, in chunks; pixels are numbered from the top left corner, row by row.
+
+    Attributes:
+      points: those drawn; valid where they count. Their leaves have the leading axes (chunks, size).
+      flows: by how much the light that leaves a point's pixel changes with the point's place in the picture.
+      place: the pixel of each point.
+      pixels: those in which most changes, to be looked at again with `finer_side` squared samples each.
+    """
+
+    points: EdgePoint
+    flows: Float[jax.Array, "chunks size 3 2"]
+    place: Int[jax.Array, " points"]
+    pixels: Int[jax.Array, " pixels"]
+
+
+def draw_boundaries(world: World, camera: Camera, settings: Settings, key: jax.Array, mesh: Mesh) -> Boundaries:
+    """Draws `settings.edge_samples` points."""
+    chunks = math.ceil(settings.edge_samples / (_ROUNDS * settings.chunk))
+    size = math.ceil(settings.edge_samples / (_ROUNDS * chunks))
+    points, crossings, flows = lax.stop_gradient(_draw_edges(world, camera, settings, key, mesh, chunks, size))
+    points = eqx.tree_at(lambda points: points.valid, points, (flows != 0).any((2, 3)))
     column, row = (crossings.x[..., axis].astype(jnp.int32).ravel() for axis in (0, 1))
-    place, flat = row * camera.width + column, image.reshape(-1, 3)
-    moving = jnp.zeros_like(flat).at[place].add(light)
+    place, all_pixels = row * camera.width + column, camera.width * camera.height
 
     # The points know nothing of the picture's samples: a choice by these would keep what they happen to miss.
     sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(2, 3))).ravel()
-    side = max(_FINER, 2 * math.isqrt(settings.samples or 1))
-    count = min(math.ceil(settings.edge_samples / side**2), flat.shape[0])
-    _, pixels = lax.top_k(jnp.zeros(flat.shape[0], sizes.dtype).at[place].add(sizes), count)
-    finer = _finer(world, camera, settings, mesh, pixels.astype(jnp.int32), side) - flat[pixels]
-    return moving.at[pixels].add(finer).reshape(image.shape)
+    count = min(math.ceil(settings.edge_samples / finer_side(settings) ** 2), all_pixels)
+    _, pixels = lax.top_k(jnp.zeros(all_pixels, sizes.dtype).at[place].add(sizes), count)
+    return Boundaries(points, flows, place, pixels.astype(jnp.int32))
+
+
+def finer_side(settings: Settings) -> int:
+    """How many samples along a pixel's side are taken where it is looked at again."""
+    return max(_FINER, 2 * math.isqrt(settings.samples or 1))
+
+
+def finer_points(camera: Camera, settings: Settings, pixel: jax.Array, sample: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where in the picture these samples of these pixels are."""
+    dtype = camera.world_from_camera.dtype
+    dx, dy = sample_offset(sample, finer_side(settings), dtype)
+    return (pixel % camera.width).astype(dtype) + dx, (pixel // camera.width).astype(dtype) + dy
 
 
 def _finer(
-    world: World, camera: Camera, settings: Settings, mesh: Mesh, pixels: Int[jax.Array, " n"], side: int
+    world: World, camera: Camera, settings: Settings, mesh: Mesh, pixels: Int[jax.Array, " n"]
 ) -> Float[jax.Array, "n 3"]:
-    """The light of pixels, given by their numbers, from side x side samples each."""
-    dtype = camera.world_from_camera.dtype
+    """The light of pixels from many samples each."""
+    side = finer_side(settings)
     together = min(max(settings.chunk // side**2, 1), pixels.shape[0])
     samples = jnp.arange(side * side, dtype=jnp.int32)
 
     def one(world: World, camera: Camera, pixel: jax.Array, sample: jax.Array) -> jax.Array:
-        dx, dy = sample_offset(sample, side, dtype)
-        x, y = (pixel % camera.width).astype(dtype), (pixel // camera.width).astype(dtype)
-        return radiance(world, stored(camera.ray(x + dx, y + dy), world.surfaces[0].sure), settings)[0]
+        ray = camera.ray(*finer_points(camera, settings, pixel, sample))
+        return radiance(world, stored(ray, world.surfaces[0].sure), settings)[0]
 
     def chunk(seen: tuple[World, Camera], pixels: jax.Array) -> jax.Array:
         light = jax.vmap(functools.partial(one, *seen))(jnp.repeat(pixels, side * side), jnp.tile(samples, together))

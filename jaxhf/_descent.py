@@ -18,12 +18,12 @@ import numpy as np
 
 from ._problem import Problem
 from ._scene import Scene
-from ._solvers import Outcome, advance, begin, restarted
+from ._solvers import Outcome, advance, begin, more_damped, restarted
 from ._uncertainty import pictures_and_influence
 from ._unknowns import Unknowns, make_basis
 from .io._checkpoint import load_arrays, load_facts, save_checkpoint
 
-_REJECTIONS = 8  # in a row: the damping has grown by 4 ** 8
+_REJECTIONS = 5  # in a row: the damping has grown by 4 · 8 · 16 · 32 · 64 = 2 ** 20
 _HALVINGS = 50  # in a row, in a line search, which starts with the whole gradient
 _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
 _SHARP = 1.1  # a robust loss's scale so near to its own is taken for it
@@ -176,6 +176,19 @@ class Descent:
     def _step(self) -> None:
         self.unknowns, self.state, outcome = advance(self.solver, self.unknowns, self.state, self.problem)
         self._note(outcome)
+        rejected = self._rejected()
+        if rejected > 1 and hasattr(self.fresh, "num_steps_since_acceptance"):
+            # Each rejection in a row raises the damping by twice as much as that before (Nielsen, Damping parameter in
+            # Marquardt's method, 1999).
+            self.state = more_damped(self.state, 2.0 ** (rejected - 1))
+
+    def _rejected(self) -> int:
+        """Steps of this stage in a row, the last of them the latest, that were not accepted."""
+        steps = self.history[self.stage_start :]
+        rejected = 0
+        while rejected < len(steps) and not steps[-1 - rejected].accepted:
+            rejected += 1
+        return rejected
 
     def _note(self, outcome: Outcome) -> None:
         loss, accepted = float(outcome.loss), bool(outcome.accepted)
@@ -199,16 +212,14 @@ class Descent:
         last = self.stage + 1 == len(self.stages)
         tolerance = self.tolerance if last else max(self.tolerance, 0.02)
         gains = [(a.loss - b.loss) / max(a.loss, 1e-300) for a, b in itertools.pairwise(steps) if b.accepted]
-        rejected = 0
-        while rejected < len(steps) and not steps[-1 - rejected].accepted:
-            rejected += 1
+        rejected = self._rejected()
         if self.converged and len(steps) > 1:  # the first only evaluates where the stage begins
             return Stop.CONVERGED
         wanted = _FLAT_STEPS if last else 1
         if len(gains) >= wanted and rejected == 0 and max(map(abs, gains[-wanted:])) < tolerance:
             return Stop.CONVERGED
         damped = hasattr(self.fresh, "num_steps_since_acceptance")
-        if rejected >= ((_REJECTIONS if last else 3) if damped else _HALVINGS):
+        if rejected >= ((_REJECTIONS if last else 2) if damped else _HALVINGS):
             return Stop.STALLED
         return Stop.MAX_STEPS if len(self.history) >= self.max_steps else None
 

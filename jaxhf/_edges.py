@@ -20,7 +20,7 @@ from jaxtyping import Float, Int
 
 from ._camera import Camera
 from ._cylinder import tube_distance
-from ._grid import Grid, triangle_plane
+from ._grid import Grid, plane_through, triangle_corners, triangle_places, triangle_plane
 from ._light import Point, Sky
 from ._lottery import Lottery, sources
 from ._ray import Ray
@@ -176,23 +176,55 @@ def _between_ends(point: EdgePoint, s: Scalar) -> tuple[Scalar, Scalar]:
     return a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1])
 
 
-def _on_edge(world: World, point: EdgePoint, s: Scalar, lift: Scalar | None = None) -> Vector:
+def _on_edge(
+    world: World,
+    point: EdgePoint,
+    s: Scalar,
+    lift: Scalar | None = None,
+    perturbation: Float[jax.Array, "5"] | None = None,
+) -> Vector:
     """World frame, `lift` above the edge (in the grid's frame); differentiable in the heights and in the transform."""
     chosen = None
     for k, grid in enumerate(world.surfaces):
         if isinstance(grid, Grid):
-
-            def height(vertex: jax.Array, grid: Grid = grid) -> Scalar:
-                z = grid.rows.at[vertex[1] * grid.shape[1] + vertex[0]].get(mode="clip")
-                return jnp.where(jnp.isfinite(z), z, 0)
-
             x, y = _between_ends(point, s)
-            z0, z1 = height(point.start), height(point.end)
+            z0, z1 = (grid.rows.at[place].get(mode="clip") for place in _ends(grid, point))
+            if perturbation is not None:
+                z0, z1 = z0 + perturbation[0], z1 + perturbation[1]
+            z0, z1 = (jnp.where(jnp.isfinite(z), z, 0) for z in (z0, z1))
             z = z0 + s * (z1 - z0)
             p = grid.world_from_grid.point(jnp.stack([x, y, z if lift is None else z + lift]))
             chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
     assert chosen is not None
     return chosen
+
+
+def _ends(grid: Grid, point: EdgePoint) -> tuple[Index, Index]:
+    """Where the ends of the edge are in the rows of its grid."""
+    start, end = (vertex[1] * grid.shape[1] + vertex[0] for vertex in (point.start, point.end))
+    return start, end
+
+
+def _receiving_cell(grid: Grid, point: EdgePoint) -> Int[jax.Array, "2"]:
+    """In range also where the shadow falls on another surface."""
+    return jnp.clip(point.cell, 0, jnp.array(grid.cells, jnp.int32) - 1)
+
+
+def deciding_vertices(world: World, point: EdgePoint) -> Int[jax.Array, "5"]:
+    """The vertices on whose heights the point's place in the picture depends, numbered over all surfaces.
+
+    The edge's two; and the three of the triangle on which its shadow falls.
+    """
+    places, before = jnp.zeros(5, jnp.int32), 0
+    for k, (surface, vertices) in enumerate(zip(world.surfaces, world.vertices, strict=True)):
+        if isinstance(surface, Grid):
+            cell = _receiving_cell(surface, point)
+            ends = jnp.clip(jnp.stack(_ends(surface, point)), 0, vertices - 1)
+            triangle = jnp.stack(triangle_places(surface.shape[1], cell[0], cell[1], point.upper))
+            here = jnp.stack([point.surface == k] * 2 + [point.receiver == k] * 3)
+            places = jnp.where(here, before + jnp.concatenate([ends, triangle]), places)
+        before += vertices
+    return places
 
 
 def _away_from_light(world: World, point: EdgePoint, p: Vector) -> Vector:
@@ -205,7 +237,7 @@ def _away_from_light(world: World, point: EdgePoint, p: Vector) -> Vector:
     return chosen
 
 
-def _fallen(world: World, point: EdgePoint, p: Vector) -> Vector:
+def _fallen(world: World, point: EdgePoint, p: Vector, perturbation: Float[jax.Array, "5"] | None = None) -> Vector:
     """Where the light past p meets the triangle that was found; differentiable."""
     away = _away_from_light(world, point, p)
     near = p + jnp.where(point.valid, point.t, 0) * away
@@ -214,8 +246,11 @@ def _fallen(world: World, point: EdgePoint, p: Vector) -> Vector:
         if isinstance(surface, Grid):
             # From `near` on, which lies there but for its derivative: far distances would cancel.
             local = surface.grid_from_world.ray(Ray(near, away))
-            cell = jnp.clip(point.cell, 0, jnp.array(surface.cells, jnp.int32) - 1)
-            a, b, c = triangle_plane(surface, cell[0], cell[1], point.upper)
+            cell = _receiving_cell(surface, point)
+            heights = triangle_corners(surface.rows, surface.shape[1], cell[0], cell[1], point.upper)
+            if perturbation is not None:
+                heights = tuple(z + more for z, more in zip(heights, perturbation[2:], strict=True))
+            a, b, c = plane_through(heights, point.upper)
             u, v = local.o[0] - cell[0].astype(p.dtype), local.o[1] - cell[1].astype(p.dtype)
             # At a length around one, as the derivative has the slope's square in it; a power of two changes no bit.
             size = largest_component(local.d)
@@ -232,15 +267,22 @@ def _fallen(world: World, point: EdgePoint, p: Vector) -> Vector:
 
 
 def picture_point(
-    world: World, camera: Camera, settings: Settings, point: EdgePoint, s: Scalar, lift: Scalar | None = None
+    world: World,
+    camera: Camera,
+    settings: Settings,
+    point: EdgePoint,
+    s: Scalar,
+    lift: Scalar | None = None,
+    perturbation: Float[jax.Array, "5"] | None = None,
 ) -> tuple[Point2, Flag]:
     """Where the point, or its shadow, is in the picture, and whether within its frame; differentiable.
 
-    In every leaf of the scene, and in s while the shadow stays in its triangle.
+    In every leaf of the scene, and in s while the shadow stays in its triangle; in `perturbation`, which is added to the
+    heights at its `deciding_vertices`.
     """
-    p = _on_edge(world, point, s, lift)
+    p = _on_edge(world, point, s, lift, perturbation)
     if any(source.light is not None for source in sources(world, settings)):
-        p = jnp.where(point.light >= 0, _fallen(world, point, p), p)
+        p = jnp.where(point.light >= 0, _fallen(world, point, p, perturbation), p)
     # Of a point that does not count, a place may be larger than any number, and its derivative, times zero, none.
     ahead = affine(jnp.asarray(camera.world_from_camera)).point(jnp.array([0, 0, 1], p.dtype))
     at = camera.film_from_world()(jnp.where(point.valid, p, lax.stop_gradient(ahead)))

@@ -4,8 +4,7 @@ import math
 
 import jax
 import jax.numpy as jnp
-
-from ._types import Scalar
+from jaxtyping import Float, Int
 
 
 def grid_side(samples: int) -> int:
@@ -13,7 +12,7 @@ def grid_side(samples: int) -> int:
     return math.isqrt(samples - 1) + 1
 
 
-def sample_offset(k: jax.Array, side: int, dtype) -> tuple[Scalar, Scalar]:
+def sample_offset(k: Int[jax.Array, "*n"], side: int, dtype) -> tuple[Float[jax.Array, "*n"], Float[jax.Array, "*n"]]:
     """The k-th sample's place in its pixel, 0..1 each way: the centres of a regular grid.
 
     With the box filter of a pixel's width, the pixel is the mean of its samples.

@@ -1,5 +1,7 @@
 """A heightfield made ready for tracing."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,13 @@ from ._pyramid import Pyramid, make_pyramid
 from ._settings import NormalScheme
 from ._transform import Affine, power_of_two
 from ._types import Flag, Index, Scalar
+
+
+class Corners(eqx.Module):
+    """What stands at the vertices 00, between and 11 of a triangle: heights, shape (3,); normals, (3, 3), or None."""
+
+    heights: Float[jax.Array, "3"]
+    normals: Float[jax.Array, "3 3"] | None
 
 
 class Grid(eqx.Module):
@@ -29,6 +38,8 @@ class Grid(eqx.Module):
       pyramid: bounds over blocks of cells.
       normals: at the vertices, object frame; None where shading is flat.
       shape: (ny, nx).
+      perturbation: what is added at the vertices of the triangle that a ray meets, for derivatives of one ray in those
+        numbers alone; None: nothing.
     """
 
     rows: Float[jax.Array, " vertices"]
@@ -39,6 +50,7 @@ class Grid(eqx.Module):
     grid_from_world: Affine
     object_from_world: Affine | None
     shape: tuple[int, int] = eqx.field(static=True)
+    perturbation: Corners | None = None
 
     @property
     def z(self) -> Float[jax.Array, "ny nx"]:
@@ -105,8 +117,14 @@ def triangle_corners(
     rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index, upper: Flag
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """What stands at the vertices of a triangle of a cell in range: 00, that between (10, or 01 in the upper), and 11."""
+    first, between, last = triangle_places(nx, ix, iy, upper)
+    return _at(rows, first), _at(rows, between), _at(rows, last)
+
+
+def triangle_places(nx: int, ix: Index, iy: Index, upper: Flag) -> tuple[Index, Index, Index]:
+    """Where these vertices are in the rows."""
     first = iy * nx + ix
-    return _at(rows, first), _at(rows, first + jnp.where(upper, nx, 1)), _at(rows, first + nx + 1)
+    return first, first + jnp.where(upper, nx, 1), first + nx + 1
 
 
 def _at(rows: Float[jax.Array, "vertices *rest"], place: Index) -> jax.Array:
@@ -115,7 +133,11 @@ def _at(rows: Float[jax.Array, "vertices *rest"], place: Index) -> jax.Array:
 
 def triangle_plane(grid: Grid, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """(a, b, c) of the triangle's plane c + a u + b v, with u and v from the cell's vertex 00; finite in a hole too."""
-    heights = triangle_corners(grid.rows, grid.shape[1], ix, iy, upper)
+    return plane_through(triangle_corners(grid.rows, grid.shape[1], ix, iy, upper), upper)
+
+
+def plane_through(heights: Any, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
+    """`triangle_plane`, from the heights at the three vertices."""
     z00, between, z11 = (jnp.where(jnp.isfinite(height), height, 0) for height in heights)
     first, second = between - z00, z11 - between
     return jnp.where(upper, second, first), jnp.where(upper, first, second), z00

@@ -15,7 +15,7 @@ from jaxtyping import Int
 
 from ._begin import Departure
 from ._cylinder import Tube, tube_distance
-from ._grid import Grid, triangle_corners, triangle_plane
+from ._grid import Grid, plane_through, triangle_corners, triangle_plane
 from ._lanes import only_where
 from ._ray import Footprint, Ray
 from ._settings import Settings
@@ -187,12 +187,20 @@ def surface_interaction(grid: Grid, ray: Ray, found: CellHit, near_surface: bool
     What stands at the vertices is fetched before the conditional, which in a reverse derivative would return the derivative
     of all heights and normals once a tile.
     """
-    plane = triangle_plane(grid, found.ix, found.iy, found.upper)
-    normals = None
-    if grid.normals is not None:
-        normals = triangle_corners(grid.normals, grid.shape[1], found.ix, found.iy, found.upper)
+    nx, place = grid.shape[1], (found.ix, found.iy, found.upper)
+    heights = triangle_corners(grid.rows, nx, *place)
+    normals = None if grid.normals is None else triangle_corners(grid.normals, nx, *place)
+    if grid.perturbation is not None:
+        heights = _moved(heights, grid.perturbation.heights)
+        normals = None if normals is None else _moved(normals, grid.perturbation.normals)
+    plane = plane_through(heights, found.upper)
     met = found.status == int(Status.HIT)
     return only_where(met, functools.partial(_interaction, near_surface), grid, ray, found, plane, normals)
+
+
+def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array | None) -> tuple[jax.Array, jax.Array, jax.Array]:
+    a, b, c = corners
+    return corners if by is None else (a + by[0], b + by[1], c + by[2])
 
 
 def _interaction(

@@ -12,6 +12,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ._heightfield import Heightfield
+from ._jacobian import Linearised
 from ._material import Matte
 from ._render import settle
 from ._scene import Scene, localise
@@ -67,6 +68,8 @@ class Problem(eqx.Module):
       loss: how much less.
       settings: how to render.
       mesh: the devices that share the work.
+      linearised: the pictures of each group with their derivatives in the heights, which are taken at the unknowns of which
+        residuals are asked; None: residuals render.
     """
 
     groups: tuple[Group, ...]
@@ -78,6 +81,7 @@ class Problem(eqx.Module):
     loss: str = eqx.field(static=True)
     settings: Settings = eqx.field(static=True)
     mesh: Mesh = eqx.field(static=True)
+    linearised: tuple[Linearised, ...] | None = None
 
     @property
     def count(self) -> int:

@@ -113,13 +113,13 @@ def render(
         settings, world, mesh = scene.settings, scene._world, scene.mesh
         camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:
-            outputs = _trace_prepared(world, camera, settings, aovs, mesh, _settled_key(key, settings, mesh))
+            outputs = _trace_prepared(world, camera, settings, aovs, mesh, settled_key(key, settings, mesh))
         else:
             outputs = _trace_in_parts(world, camera, settings, aovs, mesh, progress)
     else:
         settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
         local = on_every_device(localise(scene), mesh)
-        outputs = _trace_all(local, settings, aovs, mesh, _settled_key(key, settings, mesh))
+        outputs = _trace_all(local, settings, aovs, mesh, settled_key(key, settings, mesh))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -137,7 +137,7 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         settled = settle(settings, scene)
-        return _trace_all(on_every_device(scene, mesh), settled, (), mesh, _settled_key(None, settled, mesh))["image"]
+        return _trace_all(on_every_device(scene, mesh), settled, (), mesh, settled_key(None, settled, mesh))["image"]
 
     return lax.map(one, scenes)
 
@@ -148,13 +148,13 @@ def settle(settings: Settings, scene: Scene) -> Settings:
     return dataclasses.replace(settings, samples=grid_side(samples) ** 2)
 
 
-def _settled_key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
+def settled_key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
     if not settings.edge_samples:
         return None
     return on_every_device(jax.random.key(0) if key is None else key, mesh)
 
 
-class _Tiling:
+class Tiling:
     """How a picture is cut into squares of one fixed size: a fixed shape gives the same bits wherever a pixel lies."""
 
     def __init__(self, camera: Camera, settings: Settings):
@@ -165,6 +165,12 @@ class _Tiling:
     @property
     def count(self) -> int:
         return self.columns * self.rows
+
+    def pixels(self, tile: Int[jax.Array, ""]) -> tuple[Int[jax.Array, " n"], Int[jax.Array, " n"]]:
+        """Column and row of each pixel of a tile, also of those beyond the picture."""
+        pixel = jnp.arange(self.side * self.side, dtype=jnp.int32)
+        column, row = (tile % self.columns) * self.side, (tile // self.columns) * self.side
+        return column + pixel % self.side, row + pixel // self.side
 
     def assemble(self, tiles: Any) -> Any:
         """(count, side * side, ...) to (height, width, ...), for NumPy and JAX arrays."""
@@ -183,7 +189,7 @@ def _trace_all(
 def _trace_world(
     world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
 ) -> dict[str, jax.Array]:
-    tiling = _Tiling(camera, settings)
+    tiling = Tiling(camera, settings)
     tiles = _trace_each(mesh, world, camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
     outputs = jax.tree.map(tiling.assemble, tiles)
     if key is not None and sources(world, settings):
@@ -215,7 +221,7 @@ def _trace_in_parts(
     progress: Callable[[int, int], None],
 ):
     """As `_trace_all`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
-    tiling = _Tiling(camera, settings)
+    tiling = Tiling(camera, settings)
     size = math.ceil(tiling.count / 64)
     pixels = tiling.width * tiling.height
     parts = []
@@ -227,27 +233,23 @@ def _trace_in_parts(
 
 
 def _trace_tile(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tile: jax.Array):
-    tiling = _Tiling(camera, settings)
-    corner_x, corner_y = (tile % tiling.columns) * tiling.side, (tile // tiling.columns) * tiling.side
-    pixel = jnp.arange(tiling.side * tiling.side, dtype=jnp.int32)
+    dtype = camera.world_from_camera.dtype
 
-    def one(pixel: jax.Array):
-        dtype = camera.world_from_camera.dtype
-        x = (corner_x + pixel % tiling.side).astype(dtype)
-        y = (corner_y + pixel // tiling.side).astype(dtype)
+    def one(x: jax.Array, y: jax.Array):
         image, exhausted = _pixel(world, camera, settings, x, y)
         outputs = {"image": image}
         if aovs:
-            ray, footprint = _camera_ray(camera, settings, x + 0.5, y + 0.5)
+            ray, footprint = camera_ray(camera, settings, x + 0.5, y + 0.5)
             outputs |= _observe(world, ray, footprint, settings, aovs)
         if "exhausted" in aovs:
             outputs["exhausted"] = exhausted
         return outputs
 
-    return jax.vmap(one)(pixel)
+    columns, rows = Tiling(camera, settings).pixels(tile)
+    return jax.vmap(one)(columns.astype(dtype), rows.astype(dtype))
 
 
-def _camera_ray(camera: Camera, settings: Settings, x: jax.Array, y: jax.Array) -> tuple[Ray, Footprint | None]:
+def camera_ray(camera: Camera, settings: Settings, x: jax.Array, y: jax.Array) -> tuple[Ray, Footprint | None]:
     """The camera's ray through the point (x, y) of the picture, and how far its hit may be off."""
     return camera.ray(x, y), None if settings.detail is None else camera.footprint(x, y, settings.detail)
 
@@ -259,7 +261,7 @@ def _pixel(world: World, camera: Camera, settings: Settings, x: jax.Array, y: ja
 
     def sample(k, sums):
         dx, dy = sample_offset(k, side, x.dtype)
-        ray, footprint = stored(_camera_ray(camera, settings, x + dx, y + dy), world.surfaces[0].sure)
+        ray, footprint = stored(camera_ray(camera, settings, x + dx, y + dy), world.surfaces[0].sure)
         light, exhausted = radiance(world, ray, settings, footprint)
         return sums[0] + light, sums[1] + exhausted
 
@@ -307,7 +309,7 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
     world = make_world(scene, settings)
 
     def one(x: jax.Array, y: jax.Array) -> Vertex:
-        ray, footprint = _camera_ray(scene.camera, settings, x, y)
+        ray, footprint = camera_ray(scene.camera, settings, x, y)
         return first_vertex(world, ray, settings, footprint=footprint)
 
     return jax.vmap(one)(x, y)

@@ -1,5 +1,6 @@
 """How far a terrain is from its pictures and from what is known beforehand, in standard deviations."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._devices import on_every_device
+from ._jacobian import Linearised, can_be_linearised, linearise_each, picture_each
 from ._material import Matte
 from ._problem import Group, Problem
 from ._render import render_each
@@ -39,20 +42,51 @@ def picture_residuals(unknowns: Unknowns, problem: Problem) -> list[Float[Array,
 
 def simulate(unknowns: Unknowns, problem: Problem) -> list[Float[Array, "n h w c"]]:
     """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
-    return [_simulate(unknowns, problem, group) for group in problem.groups]
+    known = [None] * len(problem.groups) if problem.linearised is None else problem.linearised
+    return [_simulate(unknowns, problem, group, linear) for group, linear in zip(problem.groups, known, strict=True)]
 
 
-def _simulate(unknowns: Unknowns, problem: Problem, group: Group) -> Float[Array, "n h w c"]:
+def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
+    """The problem with its pictures at these unknowns and their derivatives: what compiles from it need not render.
+
+    Where that cannot be, because of mirrors or an unknown albedo, the problem as it is.
+    """
+    if unknowns.albedo is not None:
+        return problem
+    if not all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
+        return problem
+    found = _linearised(*on_every_device((unknowns, problem), problem.mesh))
+    return eqx.tree_at(lambda problem: problem.linearised, problem, found, is_leaf=lambda leaf: leaf is None)
+
+
+@eqx.filter_jit
+def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised, ...]:
+    change = _with_unknowns(unknowns, problem)
+    pictures = tuple(
+        linearise_each(group.scenes, change, problem.settings, problem.mesh, group.targets.shape[-1])
+        for group in problem.groups
+    )
+    return on_every_device(pictures, problem.mesh)
+
+
+def _with_unknowns(unknowns: Unknowns, problem: Problem) -> Callable[[Scene], Scene]:
     heights = problem.basis.heights(unknowns.waves)
-    n = len(group.places)
 
-    def with_unknowns(scene: Scene) -> Scene:
+    def changed(scene: Scene) -> Scene:
         scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights)
         return scene if unknowns.albedo is None else _painted(scene, unknowns.albedo)
 
-    image = render_each(group.scenes, with_unknowns, problem.settings, problem.mesh)
-    if group.targets.shape[-1] == 1:
-        image = jnp.mean(image, axis=-1, keepdims=True)
+    return changed
+
+
+def _simulate(unknowns: Unknowns, problem: Problem, group: Group, known: Linearised | None) -> Float[Array, "n h w c"]:
+    n, change = len(group.places), _with_unknowns(unknowns, problem)
+    if known is not None:
+        image = picture_each(known, group.scenes, change, problem.settings, problem.mesh)
+    else:
+        image = render_each(group.scenes, change, problem.settings, problem.mesh)
+        if group.targets.shape[-1] == 1:
+            image = jnp.mean(image, axis=-1, keepdims=True)
     if unknowns.exposures is not None:
         image = image * jnp.stack([unknowns.exposures[k] for k in group.places]).reshape(n, 1, 1, 1)
     if unknowns.offsets is not None:

@@ -1,6 +1,7 @@
 """Radiance along one ray: direct light, shadows, mirrors."""
 
 import functools
+from collections.abc import Iterable
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ from jax import lax
 from jaxtyping import Bool
 
 from ._cylinder import make_tube
-from ._grid import make_grid
+from ._grid import Grid, make_grid
 from ._heightfield import Heightfield
 from ._hit import Hit, Origin, Surface, blocked, intersect
 from ._lanes import only_where
@@ -34,6 +35,11 @@ class World(eqx.Module):
     surfaces: tuple[Surface, ...]
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
+
+    @property
+    def vertices(self) -> tuple[int, ...]:
+        """How many vertices each surface has; a cylinder has none."""
+        return tuple(surface.shape[0] * surface.shape[1] if isinstance(surface, Grid) else 0 for surface in self.surfaces)
 
 
 def make_world(scene: Scene, settings: Settings) -> World:
@@ -104,10 +110,8 @@ def radiance(world: World, ray: Ray, settings: Settings, footprint: Footprint | 
 
     For the footprint, which is that of the camera ray alone, see `first_vertex`.
     """
-    if not settings.max_depth or not any(isinstance(material, Mirror) for material in world.materials):
-        vertex = first_vertex(world, ray, settings, footprint=footprint)
-        light, exhausted = _outgoing(world, ray, vertex, vertex.hit.status != int(Status.EXHAUSTED), settings)
-        return light, exhausted + _count(vertex.hit.status == int(Status.EXHAUSTED))
+    if not mirrors(world.materials, settings):
+        return direct(world, ray, settings, footprint)[:2]
 
     def bounce(carry, _):
         ray, origin, throughput, total, active, exhausted = carry
@@ -121,6 +125,18 @@ def radiance(world: World, ray: Ray, settings: Settings, footprint: Footprint | 
     init = (ray, nowhere(dtype), jnp.ones(3, dtype), jnp.zeros(3, dtype), jnp.ones((), bool), none)
     (_, _, _, total, _, exhausted), _ = lax.scan(bounce, init, length=settings.max_depth + 1)
     return total, exhausted
+
+
+def mirrors(materials: Iterable[Material], settings: Settings) -> bool:
+    """Whether light may come by way of a mirror."""
+    return settings.max_depth > 0 and any(isinstance(material, Mirror) for material in materials)
+
+
+def direct(world: World, ray: Ray, settings: Settings, footprint: Footprint | None) -> tuple[Vector, Index, Vertex]:
+    """`radiance` where there are no mirrors, and from where it comes."""
+    vertex = first_vertex(world, ray, settings, footprint=footprint)
+    light, exhausted = _outgoing(world, ray, vertex, vertex.hit.status != int(Status.EXHAUSTED), settings)
+    return light, exhausted + _count(vertex.hit.status == int(Status.EXHAUSTED)), vertex
 
 
 def _bounce(

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ._devices import on_every_device
 from ._problem import Problem
-from ._residuals import half_squares, residuals
+from ._residuals import half_squares, linearised, residuals
 from ._types import Flag, Scalar
 from ._unknowns import Unknowns
 
@@ -133,6 +133,7 @@ def begin(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
     """A solver's state before its first step. Its static parts must be those of the one state that is ever made."""
     # What enters a compiled step and what leaves it must lie in the same places, or the next step is compiled again for the
     # other ones: 16 x 16 heights on two devices took 89 s of processor time before the first wave of the last level, not 30.
+    problem = linearised(unknowns, problem)
     return _begin(solver, *on_every_device((unknowns, problem), problem.mesh))
 
 
@@ -151,6 +152,11 @@ def _with_step_size(state: Any, step_size: Float[Array, ""]) -> Any:
     return eqx.tree_at(lambda state: state.search_state.step_size, state, step_size)
 
 
+def more_damped(state: Any, factor: float) -> Any:
+    """A state of Levenberg-Marquardt with λ times a factor."""
+    return _with_step_size(state, state.search_state.step_size / factor)
+
+
 def restarted(fresh: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None = None) -> Any:
     """A state that stands at `unknowns` and knows nothing of its surroundings yet; `fresh` is what `begin` made.
 
@@ -164,6 +170,7 @@ def restarted(fresh: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None
 
 def advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tuple[Unknowns, Any, Outcome]:
     """One step: a trial of new unknowns, which are accepted or not."""
+    problem = linearised(getattr(state, "y_eval", unknowns), problem)  # where the residuals are going to be asked for
     return _advance(solver, *on_every_device((unknowns, state, problem), problem.mesh))
 
 

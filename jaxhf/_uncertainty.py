@@ -4,6 +4,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._devices import on_every_device
 from ._problem import Problem
-from ._residuals import known_residuals, picture_residuals, robust_weight, simulate, unusual
+from ._residuals import known_residuals, linearised, picture_residuals, robust_weight, simulate, unusual
 from ._unknowns import Unknowns
 
 EXACT_ENTRIES = 2**24
@@ -35,7 +36,7 @@ def standard_deviations(
         1 / √(2 · samples), however the heights are correlated.
       inner_steps: of LSMR, each; five times as many as in a step of the fit are allowed.
     """
-    unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
+    unknowns, problem = on_every_device((unknowns, linearised(unknowns, problem)), problem.mesh)
     if samples == "exact":
         return np.sqrt(np.asarray(_exact_variance(unknowns, problem)))
     total = np.zeros(problem.basis.inside(problem.basis.base).shape)
@@ -62,6 +63,7 @@ def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[F
     The column of J of a vertex without influence is zero, and so is its product with any vector; that of another vertex with
     a random vector is zero with probability zero.
     """
+    problem = linearised(unknowns, problem)
     return _pictures_and_influence(*on_every_device((unknowns, problem), problem.mesh))
 
 
@@ -112,7 +114,15 @@ def _draw(unknowns: Unknowns, problem: Problem, key: PRNGKeyArray, steps: int) -
 
 @eqx.filter_jit
 def _exact_variance(unknowns: Unknowns, problem: Problem) -> Float[Array, "ny nx"]:
-    matrix = _operator(unknowns, problem)[0].as_matrix()
+    operator = _operator(unknowns, problem)[0]
+    flat, unflat = jax.flatten_util.ravel_pytree(unknowns)
+
+    # One after the other: all at once they would take room for every sample of the pictures, not for every residual.
+    def column(_: None, k: jax.Array) -> tuple[None, Array]:
+        change = operator.mv(unflat(jnp.zeros_like(flat).at[k].set(1)))
+        return None, jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(change)])
+
+    matrix = lax.scan(column, None, jnp.arange(flat.size))[1].T
     n = unknowns.waves.size
     # QᵀQ = 1 of J = QR leaves (JᵀJ)⁻¹ = R⁻¹R⁻ᵀ; waves are the first of the unknowns.
     root = jnp.linalg.qr(matrix, mode="r")

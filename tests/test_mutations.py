@@ -74,6 +74,24 @@ MUTATIONS = {
         "t = lax.stop_gradient(distance(plane, ray, found, grid.z_top if near_surface else None))",
         "test_gradient.py::test_every_leaf_pixel_by_pixel[parallel]",
     ),
+    "which vertices a sample shows": Mutation(
+        "_jacobian.py",
+        "before + jnp.stack(here)",
+        "jnp.stack(here)",
+        "test_jacobian.py::test_matrix_is_the_derivative_of_render[flat, near the surface, several objects]",
+    ),
+    "pixels looked at again": Mutation(
+        "_jacobian.py",
+        ".at[edges.pixels].set(finer, unique_indices=True)",
+        "",
+        "test_jacobian.py::test_matrix_is_the_derivative_of_render[smooth with edges]",
+    ),
+    "which vertices decide on a point": Mutation(
+        "_edges.py",
+        "before + jnp.concatenate([ends, triangle])",
+        "jnp.concatenate([ends, triangle])",
+        "test_jacobian.py::test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone[2-1]",
+    ),
     "masks": Mutation(
         "_residuals.py",
         "group.weights * (image - group.targets)",
@@ -160,7 +178,7 @@ MUTATIONS = {
     ),
     "stalling": Mutation(
         "_descent.py",
-        "_REJECTIONS = 8",
+        "_REJECTIONS = 5",
         "_REJECTIONS = 200",
         "test_fit.py::test_a_fit_that_stalls_says_so_and_keeps_the_best",
     ),

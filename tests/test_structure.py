@@ -11,7 +11,7 @@ FLOW = (
     "_types", "_store", "_lanes", "_devices", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera",
     "_film", "_heightfield", "_pyramid", "_grid", "_cylinder",
     "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade",
-    "_silhouette", "_lottery", "_edges", "_boundaries", "_render", "io",
+    "_silhouette", "_lottery", "_edges", "_boundaries", "_render", "_jacobian", "io",
     "_unknowns", "_problem", "_residuals", "_solvers", "_uncertainty", "_descent", "_fit", "_plots", "_report", "_fit_command",
     "_worker", "_measure", "_tradeoff", "_sweeping", "_front", "_curves", "__init__", "__main__",
 )  # fmt: skip
@@ -44,13 +44,16 @@ def test_imports_follow_the_flow(path):
         assert FLOW.index(name) < here or name == _stage(path) == "io", f"{path.name} imports {name}, which comes after it"
 
 
-def test_rays_are_batched_in_two_places_and_compiled_in_one():
-    """Pixels in one, points on edges in the other; besides, two modules say what `vmap` is to make of a function of one ray."""
-    batching, rules = ("_render", "_boundaries"), ("_lanes", "_march")
+def test_rays_are_batched_in_three_places_and_compiled_in_two():
+    """Pixels in one, points on edges in another, both for the matrix of a fit in the third.
+
+    Besides, two modules say what `vmap` is to make of a function of one ray.
+    """
+    batching, rules = ("_render", "_boundaries", "_jacobian"), ("_lanes", "_march")
     for path in PACKAGE.rglob("*.py"):
         text, stage = path.read_text(), _stage(path)
         assert ("custom_vmap" in text) == (stage in rules), path.name
         assert stage in (*batching, *rules) or "jax.vmap" not in text, f"{path.name} batches rays"
         assert stage in (*batching, "_devices") or "lax.map(" not in text, f"{path.name} batches rays"
-        assert stage == "_render" or "jax.jit" not in text, f"{path.name} compiles"
+        assert stage in ("_render", "_jacobian") or "jax.jit" not in text, f"{path.name} compiles"
         assert stage == "_devices" or "shard_map" not in text, f"{path.name} deals out work"
