@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=240)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    print("four sweeps, about 4 minutes on two free cores", flush=True)
+    print("four sweeps, about 6 minutes on two free cores", flush=True)
     scenes = Path(__file__).parents[1] / "scenes"
     found = {}
     for name in SCENES:

@@ -36,7 +36,7 @@ _TOGETHER = 1024
 
 
 class Linearised(eqx.Module):
-    """A picture, and its derivative in what stands at the vertices of its scene; pixels are numbered row by row.
+    """A picture, and its derivative in what stands at the vertices of its scene.
 
     Attributes:
       image: shape (h, w, c).
@@ -57,7 +57,7 @@ class LinearisedEdges(eqx.Module):
     Attributes:
       slopes: the derivatives of the light in five heights, (chunks, c, 5, size).
       places: the numbers of their vertices, (chunks, 5, size).
-      pixel: which pixel each point is in.
+      pixel: which pixel each point is in; they are numbered row by row.
       pixels: those that are looked at again, by samples after the picture's.
     """
 
