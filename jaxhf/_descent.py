@@ -18,12 +18,12 @@ import numpy as np
 
 from ._problem import Problem
 from ._scene import Scene
-from ._solvers import Outcome, advance, begin, more_damped, restarted
+from ._solvers import Outcome, advance, begin, impatient, restarted
 from ._uncertainty import pictures_and_influence
 from ._unknowns import Unknowns, make_basis
 from .io._checkpoint import load_arrays, load_facts, save_checkpoint
 
-_REJECTIONS = 5  # in a row: the damping has grown by 4 · 8 · 16 · 32 · 64 = 2 ** 20
+_REJECTIONS = 5  # in a row: the last trial had 4 · 8 · 16 · 32 times the damping of the first
 _HALVINGS = 50  # in a row, in a line search, which starts with the whole gradient
 _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
 _SHARP = 1.1  # a robust loss's scale so near to its own is taken for it
@@ -174,13 +174,9 @@ class Descent:
         return float(np.clip(usual / weak, 1.0, 1e3)) if weak > 0 else 1.0
 
     def _step(self) -> None:
-        self.unknowns, self.state, outcome = advance(self.solver, self.unknowns, self.state, self.problem)
+        solver = impatient(self.solver, self._rejected())
+        self.unknowns, self.state, outcome = advance(solver, self.unknowns, self.state, self.problem)
         self._note(outcome)
-        rejected = self._rejected()
-        if rejected > 1 and hasattr(self.fresh, "num_steps_since_acceptance"):
-            # Each rejection in a row raises the damping by twice as much as that before (Nielsen, Damping parameter in
-            # Marquardt's method, 1999).
-            self.state = more_damped(self.state, 2.0 ** (rejected - 1))
 
     def _rejected(self) -> int:
         """Steps of this stage in a row, the last of them the latest, that were not accepted."""
@@ -259,7 +255,8 @@ class Descent:
         if hasattr(self.fresh, "num_steps_since_acceptance"):
             self.state = restarted(self.fresh, self.unknowns, state)
             if len(self.history) > self.stage_start:
-                self.unknowns, self.state, _ = advance(self.solver, self.unknowns, self.state, self.problem)
+                solver = impatient(self.solver, 0)
+                self.unknowns, self.state, _ = advance(solver, self.unknowns, self.state, self.problem)
         else:
             self.state = eqx.combine(state, self.fresh)
 

@@ -93,7 +93,7 @@ def fit(
 
     Minimises Σ ρ((exposure · picture(heights) + offset - target) / noise) + Σ ((heights - prior) / prior_std)² / 2
     + Σ (Laplacian / smoothness)² / 2 over the heights and what else is unknown, from coarse to fine, by Levenberg-Marquardt
-    steps that never form a matrix. Every term is in standard deviations, so that the result's are those of the heights.
+    steps that never form a dense matrix. Every term is in standard deviations, so that the result's are those of the heights.
 
     The derivative is `render`'s, which knows that shadows, silhouettes and the terrain's border move where the settings ask
     for it by `edge_samples`. What shows in nothing (the height of a plain under a vertical view) stays where it began.

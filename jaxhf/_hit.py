@@ -192,15 +192,16 @@ def surface_interaction(grid: Grid, ray: Ray, found: CellHit, near_surface: bool
     normals = None if grid.normals is None else triangle_corners(grid.normals, nx, *place)
     if grid.perturbation is not None:
         heights = _moved(heights, grid.perturbation.heights)
-        normals = None if normals is None else _moved(normals, grid.perturbation.normals)
+        if normals is not None and grid.perturbation.normals is not None:
+            normals = _moved(normals, grid.perturbation.normals)
     plane = plane_through(heights, found.upper)
     met = found.status == int(Status.HIT)
     return only_where(met, functools.partial(_interaction, near_surface), grid, ray, found, plane, normals)
 
 
-def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array | None) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     a, b, c = corners
-    return corners if by is None else (a + by[0], b + by[1], c + by[2])
+    return a + by[0], b + by[1], c + by[2]
 
 
 def _interaction(

@@ -107,12 +107,19 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int) -> L
     drawn = None
     if key is not None and sources(world, settings):
         drawn = draw_boundaries(world, camera, settings, key, mesh)
-    chunk = functools.partial(_samples, settings, channels)
-    light, slopes, places = map_over(mesh, chunk, (world, camera), _points(camera, settings, drawn))
+    points = _points(camera, settings)
+    shade = functools.partial(_all_samples, world, camera, mesh, channels)
+    exact = dataclasses.replace(settings, detail=None)
+    if drawn is None:
+        light, slopes, places = shade(settings, points)
+    elif settings == exact:  # one program for both
+        light, slopes, places = shade(settings, _in_a_row(points, _finer_points(camera, settings, drawn)))
+    else:
+        light, slopes, places = _in_a_row(shade(settings, points), shade(exact, _finer_points(camera, settings, drawn)))
     image, edges = _in_pixels(light, camera, settings), None
     if drawn is not None:
-        points = functools.partial(_edge_points, settings, channels)
-        edge_slopes, edge_places = map_over(mesh, points, (world, camera), (drawn.points, drawn.flows))
+        followed = functools.partial(_edge_points, settings, channels)
+        edge_slopes, edge_places = map_over(mesh, followed, (world, camera), (drawn.points, drawn.flows))
         edges = LinearisedEdges(edge_slopes, edge_places, drawn.place, drawn.pixels)
     return Linearised(image, slopes, places, edges)
 
@@ -124,9 +131,10 @@ def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) ->
     change = _in_pixels(moved, scene.camera, settings)
     if known.edges is not None:
         edges, flat = known.edges, change.reshape(-1, change.shape[-1])
-        tiling, shape = Tiling(scene.camera, settings), (edges.pixels.shape[0], finer_side(settings) ** 2)
-        finer = moved.reshape(-1, moved.shape[-1])[tiling.count * (settings.samples or 1) * moved.shape[1] :]
-        finer = finer[: shape[0] * shape[1]].reshape(*shape, -1).mean(1)
+        tiling, samples = Tiling(scene.camera, settings), settings.samples
+        assert samples is not None
+        shape = (edges.pixels.shape[0], finer_side(settings) ** 2)
+        finer = moved[tiling.count * samples :].reshape(-1, moved.shape[-1])[: shape[0] * shape[1]].reshape(*shape, -1).mean(1)
         heights = at_vertices[:, 0].at[edges.places].get(mode="promise_in_bounds")
         light = jnp.moveaxis(jnp.sum(edges.slopes * heights[:, None], axis=2), 1, -1)
         flat = flat.at[edges.pixels].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, flat.shape[1]))
@@ -136,7 +144,8 @@ def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) ->
 
 def _in_pixels(values: Float[jax.Array, "chunks lanes c"], camera: Camera, settings: Settings) -> Float[jax.Array, "h w c"]:
     """The means over the samples of each pixel."""
-    tiling, samples = Tiling(camera, settings), settings.samples or 1
+    tiling, samples = Tiling(camera, settings), settings.samples
+    assert samples is not None
     tiles = values[: tiling.count * samples].reshape(tiling.count, samples, *values.shape[1:])
     return tiling.assemble(tiles.sum(1) / samples)
 
@@ -145,31 +154,42 @@ def _channels(light: Float[jax.Array, "*rest 3"], channels: int) -> Float[jax.Ar
     return light if channels == 3 else jnp.mean(light, axis=-1, keepdims=True)
 
 
-def _points(camera: Camera, settings: Settings, boundaries: Boundaries | None) -> tuple[jax.Array, jax.Array]:
-    """Where in the picture its samples are, (chunks, lanes) each: tile by tile, then those of the pixels looked at again."""
+def _in_a_row(*parts: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    return tuple(jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
+
+
+def _points(camera: Camera, settings: Settings) -> tuple[jax.Array, ...]:
+    """Where in the picture its samples are, x and y, (chunks, lanes) each, tile by tile."""
     tiling, dtype = Tiling(camera, settings), camera.world_from_camera.dtype
     assert settings.samples is not None
     pixels = jax.vmap(tiling.pixels)(jnp.arange(tiling.count, dtype=jnp.int32))
     offsets = sample_offset(jnp.arange(settings.samples, dtype=jnp.int32), math.isqrt(settings.samples), dtype)
     lanes = tiling.side * tiling.side
-    x, y = (
+    return tuple(
         (pixel.astype(dtype)[:, None, :] + offset[None, :, None]).reshape(-1, lanes)
         for pixel, offset in zip(pixels, offsets, strict=True)
     )
-    if boundaries is None:
-        return x, y
+
+
+def _finer_points(camera: Camera, settings: Settings, boundaries: Boundaries) -> tuple[jax.Array, ...]:
+    """The same for the pixels that are looked at again, one after the other."""
+    lanes = Tiling(camera, settings).side ** 2
     samples = finer_side(settings) ** 2
     repeated = jnp.repeat(boundaries.pixels, samples)
     numbers = jnp.tile(jnp.arange(samples, dtype=jnp.int32), boundaries.pixels.shape[0])
-    more = (
+    return tuple(
         jnp.pad(values, (0, -values.shape[0] % lanes), mode="edge").reshape(-1, lanes)
         for values in finer_points(camera, settings, repeated, numbers)
     )
-    x, y = (jnp.concatenate(pair) for pair in zip((x, y), more, strict=True))
-    return x, y
 
 
-def _samples(settings: Settings, channels: int, seen: tuple[World, Camera], points: tuple[jax.Array, jax.Array]):
+def _all_samples(
+    world: World, camera: Camera, mesh: Mesh, channels: int, settings: Settings, points: tuple[jax.Array, ...]
+) -> tuple[jax.Array, ...]:
+    return map_over(mesh, functools.partial(_samples, settings, channels), (world, camera), points)
+
+
+def _samples(settings: Settings, channels: int, seen: tuple[World, Camera], points: tuple[jax.Array, ...]):
     """Light at points of the picture, (lanes, c), its derivatives and in what: see `Linearised`."""
     world, camera = seen
     x, y = points

@@ -23,6 +23,7 @@ Solver = Literal["lm", "bfgs", "lbfgs", "adam"]
 # BFGS keeps a dense matrix of this many rows at most: 128 MiB in double precision.
 BFGS_UNKNOWNS = 4096
 _FIRST_DAMPING = 1e-2
+_SHORTER = 0.25  # by how much 1 / λ changes at a rejected step, the first in a row
 # Of LSMR, as a share of the matrix's Frobenius norm. That is far above what a height changes that no picture shows: where a
 # prior is to say how high it is, such heights wandered off with 1e-3, and came back over twice as many steps as with 1e-4.
 _INNER_TOLERANCE = 1e-3
@@ -31,7 +32,7 @@ _RATE = 0.02  # of Adam, in units of a wave's usual size
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
-    """Damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963), each solved without a matrix.
+    """Damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963), each solved without a dense matrix.
 
     optimistix's own class is the same with a dense QR decomposition, and lowers the damping only where a step did at
     least 99 % of what was predicted, which a picture with shadows hardly ever lets it.
@@ -51,7 +52,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         # LSMR (Fong and Saunders 2011) works on J itself; conjugate gradients on JᵀJ, whose condition is squared, went
         # non-finite in single precision. Its limit on the condition is lifted: the damping bounds it.
         self.descent = optx.DampedNewtonDescent(lx.LSMR(rtol=inner_tolerance, atol=0.0, max_steps=inner_steps, conlim=1e16))
-        self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=4.0, low_constant=0.25)
+        self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=4.0, low_constant=_SHORTER)
         self.verbose = _silent
 
 
@@ -93,6 +94,16 @@ class BFGS(optx.AbstractBFGS):
             lambda info: info.hessian_inv, f_info, jax.tree.map(lambda leaf: factor * leaf, f_info.hessian_inv)
         )
         return super().update_hessian(y, y_eval, scaled, f_eval_info, None)[0], hessian_update_state & ~curved
+
+
+def impatient(solver: Any, rejected: int) -> Any:
+    """The solver for a step after so many rejections in a row: the next one raises λ by twice as much as the last.
+
+    (Nielsen, Damping parameter in Marquardt's method, 1999.) Solvers without a λ stay as they are.
+    """
+    if not isinstance(solver, LevenbergMarquardt):
+        return solver
+    return eqx.tree_at(lambda solver: solver.search.low_constant, solver, jnp.asarray(_SHORTER / 2**rejected))
 
 
 def _silent(**_: Any) -> None:
@@ -152,11 +163,6 @@ def _with_step_size(state: Any, step_size: Float[Array, ""]) -> Any:
     return eqx.tree_at(lambda state: state.search_state.step_size, state, step_size)
 
 
-def more_damped(state: Any, factor: float) -> Any:
-    """A state of Levenberg-Marquardt with λ times a factor."""
-    return _with_step_size(state, state.search_state.step_size / factor)
-
-
 def restarted(fresh: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None = None) -> Any:
     """A state that stands at `unknowns` and knows nothing of its surroundings yet; `fresh` is what `begin` made.
 
@@ -171,7 +177,7 @@ def restarted(fresh: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None
 def advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tuple[Unknowns, Any, Outcome]:
     """One step: a trial of new unknowns, which are accepted or not."""
     problem = linearised(getattr(state, "y_eval", unknowns), problem)  # where the residuals are going to be asked for
-    return _advance(solver, *on_every_device((unknowns, state, problem), problem.mesh))
+    return _advance(*on_every_device((solver, unknowns, state, problem), problem.mesh))
 
 
 @eqx.filter_jit

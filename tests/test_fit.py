@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -232,6 +233,27 @@ def test_exposures_and_offsets_come_back_apart():
     # They trade against each other where slopes are small: after 40 steps they are off by 0.8 % and 0.0046.
     np.testing.assert_allclose(found.exposures, exposures, rtol=0.015)
     np.testing.assert_allclose(found.offsets, offsets, atol=0.008)
+
+
+def test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption(tmp_path):
+    """Twice as much as the one before. Where it starts there is nothing left to gain."""
+    targets = [np.asarray(jaxhf.render(scene, SETTINGS)) for scene in scenes()]
+    options: dict[str, Any] = {"settings": SETTINGS, "levels": [1.0], "tolerance": 1e-30}
+    whole = jaxhf.fit(scenes(), targets, **options)
+    assert whole.result is jaxhf.Stop.STALLED
+    assert [step.accepted for step in whole.history[-6:]] == [True] + 5 * [False]
+    damping = np.array([step.damping for step in whole.history[-6:]])
+    np.testing.assert_allclose(damping[1:] / damping[:-1], [4, 8, 16, 32, 64], rtol=1e-12)
+
+    def interrupt(step):
+        if step.step == len(whole.history) - 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        jaxhf.fit(scenes(), targets, checkpoint=tmp_path / "kept", progress=interrupt, **options)
+    resumed = jaxhf.fit(scenes(), targets, checkpoint=tmp_path / "kept", resume=True, **options)
+    assert [step[:-1] for step in resumed.history] == [step[:-1] for step in whole.history]
+    np.testing.assert_array_equal(resumed.heights, whole.heights)
 
 
 def test_a_fit_that_stalls_says_so_and_keeps_the_best(targets, monkeypatch):

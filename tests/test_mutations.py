@@ -160,8 +160,8 @@ MUTATIONS = {
     ),
     "sign of the damping": Mutation(
         "_solvers.py",
-        "high_constant=4.0, low_constant=0.25",
-        "high_constant=0.25, low_constant=4.0",
+        "high_constant=4.0, low_constant=_SHORTER",
+        "high_constant=_SHORTER, low_constant=4.0",
         "test_fit.py::test_heights_come_back_from_a_flat_start",
     ),
     "constant wave at the last level only": Mutation(
@@ -175,6 +175,12 @@ MUTATIONS = {
         "and loss <= self.best[0]",
         "and loss <= math.inf",
         "test_fit.py::test_a_fit_that_stalls_says_so_and_keeps_the_best",
+    ),
+    "impatience": Mutation(
+        "_descent.py",
+        "solver = impatient(self.solver, self._rejected())",
+        "solver = impatient(self.solver, 0)",
+        "test_fit.py::test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption",
     ),
     "stalling": Mutation(
         "_descent.py",
