@@ -64,7 +64,12 @@ def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
     ("which", "settings", "channels"),
     [
         ("one", jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3),
-        ("one", jaxhf.Settings(samples=1, chunk=256, edge_samples=300, detail=0.5, shading="flat"), 1),
+        pytest.param(
+            "one",
+            jaxhf.Settings(samples=1, chunk=256, edge_samples=300, detail=0.5, shading="flat"),
+            1,
+            marks=pytest.mark.slow,
+        ),
         ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat", detail=0.5), 1),
     ],
     ids=["smooth with edges", "with edges, near the surface", "flat, near the surface, several objects"],
