@@ -215,15 +215,13 @@ def deciding_vertices(world: World, point: EdgePoint) -> Int[jax.Array, "5"]:
 
     The edge's two; and the three of the triangle on which its shadow falls.
     """
-    places, before = jnp.zeros(5, jnp.int32), 0
-    for k, (surface, vertices) in enumerate(zip(world.surfaces, world.vertices, strict=True)):
-        if isinstance(surface, Grid):
-            cell = _receiving_cell(surface, point)
-            ends = jnp.clip(jnp.stack(_ends(surface, point)), 0, vertices - 1)
-            triangle = jnp.stack(triangle_places(surface.shape[1], cell[0], cell[1], point.upper))
-            here = jnp.stack([point.surface == k] * 2 + [point.receiver == k] * 3)
-            places = jnp.where(here, before + jnp.concatenate([ends, triangle]), places)
-        before += vertices
+    places = jnp.zeros(5, jnp.int32)
+    for k, grid, before in world.grids:
+        cell = _receiving_cell(grid, point)
+        ends = jnp.clip(jnp.stack(_ends(grid, point)), 0, grid.rows.shape[0] - 1)
+        triangle = jnp.stack(triangle_places(grid.shape[1], cell[0], cell[1], point.upper))
+        here = jnp.stack([point.surface == k] * 2 + [point.receiver == k] * 3)
+        places = jnp.where(here, before + jnp.concatenate([ends, triangle]), places)
     return places
 
 

@@ -216,13 +216,10 @@ def _samples(settings: Settings, channels: int, seen: tuple[World, Camera], poin
 
 def _places(world: World, vertex: Vertex) -> Int[jax.Array, "3"]:
     """The numbers of the vertices of the triangle that was hit, over all surfaces; any that there are where there is none."""
-    places, before = jnp.zeros(3, jnp.int32), 0
-    for k, (surface, vertices) in enumerate(zip(world.surfaces, world.vertices, strict=True)):
-        if isinstance(surface, Grid):
-            cell = vertex.hit.cell
-            here = triangle_places(surface.shape[1], cell[0], cell[1], vertex.hit.triangle == 1)
-            places = jnp.where(vertex.index == k, before + jnp.stack(here), places)
-        before += vertices
+    places, cell = jnp.zeros(3, jnp.int32), vertex.hit.cell
+    for k, grid, before in world.grids:
+        here = triangle_places(grid.shape[1], cell[0], cell[1], vertex.hit.triangle == 1)
+        places = jnp.where(vertex.index == k, before + jnp.stack(here), places)
     return places
 
 
@@ -245,7 +242,7 @@ def _edge_points(
 
 def _at_vertices(world: World) -> Float[jax.Array, "vertices n"]:
     """Heights and, with smooth shading, the normals' components, over all surfaces."""
-    grids = [surface for surface in world.surfaces if isinstance(surface, Grid)]
+    grids = [grid for _, grid, _ in world.grids]
     heights = jnp.concatenate([grid.rows for grid in grids])[:, None]
     normals = [grid.normals for grid in grids if grid.normals is not None]
     return jnp.concatenate([heights, jnp.concatenate(normals)], axis=1) if normals else heights

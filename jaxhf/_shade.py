@@ -37,9 +37,14 @@ class World(eqx.Module):
     lights: tuple[Light, ...]
 
     @property
-    def vertices(self) -> tuple[int, ...]:
-        """How many vertices each surface has; a cylinder has none."""
-        return tuple(surface.shape[0] * surface.shape[1] if isinstance(surface, Grid) else 0 for surface in self.surfaces)
+    def grids(self) -> tuple[tuple[int, Grid, int], ...]:
+        """Of each grid: which surface it is, the grid, and the number of its first vertex, counted over all surfaces."""
+        found, first = [], 0
+        for k, surface in enumerate(self.surfaces):
+            if isinstance(surface, Grid):
+                found.append((k, surface, first))
+                first += surface.rows.shape[0]
+        return tuple(found)
 
 
 def make_world(scene: Scene, settings: Settings) -> World:
