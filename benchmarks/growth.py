@@ -1,11 +1,11 @@
 """How time and memory grow with heights, pixels, samples, pictures and devices: one table, one page of plots, the exponents.
 
 Each point is a process of its own, so that its peak of memory is its own. One quantity varies, the others stay at 1024 x 1024
-heights, 512 x 512 pixels, one sample, one picture, all cores, in the view of camera B of forward.py (fewer cores where a
-terrain does not fit into memory once for each). The terrain is a sum of
-waves, from the whole side down to eight cells, which takes no memory beyond its heights. "frame" is from new heights to the
-picture, "prepared" has their normals and bounds at hand; several pictures are seen from several places. An exponent e says
-that a cost grows as quantity ** e: the slope of the logarithms over the upper half of the points.
+heights, 512 x 512 pixels, one sample, one picture, all cores, in the view of camera B of forward.py. All heights have as
+many cores as the largest terrain fits into memory for, once for each. The terrain is a sum of waves, from the whole side down
+to eight cells, which takes no memory beyond its heights. "frame" is from new heights to the picture, "prepared" has their
+normals and bounds at hand; several pictures are seen from several places. An exponent e says that a cost grows as
+quantity ** e: the slope of the logarithms over the upper half of the points.
 """
 
 import argparse
@@ -20,12 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxhf._worker import MeasurementError, Worker, peak_mb, serve, timed
+from jaxhf._worker import MeasurementError, Worker, available_bytes, peak_mb, serve, timed
 
 BASE = {"heights": 1024, "pixels": 512, "samples": 1, "images": 1}
 UNITS = {"heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores"}
 # At the peak, for each device, which has the scene to itself: 54 to 63 measured with one, 107 with two.
 BYTES_A_HEIGHT = 66
+# Measured on two cores: what all points of a quantity take besides their repeats, and what one repeat of all takes.
+SECONDS = {"heights": (150, 30), "pixels": (120, 45), "samples": (60, 15), "images": (70, 7), "devices": (30, 1)}
 
 
 def waves(size: int, count: int = 48) -> np.ndarray:
@@ -96,7 +98,7 @@ def measure(quantity: str, value: int, cores: list[int], repeats: int) -> dict[s
         prepared = [worker.ask("prepared")["seconds"] for _ in range(repeats)]
     count = value**2 if quantity in ("heights", "pixels") else value
     return {
-        "quantity": quantity, "value": value, "count": count, "frame": float(np.median(frames)),
+        "quantity": quantity, "value": value, "count": count, "devices": len(used), "frame": float(np.median(frames)),
         "prepared": float(np.median(prepared)), "peak_mb": peak,
     }  # fmt: skip
 
@@ -109,17 +111,18 @@ def exponent(points: list[dict[str, Any]], cost: str) -> float:
 
 
 def table(points: list[dict[str, Any]]) -> str:
-    lines = ["| | frame, s | prepared, s | peak, MiB |", "|---|---|---|---|"]
+    lines = ["| | cores | frame, s | prepared, s | peak, MiB |", "|---|---|---|---|---|"]
     for quantity in dict.fromkeys(point["quantity"] for point in points):
         mine = [point for point in points if point["quantity"] == quantity]
         for point in mine:
             name = f"{point['value']}²" if quantity in ("heights", "pixels") else str(point["value"])
             lines.append(
-                f"| {name} {UNITS[quantity]} | {point['frame']:.3g} | {point['prepared']:.3g} | {point['peak_mb']:.0f} |"
+                f"| {name} {UNITS[quantity]} | {point['devices']} | {point['frame']:.3g} | {point['prepared']:.3g} | "
+                f"{point['peak_mb']:.0f} |"
             )
         if len(mine) > 1:
             slopes = " | ".join(f"**{exponent(mine, cost):.2f}**" for cost in ("frame", "prepared", "peak_mb"))
-            lines.append(f"| **exponent of {UNITS[quantity]}** | {slopes} |")
+            lines.append(f"| **exponent of {UNITS[quantity]}** | | {slopes} |")
     return "\n".join(lines)
 
 
@@ -154,12 +157,6 @@ def whole_decades(values: list[float]) -> tuple[float, float]:
     return 10 ** math.floor(math.log10(min(values))), 10 ** math.ceil(math.log10(max(values)))
 
 
-def available_bytes() -> int:
-    """Of memory, caches that the system would give up included (Linux)."""
-    lines = Path("/proc/meminfo").read_text().splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable"))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("growth"), help="growth.json and growth.png go here")
@@ -175,32 +172,28 @@ def main() -> None:
         "images": [1, 2, 4, 8, 16],
         "devices": [n for n in (1, 2, 4, 8, 16) if n <= len(cores)],
     }
-    print("about 12 minutes on two free cores, heights alone 5", flush=True)
+    seconds = sum(SECONDS[quantity][0] + options.repeats * SECONDS[quantity][1] for quantity in options.quantities)
+    print(f"about {math.ceil(seconds / 60)} minutes on two free cores", flush=True)
     options.output.mkdir(parents=True, exist_ok=True)
     points: list[dict[str, Any]] = []
     for quantity in options.quantities:
+        used = cores
+        if quantity == "heights":
+            copies = available_bytes() / BYTES_A_HEIGHT
+            values[quantity] = [value for value in values[quantity] if value**2 <= copies]
+            largest = values[quantity][-1]
+            used = cores[: min(len(cores), int(copies / largest**2))]
+            print(f"heights up to {largest}², on {len(used)} cores: as many as memory holds copies for", flush=True)
         for value in values[quantity]:
-            used = cores
-            if quantity == "heights":
-                needed, free = BYTES_A_HEIGHT * value**2, available_bytes()
-                if needed > free:
-                    print(
-                        f"{value}² heights are left out: they need {needed / 2**30:.0f} GiB, {free / 2**30:.0f} are free",
-                        flush=True,
-                    )
-                    continue
-                used = cores[: free // needed]
-                if len(used) < len(cores):
-                    print(f"{value}² heights: {len(used)} of {len(cores)} cores, for want of memory", flush=True)
             begin = time.perf_counter()
             try:
                 points.append(measure(quantity, value, used, options.repeats))
+                (options.output / "growth.json").write_text(json.dumps(points, indent=1))
             except MeasurementError as error:
                 print(f"{quantity} {value}: {error}", flush=True)
                 continue
             if sys.stderr.isatty():
                 print(f"{quantity} {value}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
-    (options.output / "growth.json").write_text(json.dumps(points, indent=1))
     plot(points, options.output / "growth.png")
     print(table(points))
 

@@ -1,6 +1,7 @@
-"""The curves that chose the presets: error over samples and over time on four scenes, and what each preset gives there.
+"""The curves that chose the presets: error over samples, over points on edges and over time on four scenes.
 
-Each scene is swept by the command `tradeoff` over its samples alone; what was measured before is not measured again.
+Each scene is swept by the command `tradeoff` over these two knobs alone, the derivative over its points only, with four
+samples; what was measured before is not measured again.
 """
 
 import argparse
@@ -32,23 +33,51 @@ def table(found: dict[str, dict[int, dict[str, float]]]) -> str:
     return "\n".join(lines)
 
 
-def plot(found: dict[str, dict[int, dict[str, float]]], path: Path) -> None:
+def by_points(measured: Sequence[Measured]) -> dict[int, dict[str, float]]:
+    return dict(sorted((int(row.knobs["edge_samples"]), row.figures) for row in measured if row.task == "derivative"))
+
+
+def derivative_table(found: dict[str, dict[int, dict[str, float]]]) -> str:
+    lines = [
+        "| scene | edge points | cosine | relative error | spread | time, of 10 000 points | |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    names = {settings.edge_samples: name for name, settings in PRESETS.items()}
+    for scene, rows in found.items():
+        for points, figures in rows.items():
+            lines.append(
+                f"| {scene} | {points} | {figures['cosine']:.3f} | {figures['relative_error']:.2f} | {figures['spread']:.2f} | "
+                f"{figures['seconds'] / rows[10_000]['seconds']:.2f} | {names.get(points, '')} |"
+            )
+    return "\n".join(lines)
+
+
+def plot(
+    found: dict[str, dict[int, dict[str, float]]], derivatives: dict[str, dict[int, dict[str, float]]], path: Path
+) -> None:
     plt = screenless_pyplot()
-    figure, (by_count, by_time) = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained", sharey=True)
+    figure, (by_count, by_time, by_edges) = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
     for scene, rows in found.items():
         errors = [figures["rmse"] for figures in rows.values()]
         by_count.plot(list(rows), errors, "o-", label=scene)
         by_time.plot([figures["against_base"] for figures in rows.values()], errors, "o-", label=scene)
+    for scene, rows in derivatives.items():
+        errors = [figures["relative_error"] for figures in rows.values()]
+        by_edges.errorbar(list(rows), errors, [figures["spread"] for figures in rows.values()], fmt="o-", label=scene)
     for name, settings in PRESETS.items():
-        by_count.axvline(settings.samples, color="0.7", linestyle=":")
-        by_count.text(settings.samples, 1.0, f" {name}", color="0.4", transform=by_count.get_xaxis_transform(), va="top")
+        for axes, value in ((by_count, settings.samples), (by_edges, settings.edge_samples)):
+            axes.axvline(value, color="0.7", linestyle=":")
+            axes.text(value, 1.0, f" {name}", color="0.4", transform=axes.get_xaxis_transform(), va="top")
     by_count.set(xscale="log", yscale="log", xlabel="samples a pixel", ylabel="RMSE, of the mean radiance")
-    by_time.set(xscale="log", xlabel="time, of that of 4 samples")
+    by_time.set(xscale="log", yscale="log", xlabel="time, of that of 4 samples")
+    by_edges.set(yscale="log", xlabel="points on edges", ylabel="relative error of the derivative")
+    by_edges.set_xscale("symlog", linthresh=1000)
+    by_edges.set_xlim(-100, 400_000)
     by_count.set_xticks([1, 4, 9, 16, 64], ["1", "4", "9", "16", "64"])
     by_count.set_xticks([], minor=True)
     by_count.set_xlim(0.8, 110)
     by_time.legend()
-    for axes in (by_count, by_time):
+    for axes in (by_count, by_time, by_edges):
         axes.grid(True, alpha=0.3)
     figure.savefig(path)
 
@@ -59,16 +88,21 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=240)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    print("four sweeps, about 6 minutes on two free cores", flush=True)
+    print("eight sweeps, about 15 minutes on two free cores", flush=True)
     scenes = Path(__file__).parents[1] / "scenes"
-    found = {}
-    for name in SCENES:
-        sweep: Sweep = plan(scenes / f"{name}.toml", options.output / name, width=options.width, knobs=("samples",))
+    found, derivatives = {}, {}
+
+    def swept(name: str, knob: str) -> list[Measured]:
+        sweep: Sweep = plan(scenes / f"{name}.toml", options.output / name, width=options.width, knobs=(knob,))
         failures = run(sweep, options.repeats, lambda line: print(line, flush=True), lambda done, total, what: None)
         assert not failures, failures
-        found[name] = by_samples(sweep.measured())
-    plot(found, options.output / "presets.png")
-    print(table(found))
+        return sweep.measured()
+
+    for name in SCENES:
+        found[name] = by_samples(swept(name, "samples"))
+        derivatives[name] = by_points(swept(name, "edge_samples"))
+    plot(found, derivatives, options.output / "presets.png")
+    print(table(found), derivative_table(derivatives), sep="\n\n")
 
 
 if __name__ == "__main__":

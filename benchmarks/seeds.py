@@ -7,6 +7,7 @@ the heights in it. Ours is also shown with what comes before the first frame: re
 """
 
 import argparse
+import math
 import os
 import re
 import subprocess
@@ -50,11 +51,14 @@ def serve(folder: Path, name: str, devices: int) -> None:
 
 def pbrt(program: str, scene: Path, cores: set[int]) -> float:
     """Seconds that pbrt-v2 takes to render, by its own progress line, which has one decimal."""
+    ours = os.sched_getaffinity(0)
     with tempfile.TemporaryDirectory() as folder:
         command = [program, "--ncores", str(len(cores)), "--outfile", f"{folder}/out.tga", str(scene.resolve())]
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=True, cwd=folder, preexec_fn=lambda: os.sched_setaffinity(0, cores)
-        )
+        os.sched_setaffinity(0, cores)  # which it inherits
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=folder)
+        finally:
+            os.sched_setaffinity(0, ours)
     said = re.findall(r"Rendering: \[\++\]\s+\(([\d.]+)s\)", done.stdout)
     assert said, f"{scene.name}: pbrt gave no time: {done.stdout[-300:]}{done.stderr[-300:]}"
     return float(said[-1])
@@ -89,6 +93,8 @@ def main() -> None:
         serve(options.folder, options.serve, options.devices)
         return
     everything = os.sched_getaffinity(0)
+    minutes = math.ceil(len(options.scenes) * (35 + 2 * options.repeats * (2 if options.pbrt else 1)) / 60)
+    print(f"about {minutes} minutes on two free cores", flush=True)
     rows: dict[str, list[float]] = {}
     for name in options.scenes:
         for cores in ({min(everything)}, everything):

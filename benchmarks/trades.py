@@ -56,31 +56,37 @@ def with_stored_triangles() -> None:
     import equinox as eqx
     import jax
 
-    from jaxhf import _grid, _shade, _walk
+    from jaxhf import _grid, _hit, _shade, _walk
 
     class Triangles(eqx.Module):
         heights: jax.Array
 
-    corners, make_grid = _grid.corners, _shade.make_grid
+    corners, triangle_corners, make_grid = _grid.corners, _grid.triangle_corners, _shade.make_grid
+
+    def at(triangles: Triangles, place: Any) -> jax.Array:
+        return triangles.heights.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
     def corners_of(values: Any, nx: int, ix: jax.Array, iy: jax.Array) -> tuple[jax.Array, ...]:
         if not isinstance(values, Triangles):
             return corners(values, nx, ix, iy)
         first = 6 * (iy * (nx - 1) + ix)
+        return tuple(at(values, first + further) for further in (0, 1, 4, 2))
 
-        def at(k: int) -> jax.Array:
-            return values.heights.at[first + k].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-        return at(0), at(1), at(5), at(2)
+    def triangle_corners_of(values: Any, nx: int, ix: jax.Array, iy: jax.Array, upper: jax.Array) -> tuple[jax.Array, ...]:
+        if not isinstance(values, Triangles):
+            return triangle_corners(values, nx, ix, iy, upper)
+        first = 6 * (iy * (nx - 1) + ix) + 3 * upper.astype(ix.dtype)
+        return tuple(at(values, first + further) for further in (0, 1, 2))
 
     def grid_of(*arguments: Any, **options: Any) -> Any:
         grid = make_grid(*arguments, **options)
         z = grid.z
         z00, z10, z01, z11 = z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]
-        stored = jax.numpy.stack([z00, z10, z11, z00, z11, z01], -1).reshape(-1)
+        stored = jax.numpy.stack([z00, z10, z11, z00, z01, z11], -1).reshape(-1)
         return eqx.tree_at(lambda grid: grid.rows, grid, Triangles(stored))
 
     _grid.corners = _walk.corners = corners_of
+    _grid.triangle_corners = _hit.triangle_corners = triangle_corners_of
     _shade.make_grid = grid_of
 
 
@@ -171,7 +177,7 @@ def main() -> None:
         if not (options.folder / f"{name}.pbrt").is_file():
             parser.error(f"{options.folder / name}.pbrt: there is no such file")
     cores = sorted(os.sched_getaffinity(0))[: options.cores]
-    print(f"about {len(options.scenes) * len(options.variants) / 3:.0f} minutes", flush=True)
+    print(f"about {len(options.scenes) * len(options.variants) / 4:.0f} minutes", flush=True)
     rows: list[dict[str, Any]] = []
     for name in options.scenes:
         rows += measure(options.folder / f"{name}.pbrt", cores, options.repeats, options.variants)

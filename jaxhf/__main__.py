@@ -1,6 +1,7 @@
 """The command line. JAX is imported only when a command runs."""
 
 import argparse
+import shutil
 import sys
 import time
 from collections.abc import Sequence
@@ -54,7 +55,9 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--max-depth", type=int, metavar="N", help="mirror bounces [4]")
     render.add_argument("--max-steps", type=int, metavar="N", help="step budget of a walk [as many as any ray needs]")
     render.add_argument("--chunk", type=int, metavar="RAYS", help="rays traced together [1024]")
-    render.add_argument("--detail", type=float, metavar="PIXELS", help="by how much hits may be off [they are exact]")
+    render.add_argument(
+        "--detail", type=float, metavar="PIXELS", help="how far from its ray a hit may be seen [off: hits are exact]"
+    )
     _add_machine(render)
     render.set_defaults(run=_render)
 
@@ -125,14 +128,14 @@ def _fit(options: argparse.Namespace) -> None:
 
 def _set_up_jax(precision: str, devices: int | None) -> None:
     """What can only be said before JAX is first used."""
-    import os
-
     import jax
+
+    from ._worker import usable_cores
 
     if devices is not None and devices < 1:
         raise ValueError(f"--devices must be a whole number from 1 on, it is {devices}")
     jax.config.update("jax_enable_x64", precision == "float64")
-    jax.config.update("jax_num_cpu_devices", devices or min(len(os.sched_getaffinity(0)), 16))
+    jax.config.update("jax_num_cpu_devices", devices or min(usable_cores(), 16))
 
 
 def _settings(options: argparse.Namespace) -> "Settings":
@@ -267,15 +270,19 @@ def _tradeoff(options: argparse.Namespace) -> None:
     with _Counter() as counter:
         failures = run(sweep, options.repeats, counter.tell, counter)
     measured = sweep.measured()
+    if failures:
+        print("\n".join(f"failed: {failure}" for failure in failures), file=sys.stderr)
+    if not measured:
+        raise ValueError(f"{sweep.path}: nothing could be measured")
     plot = save_plot(sweep, measured)
     asks = options.error is not None or options.time is not None
     if options.markdown:
-        print(markdown(measured))
+        print(markdown(measured), end="\n\n")
     if asks or not options.markdown:
         print("\n".join(recommend(measured, options.error, options.time) if asks else front_lines(measured)))
     print(f"{len(measured)} configurations: {sweep.table}, {plot}")
     if failures:
-        raise ValueError(f"{len(failures)} configurations failed; the first: {failures[0]}")
+        raise ValueError(f"{len(failures)} configurations failed")
 
 
 class _Counter:
@@ -283,11 +290,12 @@ class _Counter:
 
     def __call__(self, done: int, total: int, what: str) -> None:
         if sys.stderr.isatty():
-            print(f"\r\033[K{done}/{total} {what}", end="", file=sys.stderr, flush=True)
+            line = f"{done}/{total} {what}"[: shutil.get_terminal_size().columns - 1]  # longer ones would stay
+            print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
 
     def tell(self, line: str) -> None:
         self._clear()
-        print(line, flush=True)
+        print(line, file=sys.stderr, flush=True)  # what is printed else may be a table on its way into a file
 
     def _clear(self) -> None:
         if sys.stderr.isatty():

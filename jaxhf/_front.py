@@ -1,5 +1,6 @@
 """What a sweep's figures say: which settings none beats, which to take for an error or a time, and all of them as tables."""
 
+import math
 from collections.abc import Iterator, Sequence
 
 from ._settings import Settings
@@ -70,7 +71,7 @@ def _as_settings(row: Measured) -> str:
     for name in SETTINGS:
         value = row.knobs[name]
         if value != str(getattr(defaults, name)):
-            changed[name] = value if value.lstrip("-").isdigit() or value in ("True", "False", "None") else f'"{value}"'
+            changed[name] = value if value in ("True", "False", "None") or _number(value) < math.inf else f'"{value}"'
     options = [f"tolerance={row.knobs['tolerance']}", f"levels {row.knobs['levels']}"] if row.task == "fit" else []
     return ", ".join(
         [f"Settings({', '.join(f'{name}={value}' for name, value in changed.items())})", row.knobs["precision"], *options]
@@ -79,10 +80,10 @@ def _as_settings(row: Measured) -> str:
 
 _HEADS = {
     "picture": ("RMSE", "99.9 %", "wrong hits"),
-    "derivative": ("cosine", "relative error"),
+    "derivative": ("cosine", "relative error", "spread"),
     "fit": ("RMSE of the heights",),
 }
-_COLUMNS = {"picture": ("rmse", "p999", "wrong_hits"), "derivative": ("cosine", "relative_error"), "fit": ("rmse",)}
+_COLUMNS = {"picture": ("rmse", "p999", "wrong_hits"), "derivative": ("cosine", "relative_error", "spread"), "fit": ("rmse",)}
 
 
 def markdown(measured: Sequence[Measured]) -> str:
@@ -128,4 +129,4 @@ def _number(value: str) -> float:
     try:
         return float(value)
     except ValueError:
-        return float("inf")
+        return math.inf

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from ._tradeoff import COLUMNS, FIGURES, FINEST_DERIVATIVE, Configuration, Sweep, describe
-from ._worker import MeasurementError, Worker
+from ._worker import MeasurementError, Worker, available_bytes
 from .io._sweep import append_row, load_reference
+
+_SWOLLEN = 3  # the peak of a derivative's process, of a picture's
 
 
 def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Callable[[int, int, str], None]) -> list[str]:
@@ -26,10 +28,10 @@ def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Calla
       progress: called with (done, of how many, what now).
 
     Returns:
-      What failed, a line each: processes that died.
+      What failed, a line each: processes that died. Where that of the derivative's reference did, no derivative is measured.
 
     Raises:
-      MeasurementError: the base or the reference failed.
+      MeasurementError: the base or the picture's reference failed.
     """
     missing = sweep.missing()
     if not missing:
@@ -40,7 +42,7 @@ def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Calla
     progress(0, len(missing), "the base")
     begin = time.perf_counter()
     with Worker("jaxhf._measure", _job(sweep, base)) as yardstick:
-        yardstick.answer()
+        peak_mb = yardstick.answer()["peak_mb"]
         start = time.perf_counter() - begin
         frame = yardstick.ask("frame")["seconds"]
         minutes = _minutes(sweep, missing, start, frame, repeats)
@@ -48,14 +50,24 @@ def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Calla
             f"{sweep.path}: {len(missing)} of {len(sweep.configurations)} configurations to measure, "
             f"{sweep.width} x {sweep.height} pixels; about {minutes} minutes"
         )
-        _ensure_reference(sweep, lambda what: progress(0, len(missing), what))
-        together = _together(sweep)
+        for task in _lacking_references(sweep, missing):
+            progress(0, len(missing), f"the {task}'s reference, in double precision")
+            try:
+                _make_reference(sweep, task)
+            except MeasurementError as error:
+                if task == "picture":
+                    raise
+                failures.append(f"{task}, the reference, and so all else of it: {error}")
+                missing = [one for one in missing if one.task != task]
+        together = max(1, int(min(_together(sweep), available_bytes() / 2**20 / (_SWOLLEN * peak_mb))))
         for done in range(0, len(missing), together):
             batch = missing[done : done + together]
             names = [describe(one.task, one.knobs, base.knobs) for one in batch]
             progress(done, len(missing), "; ".join(names))
             for configuration, name, figures in zip(batch, names, _measure(sweep, batch, yardstick, repeats), strict=True):
                 if isinstance(figures, MeasurementError):
+                    if configuration == base:
+                        raise figures
                     failures.append(f"{name}: {figures}")
                     continue
                 row = {"identity": sweep.identity, "task": configuration.task, **configuration.knobs}
@@ -131,22 +143,20 @@ def _job(sweep: Sweep, configuration: Configuration) -> dict[str, Any]:
     }
 
 
-def _ensure_reference(sweep: Sweep, progress: Callable[[str], None]) -> None:
-    """One that is there and is this sweep's has all parts that its configurations need, or is made again."""
-    base = sweep.configurations[0]
-    parts: dict[str, dict[str, Any]] = {"picture": {"samples": sweep.reference_samples}}
-    needed = {"picture", "hits"}
-    if any(configuration.task == "derivative" for configuration in sweep.configurations):
-        parts["derivative"] = FINEST_DERIVATIVE
-        needed.add("gradient")
+def _lacking_references(sweep: Sweep, missing: Sequence[Configuration]) -> list[str]:
+    """Of which tasks a reference is to be made; one of another scene, or damaged, does not count."""
     try:
-        if needed <= load_reference(sweep.reference, sweep.identity).keys():
-            return
+        there = load_reference(sweep.reference, sweep.identity).keys()
     except (FileNotFoundError, ValueError):
-        pass  # of another scene, or damaged: it is made again
-    progress(f"the reference, in double precision, {sweep.reference_samples} samples a pixel")
-    job = _job(sweep, dataclasses.replace(base, precision="float64"))
-    with Worker("jaxhf._measure", job | {"task": "reference", "parts": parts}) as worker:
+        there = frozenset()
+    tasks = {one.task for one in missing}
+    return [task for task, part in (("picture", "hits"), ("derivative", "gradient")) if task in tasks and part not in there]
+
+
+def _make_reference(sweep: Sweep, task: str) -> None:
+    finest = {"samples": sweep.reference_samples} if task == "picture" else FINEST_DERIVATIVE
+    job = _job(sweep, dataclasses.replace(sweep.configurations[0], precision="float64"))
+    with Worker("jaxhf._measure", job | {"task": "reference", "of": task, "finest": finest}) as worker:
         worker.answer()
 
 
@@ -159,7 +169,9 @@ def _minutes(sweep: Sweep, missing: Sequence[Configuration], start: float, frame
         share = (one.settings.samples or 1) / samples * (2 if one.precision == "float64" else 1)
         runs += (repeats + 1) * frame * (1 + (share if one.task == "picture" else 1))
     total = starts / _together(sweep) + runs
-    if not sweep.reference.exists():
+    lacking = _lacking_references(sweep, missing)
+    if "picture" in lacking:
         total += 2 * start + 2 * frame * sweep.reference_samples / samples
-        total += 8 * start if any(one.task == "derivative" for one in sweep.configurations) else 0
+    if "derivative" in lacking:
+        total += 8 * start
     return max(1, math.ceil(total / 60))

@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import importlib.metadata
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from ._measure import resized
 from ._render import settle
 from ._scene import Scene
 from ._settings import Settings
+from ._worker import usable_cores
 from .io import PathLike, load_scene
 from .io._sweep import read_rows
 
@@ -27,7 +27,7 @@ SETTINGS = tuple(field.name for field in dataclasses.fields(Settings))
 KNOBS = ("precision", *SETTINGS, "tolerance", "levels")
 FIGURES = (
     "seconds", "fastest", "cpu_seconds", "against_base", "compile_seconds", "peak_mb",
-    "rmse", "p999", "wrong_hits", "cosine", "relative_error",
+    "rmse", "p999", "wrong_hits", "cosine", "relative_error", "spread",
 )  # fmt: skip
 COLUMNS = ("identity", "task", *KNOBS, *FIGURES)
 
@@ -101,9 +101,10 @@ class Measured:
       task: as in `Configuration`.
       knobs: as `Configuration.knobs`.
       figures: those of `FIGURES` that the task has. against_base: how long a warm run takes, as the median of its ratios to
-        runs of the base in between. seconds: that times the base's own median. fastest: the least by the clock. cpu_seconds:
-        the median, of all cores together. compile_seconds: what the first run took beyond a warm one. peak_mb: the process's
-        largest size, MiB. rmse, p999, wrong_hits, cosine, relative_error: see docs/tradeoff.md.
+        runs of the base in between. seconds: that times the base's own median; in the table on the disk, the median itself.
+        fastest: the least by the clock. cpu_seconds: the median, of all cores together. compile_seconds: what the first run
+        took beyond a warm one. peak_mb: the process's largest size, MiB. rmse, p999, wrong_hits, cosine, relative_error,
+        spread: see docs/tradeoff.md.
     """
 
     task: str
@@ -144,7 +145,8 @@ class Sweep:
 
     @property
     def reference_samples(self) -> int:
-        return FINEST // 4 if self.quick else FINEST
+        """Four times the base's at least, else its error would be that of rounding."""
+        return max(FINEST // 4 if self.quick else FINEST, 4 * (self.configurations[0].settings.samples or 1))
 
     def measured(self) -> list[Measured]:
         """What the table holds of this sweep, in the sweep's order."""
@@ -155,7 +157,8 @@ class Sweep:
             if row is not None:
                 figures = {name: float(row[name]) for name in FIGURES if row[name]}
                 found.append(Measured(configuration.task, configuration.knobs, figures))
-        base = next((row.figures["seconds"] for row in found if row.knobs == self.configurations[0].knobs), None)
+        first = self.configurations[0]
+        base = next((row.figures["seconds"] for row in found if (row.task, row.knobs) == (first.task, first.knobs)), None)
         for row in found:
             if base is not None and "against_base" in row.figures:
                 row.figures["seconds"] = row.figures["against_base"] * base
@@ -190,10 +193,11 @@ def plan(
       devices: None: all cores.
       knobs: which are swept; none: all.
       quick: fewer values, against a reference of a quarter of the samples.
-      fits: also small fits, over their tolerance and levels.
+      fits: also small fits, over their tolerance and levels. Either of these two among the knobs says so, too.
 
     Raises:
-      ValueError: an unknown knob, a width or a number of devices below 1, or anything about the scene.
+      ValueError: an unknown knob, a width or a number of devices below 1, fits of a terrain with holes, or anything about the
+        scene.
     """
     for knob in knobs:
         if knob not in KNOBS:
@@ -209,7 +213,10 @@ def plan(
     longest = PIXELS // 2 if quick else PIXELS
     scale = width / camera.width if width else min(1.0, longest / max(camera.width, camera.height))
     size = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
-    devices = devices or min(len(os.sched_getaffinity(0)), 16)
+    devices = devices or min(usable_cores(), 16)
+    fits = fits or not _FIT_VALUES.keys().isdisjoint(knobs)
+    if fits and not np.isfinite(scene.heights).all():
+        raise ValueError(f"{path}: a fit's terrain must be without holes, this one has {np.sum(~np.isfinite(scene.heights))}")
     configurations = tuple(dict.fromkeys(_configurations(scene, frozenset(knobs or KNOBS), quick, fits)))
     folder = Path(f"{path.stem}-tradeoff") if folder is None else Path(folder)
     identity = _identity(resized(scene, *size), devices, quick)
@@ -246,8 +253,9 @@ def _configurations(scene: Scene, knobs: frozenset[str], quick: bool, fits: bool
     if fits:
         fit = Configuration("fit", settings=dataclasses.replace(Settings(), samples=4), tolerance=1e-4)
         yield fit
+        swept = _FIT_VALUES if knobs.isdisjoint(_FIT_VALUES) else knobs & _FIT_VALUES.keys()
         for knob, choices in _FIT_VALUES.items():
-            for value in choices:
+            for value in choices if knob in swept else ():
                 yield fit.with_knob(knob, value)
 
 

@@ -2,8 +2,9 @@
 
 import contextlib
 import json
+import math
 import os
-import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -37,7 +38,8 @@ class Worker:
             stdout=subprocess.PIPE,
             stderr=self.complaints,
             text=True,
-            env={**os.environ, "PYTHONPATH": path},
+            # What the last line of a failure says is then its error.
+            env={**os.environ, "PYTHONPATH": path, "JAX_TRACEBACK_FILTERING": "off"},
             start_new_session=True,
         )
         if cores is not None:
@@ -59,7 +61,7 @@ class Worker:
             code = self.process.wait()
             self.complaints.seek(0)
             said = [line for line in self.complaints.read().splitlines() if line.strip()]
-            raise MeasurementError(f"the process ended with code {code}: {said[-1] if said else 'it said nothing'}")
+            raise MeasurementError(f"{_ended(code)}: {said[-1] if said else 'it said nothing'}")
         return json.loads(line)
 
     def ask(self, question: str) -> dict[str, Any]:
@@ -76,6 +78,12 @@ class Worker:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _ended(code: int) -> str:
+    if code == -signal.SIGKILL:
+        return "the process was killed, as happens where memory runs out"
+    return f"the process ended with code {code}"
 
 
 class MeasurementError(ChildProcessError):
@@ -101,11 +109,26 @@ def timed(frame: Callable[[], object]) -> dict[str, float]:
     return {"seconds": time.perf_counter() - begin, "cpu_seconds": time.process_time() - cpu}
 
 
+def usable_cores() -> int:
+    """Of the CPU, that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def available_bytes() -> float:
+    """Of memory, caches that the system would give up included; without end where the system does not say (not Linux)."""
+    said = Path("/proc/meminfo")
+    if not said.exists():
+        return math.inf
+    return next(1024.0 * int(line.split()[1]) for line in said.read_text().splitlines() if line.startswith("MemAvailable"))
+
+
 def peak_mb() -> float:
     """The most memory that this process has held so far, Python and JAX themselves included, MiB."""
     status = Path("/proc/self/status")
     if status.exists():  # Linux hands ru_maxrss down from the process that started this one
         (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
         return int(line.split()[1]) / 1024
+    import resource  # not on Windows
+
     unit = 2**20 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

@@ -13,9 +13,20 @@ import numpy as np
 import pytest
 
 import jaxhf
+from jaxhf import _sweeping
 from jaxhf._curves import plot
 from jaxhf._front import curves, front, markdown, recommend
-from jaxhf._measure import DERIVATIVE_PIXELS, centre_hits, gradient_errors, picture_errors, shrunk, wrong_share
+from jaxhf._measure import (
+    DERIVATIVE_PIXELS,
+    Derivative,
+    Recovery,
+    _thinned,
+    centre_hits,
+    gradient_errors,
+    picture_errors,
+    shrunk,
+    wrong_share,
+)  # fmt: skip
 from jaxhf._tradeoff import COLUMNS, KNOBS, Configuration, Measured, plan
 from jaxhf._worker import MeasurementError, Worker
 from jaxhf.io._sweep import append_row, load_reference, read_rows, save_reference
@@ -81,11 +92,11 @@ def test_centre_hits_are_those_of_the_aovs():
     assert (hits[~met][:, :4] == -1).all()
 
 
-def row(task="picture", seconds=1.0, error=1.0, **knobs):
+def row(task="picture", seconds=1.0, error=1.0, **knobs: str):
     base = Configuration(task, tolerance=1e-4) if task == "fit" else Configuration(task)
     name = "relative_error" if task == "derivative" else "rmse"
     figures = {"seconds": seconds, "cpu_seconds": seconds, "against_base": seconds, "compile_seconds": 1.0, "peak_mb": 100.0}
-    figures |= {"p999": 0.0, "wrong_hits": 0.0, "cosine": 0.0, name: error}
+    figures |= {"p999": 0.0, "wrong_hits": 0.0, "cosine": 0.0, "spread": 0.1, name: error}
     return Measured(task, base.knobs | knobs, figures)
 
 
@@ -121,6 +132,12 @@ def test_recommendations_by_hand(error, seconds, picture, derivative):
     assert len(lines) == 2
     assert lines[0].partition(": ")[2].startswith(picture)
     assert lines[1].partition(": ")[2].startswith(derivative)
+
+
+def test_what_is_recommended_can_be_written_as_it_stands():
+    (line,) = recommend([row(detail="1.0", samples="16", normals="four", shadows="False", max_steps="32")], 1.0, None)
+    settings = eval(line[line.index("Settings(") : line.index("), float32") + 1], {"Settings": jaxhf.Settings})
+    assert settings == jaxhf.Settings(detail=1.0, samples=16, normals="four", shadows=False, max_steps=32)
 
 
 def test_curves_change_one_knob():
@@ -178,6 +195,24 @@ def test_plan_of_some_knobs():
     assert len(plan(SCENES / "texture.toml", knobs=("edge_samples",)).configurations) == 5
     fits = plan(SCENES / "texture.toml", knobs=("shading",), fits=True).configurations
     assert [one.tolerance for one in fits if one.task == "fit"] == [1e-4, 1e-2, 1e-3, 1e-5, 1e-4]
+    fits = plan(SCENES / "texture.toml", knobs=("levels",)).configurations
+    assert [(one.task, one.levels) for one in fits] == [("picture", None), ("fit", None), ("fit", (1.0,))]
+
+
+@pytest.mark.parametrize(
+    ("samples", "quick", "expected"), [(1, False, 256), (1, True, 64), (64, True, 256), (256, False, 1024)]
+)
+def test_the_reference_is_finer_than_the_base(tmp_path, samples, quick, expected):
+    (tmp_path / "a.toml").write_text(SCENE.replace("samples = 1", f"samples = {samples}"))
+    assert plan(tmp_path / "a.toml", quick=quick).reference_samples == expected
+
+
+def test_plan_refuses_fits_of_holes(tmp_path):
+    np.save(tmp_path / "hole.npy", np.array([[0, 0.1, 0.3], [0.2, np.nan, 0.1]]))
+    (tmp_path / "a.toml").write_text(SCENE[: SCENE.index("heights = ")] + 'file = "hole.npy"\n')
+    with pytest.raises(ValueError, match=r"a\.toml: a fit's terrain must be without holes, this one has 1"):
+        plan(tmp_path / "a.toml", fits=True)
+    assert plan(tmp_path / "a.toml").configurations
 
 
 def test_identity(tmp_path):
@@ -277,7 +312,14 @@ from jaxhf._worker import peak_mb, serve
 def prepare(job):
     def die():
         raise ZeroDivisionError("on purpose")
-    return {"ready": lambda: {"peak_mb": peak_mb(), "job": job}, "frame": lambda: {"seconds": 1.5}, "errors": die}
+    def traced():
+        import jax
+        def program(x):
+            raise ZeroDivisionError("while tracing")
+        jax.jit(program)(0)
+    return {
+        "ready": lambda: {"peak_mb": peak_mb(), "job": job}, "frame": lambda: {"seconds": 1.5}, "errors": die, "traced": traced
+    }
 
 serve(prepare)
 """
@@ -299,11 +341,95 @@ def test_a_worker_answers_until_it_dies(served):
     assert worker.process.returncode is not None
 
 
+def test_a_worker_says_why_it_died_while_tracing(served):
+    with Worker(served, {}) as worker:
+        worker.answer()
+        with pytest.raises(MeasurementError, match="ended with code 1: ZeroDivisionError: while tracing"):
+            worker.ask("traced")
+
+
+def test_a_worker_that_is_killed_is_said_to_be(served):
+    with Worker(served, {}) as worker:
+        worker.answer()
+        worker.process.kill()
+        with pytest.raises(MeasurementError, match="was killed, as happens where memory runs out: it said nothing"):
+            worker.ask("frame")
+
+
 def test_a_worker_does_not_inherit_its_parents_peak(served):
     ours = np.ones(1 << 25)  # 256 MiB
     with Worker(served, {}) as worker:
         assert 5 < worker.answer()["peak_mb"] < 128
     assert ours[0] == 1
+
+
+class Pretended(Worker):
+    """What stands for `Worker`: a derivative's reference finds no memory, all else has figures."""
+
+    def __init__(self, module, job):
+        self.job, self.question = job, "ready"
+
+    def send(self, question):
+        self.question = question
+
+    def answer(self):
+        if self.job["task"] == "reference":
+            if self.job["of"] == "derivative":
+                raise MeasurementError("killed")
+            save_reference(self.job["reference"], self.job["identity"], {"picture": np.zeros(1), "hits": np.zeros(1)})
+        return {
+            "ready": {"peak_mb": 100.0, "first_seconds": 2.0}, "frame": {"seconds": 1.0, "cpu_seconds": 1.0},
+            "errors": {"rmse": 0.1, "p999": 0.1, "wrong_hits": 0.0},
+        }[self.question]  # fmt: skip
+
+    def ask(self, question):
+        self.send(question)
+        return self.answer()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+
+def test_a_terrain_too_large_for_derivatives_has_pictures_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(_sweeping, "Worker", Pretended)
+    (tmp_path / "scene.toml").write_text(SCENE)
+    sweep = plan(tmp_path / "scene.toml", tmp_path / "out", knobs=("traversal", "edge_samples"))
+    told = []
+    (failure,) = _sweeping.run(sweep, 1, told.append, lambda *_: None)
+    assert failure == "derivative, the reference, and so all else of it: killed"
+    assert [row.task for row in sweep.measured()] == ["picture", "picture"]
+    assert {one.task for one in sweep.missing()} == {"derivative"}
+    assert len(told) == 1
+
+
+def test_errors_of_a_derivative_are_taken_over_draws(monkeypatch):
+    """Of four, against the mean of four others."""
+    exact, off = np.array([3.0, 4.0]), {0: 1.0, 1: 2.0, 2: 2.0, 3: 4.0, 4: -1.0, 5: 1.0, 6: -2.0, 7: 2.0}
+    monkeypatch.setattr(Derivative, "_along_waves", lambda self, draw: exact + np.array([off[draw], 0.0]))
+    derivative = Derivative.__new__(Derivative)
+    reference = derivative.reference()
+    np.testing.assert_array_equal(reference["gradient"], exact)
+    errors = derivative.errors(reference)
+    np.testing.assert_allclose(errors["relative_error"], np.sqrt((1 + 4 + 4 + 16) / 4) / 5)
+    np.testing.assert_allclose(errors["spread"], np.std([0.2, 0.4, 0.4, 0.8], ddof=1))
+    cosines = [(3 * (3 + d) + 16) / (5 * np.hypot(3 + d, 4)) for d in (1, 2, 2, 4)]
+    np.testing.assert_allclose(errors["cosine"], np.mean(cosines))
+
+
+def test_small_fits_are_measured_on_any_shape():
+    """The side that is short already stays as it is."""
+    field = jaxhf.Heightfield(np.random.default_rng(0).uniform(0, 0.1, (3, 40)), dx=0.1, dy=0.5)
+    camera = jaxhf.Orthographic.look_at((2, 0.5, 5), (2, 0.5, 0), up=(0, 1, 0), extent=2.0, width=64, height=16)
+    scene = jaxhf.Scene([jaxhf.Object(field)], camera, [jaxhf.Directional((1, 2, 3))], 1)
+    thin = _thinned(scene, 32)
+    np.testing.assert_array_equal(thin.heights, field.heights[:, ::2])
+    assert (thin.heightfields[0].dx, thin.heightfields[0].dy) == (0.2, 0.5)
+    recovery = Recovery(scene, jaxhf.Settings(samples=1, shadows=False, chunk=256), 1e-2, [1.0])
+    recovery.run()
+    assert 0 < recovery.errors({})["rmse"] < 0.2
 
 
 def test_sweep_can_be_interrupted_and_gone_on_with(tmp_path):
@@ -329,15 +455,19 @@ def test_sweep_can_be_interrupted_and_gone_on_with(tmp_path):
         sweep.send_signal(signal.SIGINT)
         out, err = sweep.communicate(timeout=60)
     assert sweep.returncode == 130, err
-    assert err.split() == ["jaxhf:", "interrupted"]
-    assert re.search(r"3 of 3 configurations to measure, 24 x 16 pixels; about \d+ minutes", out)
+    assert out == ""
+    announced, *said = err.splitlines()
+    assert re.search(r"3 of 3 configurations to measure, 24 x 16 pixels; about \d+ minutes", announced)
+    assert said == ["", "jaxhf: interrupted"]
     begun = table.read_text()
 
     done = subprocess.run([*command, "--markdown"], **pipes, timeout=300)
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    assert "of 3 configurations to measure" in done.stdout
-    assert "3 of 3" not in done.stdout
+    (announced,) = done.stderr.splitlines()
+    assert "of 3 configurations to measure" in announced
+    assert "3 of 3" not in announced
+    assert done.stdout.startswith("| picture |")
+    assert "|\n\n3 configurations: " in done.stdout
     assert table.read_text().startswith(begun)
     assert (table.parent / "tradeoff.png").read_bytes().startswith(b"\x89PNG")
     with table.open() as file:
@@ -354,7 +484,7 @@ def test_sweep_can_be_interrupted_and_gone_on_with(tmp_path):
 
     begin = time.perf_counter()
     asked = subprocess.run([*command, "--error", "1"], **pipes, timeout=60)
-    assert "to measure" not in asked.stdout
+    assert asked.stderr == ""
     assert asked.stdout.startswith("picture, error 1: Settings(")
     assert time.perf_counter() - begin < 30
 
