@@ -97,6 +97,8 @@ class Descent:
         self.history: list[Step] = []
         self.stage_start = 0  # steps taken before this stage
         self.best = (math.inf, unknowns)
+        self.converged = False  # the last step says so
+        self.kept: tuple[dict[str, Any], Any] | None = None  # see `_keep`
         self.sharpest = None if problem.loss_scale is None else float(problem.loss_scale)
         self.lift = 1.0  # see `make_basis`
         self.seconds = 0.0  # spent before a resumption
@@ -116,16 +118,16 @@ class Descent:
                 stop = self._stage_ended()
                 while stop is not None:
                     if stop in (Stop.MAX_STEPS, Stop.NON_FINITE) or self.stage + 1 == len(self.stages):
+                        self._save()  # what comes now, standard deviations, may take long
                         self.unknowns = self.best[1]
                         return stop
                     self._next_stage(field)
                     stop = self._stage_ended()
                 self._step()
-                if self.path and len(self.history) % self.every == 0:
+                if len(self.history) % self.every == 0:
                     self._save()
         except KeyboardInterrupt:
-            if self.path:
-                self._save()
+            self._save()
             raise
 
     def _next_stage(self, field: Any) -> None:
@@ -149,6 +151,7 @@ class Descent:
             self.problem = eqx.tree_at(lambda problem: problem.loss_scale, self.problem, scale)
         self.best = (math.inf, self.unknowns)
         self.state = restarted(self.fresh, self.unknowns)
+        self._keep()
 
     def _set_basis(self, field: Any, base: np.ndarray) -> None:
         basis = make_basis(field, base, self.stages[self.stage], self.lift)
@@ -195,6 +198,7 @@ class Descent:
         line = Step(len(self.history) + 1, waves, loss, accepted, float(outcome.damping), float(outcome.change), seconds)
         self.history.append(line)
         self.converged = bool(outcome.converged)
+        self._keep()
         if self.progress:
             self.progress(line)
 
@@ -226,8 +230,14 @@ class Descent:
         basis = (self.problem.basis.base, self.problem.loss_scale)
         return self.unknowns, self.best[1], basis, state
 
-    def _save(self) -> None:
-        assert self.path is not None
+    def _keep(self) -> None:
+        """Notes where the fit stands, for the next checkpoint; called only where all of that belongs together.
+
+        Ctrl-C may come while a stage changes or a step's numbers are waited for: what is done again then is that stage or step.
+        Arrays are never written to, nor donated, so holding on to them is enough.
+        """
+        if self.path is None:
+            return
         facts = {
             "fingerprint": self.fingerprint,
             "stage": self.stage,
@@ -238,7 +248,12 @@ class Descent:
             "seconds": self.seconds + time.perf_counter() - self.begun,
             "history": [list(step) for step in self.history],
         }
-        save_checkpoint(self.path, facts, self._arrays())
+        self.kept = (facts, self._arrays())
+
+    def _save(self) -> None:
+        """A fit that went on from a checkpoint and took no step keeps nothing: the file says it all."""
+        if self.path and self.kept:
+            save_checkpoint(self.path, *self.kept)
 
     def _load(self, field: Any) -> None:
         assert self.path is not None

@@ -24,6 +24,7 @@ from ._solvers import BFGS_UNKNOWNS, Solver, count_unknowns, make_solver
 from ._types import AnyArray
 from ._uncertainty import pictures_and_influence, require_small, standard_deviations
 from ._unknowns import beyond, make_basis
+from .io._files import require_folder
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,7 +108,8 @@ def fit(
         on; it divides the noise.
       noise: standard deviation of a target's values at weight 1, radiance; one number or one for each picture.
       start: heights to begin with: a number (flat), a grid over the same footprint, of any size, or None: those of the
-        first scene.
+        first scene. They may have no holes: fill in what is not known; where a picture shows no ground there, give its
+        pixels no weight.
       prior: heights known beforehand, as `start`; None: nothing.
       prior_std: how far they may be off, a number or shape (ny, nx), height units.
       prior_length: over what distance L they are off together, in units of dx and dy; None: each by itself. For a terrain
@@ -134,8 +136,10 @@ def fit(
       uncertainty: None; the number of samples from which standard deviations are estimated, each to 1 / √(2 · samples); or
         "exact", where pictures times unknowns are few. See `standard_deviations`.
       progress: called after each step; True prints a line to standard error.
-      checkpoint: a file in which the state is kept every `checkpoint_every` steps and on Ctrl-C.
-      resume: goes on from that file if it is there; the result is bitwise that of a fit that was not interrupted.
+      checkpoint: a file in which the state is kept every `checkpoint_every` steps, after the last one and on Ctrl-C;
+        `fit` never removes it.
+      resume: goes on from that file if it is there; the result is bitwise that of a fit that was not interrupted. Without
+        it a file that is there is refused, as it may hold hours of work.
       mesh: the devices that share each picture's tiles, see `render`.
 
     Returns:
@@ -143,7 +147,8 @@ def fit(
 
     Raises:
       ValueError: anything about the arguments, before anything is traced; a checkpoint that is damaged or of another fit.
-      KeyboardInterrupt: Ctrl-C, after the checkpoint was written.
+      FileNotFoundError, PermissionError: the checkpoint's folder is not there or cannot be written to, before as well.
+      KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
     scenes, targets = tuple(scenes), tuple(targets)
     asked = Asked(
@@ -151,10 +156,17 @@ def fit(
         offsets, loss, loss_scale,
     )  # fmt: skip
     _check_choices(asked, solver, levels, max_steps, inner_steps, checkpoint_every, tolerance, uncertainty)
+    path = None if checkpoint is None else Path(checkpoint)
+    if path is not None:
+        _require_place(path, resume)
+    elif resume:
+        raise ValueError("fit: resume must come with a checkpoint to go on from")
     groups = make_groups(scenes, targets, settings, asked)
     first = scenes[0]
     shape, dtype = first.heights.shape, first.heights.dtype
-    heights = make_heights("start", np.asarray(first.heights) if start is None else start, shape)
+    if start is None:
+        start = _without_holes(np.asarray(first.heights))
+    heights = make_heights("start", start, shape)
     known = make_prior(first.heightfields[0], prior, prior_std, prior_length, prior_exponent)
     margin = prior_margin(first.heightfields[0], prior_length)
     basis = make_basis(first.heightfields[0], beyond(heights, margin))
@@ -188,7 +200,7 @@ def fit(
         tolerance,
         max_steps,
         print_step if progress is True else progress or None,
-        None if checkpoint is None else Path(checkpoint),
+        path,
         checkpoint_every,
         f"{solver} {levels} {inner_steps} {tolerance}",
     )
@@ -219,6 +231,26 @@ def _check_choices(asked, solver, levels, max_steps, inner_steps, every, toleran
     whole = isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and uncertainty >= 2
     if not (uncertainty is None or uncertainty == "exact" or whole):
         raise ValueError(f"fit: uncertainty must be None, 'exact' or a number of samples from 2 on, it is {uncertainty!r}")
+
+
+def _require_place(checkpoint: Path, resume: bool) -> None:
+    require_folder(checkpoint, "a checkpoint")
+    if checkpoint.exists() and not resume:
+        raise ValueError(
+            f"{checkpoint}: this checkpoint is there already; resume=True goes on from it, to begin anew remove it"
+        )
+
+
+def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
+    """The first scene's heights, where a fit is to begin with them."""
+    holes = np.argwhere(~np.isfinite(heights))
+    if len(holes):
+        iy, ix = holes[0]
+        raise ValueError(
+            f"fit: scenes[0]: the heights must have no holes where there is no start, row {iy} column {ix} is "
+            f"{heights[iy, ix]}; fill them, or give a start without holes"
+        )
+    return heights
 
 
 def _report(run: Descent, result: Stop, targets: Sequence[Any], uncertainty: int | str | None, inner_steps: int) -> Fit:

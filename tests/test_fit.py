@@ -286,6 +286,16 @@ def test_a_loss_that_is_not_finite_stops_the_fit(targets):
     np.testing.assert_array_equal(found.heights, 0.05)
 
 
+def test_terrain_with_a_hole_is_found_from_a_start_without(targets):
+    """Whatever stood in the scene's heights counts no more: the same bits as from a scene that was filled in."""
+    hole = np.arange(144).reshape(12, 12) == 27
+    filled = np.full((12, 12), 0.05)
+    options: dict[str, Any] = {"settings": SETTINGS, "max_steps": 3}
+    found = jaxhf.fit(scenes(np.where(hole, np.nan, filled)), targets, start=filled, **options)
+    np.testing.assert_array_equal(found.heights, jaxhf.fit(scenes(filled), targets, **options).heights)
+    assert np.ptp(found.heights) > 0.01
+
+
 BAD = {
     "scenes must hold at least one": ({"scenes": []}, {}),
     r"targets must hold a picture for each of the 3 scenes, they are 1": ({"targets": 1}, {}),
@@ -301,9 +311,11 @@ BAD = {
     r"prior_length must stand with a prior": ({}, {"prior_length": 1.0}),
     r"prior_length must be positive and finite, it is 0": ({}, {"prior": 0.0, "prior_std": 1.0, "prior_length": 0}),
     r"start must be finite, row 0 column 1": ({}, {"start": [[0.0, np.inf], [0.0, 0.0]]}),
-    r"start must be finite, row 2 column 3 is nan": ({"hole": True}, {}),
+    r"scenes\[0\]: the heights must have no holes where there is no start, row 2 column 3 is nan": ({"hole": True}, {}),
+    r"start must be finite, row 1 column 0 is nan": ({"hole": True}, {"start": [[0.0, 0.0], [np.nan, 0.0]]}),
     r"solver must be one of lm, bfgs, lbfgs, adam; it is 'sgd'": ({}, {"solver": "sgd"}),
     r"levels must be shares above 0, the last of them 1": ({}, {"levels": [0.5]}),
+    r"resume must come with a checkpoint": ({}, {"resume": True}),
     r"uncertainty must be None, 'exact' or a number": ({}, {"uncertainty": "some"}),
     r"uncertainty 'exact' takes at most 16777216 residuals times": (
         {"fine": True},
