@@ -4,13 +4,11 @@ import argparse
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
-    from ._cylinder import Cylinder
-    from ._heightfield import Heightfield
     from ._scene import Scene
     from ._settings import Settings
 
@@ -69,11 +67,54 @@ def _parser() -> argparse.ArgumentParser:
     _add_machine(fit)
     fit.set_defaults(run=_fit)
 
+    _add_hillshade(commands)
+
+    convert = commands.add_parser(
+        "convert", help="write a terrain in another format",
+        description="Write a terrain in another format. From GeoTIFF to GeoTIFF it keeps its place on the map.",
+    )  # fmt: skip
+    convert.add_argument("terrain", metavar="IN", help="heights: .npy, .npz, .png (16 bits) or .tif")
+    convert.add_argument("output", metavar="OUT", help=".npy, .npz or .tif")
+    _add_stored(convert)
+    convert.set_defaults(run=_convert)
+
     info = commands.add_parser("info", help="print what a scene holds", description="Print what a scene holds.")
     info.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
     info.set_defaults(run=_info)
     _add_tradeoff(commands)
     return parser
+
+
+def _add_hillshade(commands: Any) -> None:
+    about = "Draw a shaded map: the terrain from straight above, north up, a pixel for each cell."
+    hillshade = commands.add_parser("hillshade", help="draw a shaded map of a terrain", description=about)
+    hillshade.add_argument("terrain", metavar="TERRAIN", help="heights: .npy, .npz, .png (16 bits) or .tif")
+    hillshade.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="the picture: .png (bytes in proportion), .exr, .npy or .pfm"
+    )
+    hillshade.add_argument(
+        "--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the light, from north, clockwise [315]"
+    )
+    hillshade.add_argument(
+        "--altitude", type=float, default=45.0, metavar="DEGREES", help="of the light, above the horizon [45]"
+    )
+    hillshade.add_argument(
+        "--sky", type=float, default=0.0, metavar="RADIANCE", help="light from everywhere, level ground being 1 [0]"
+    )
+    hillshade.add_argument(
+        "--no-shadows", dest="shadows", action="store_false", default=None, help="shade slopes, cast no shadows"
+    )
+    hillshade.add_argument("--width", type=int, metavar="PIXELS", help="size; with one of the two, the other keeps proportions")
+    hillshade.add_argument("--height", type=int, metavar="PIXELS")
+    hillshade.add_argument("--samples", type=int, metavar="N", help="rays a pixel, a square number [1]")
+    _add_stored(hillshade)
+    _add_machine(hillshade)
+    hillshade.set_defaults(run=_hillshade)
+
+
+def _add_stored(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--z-scale", type=float, default=1.0, metavar="S", help="heights are multiplied by it [1]")
+    command.add_argument("--nodata", type=float, metavar="V", help="a stored value that means no height [as the file says]")
 
 
 def _add_tradeoff(commands: Any) -> None:
@@ -105,15 +146,46 @@ def _add_machine(command: argparse.ArgumentParser) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
+    _draw(options, lambda: _load(options.scene, options.precision))
+
+
+def _hillshade(options: argparse.Namespace) -> None:
+    from ._hillshade import hillshade_scene, printed
+    from .io import load_heights
+
+    def scene() -> "Scene":
+        terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+        terrain = replace(terrain, heights=terrain.heights.astype(options.precision))
+        return hillshade_scene(terrain, options.azimuth, options.altitude, options.sky)
+
+    _draw(options, scene, printed if options.output.lower().endswith(".png") else None)
+
+
+def _draw(options: argparse.Namespace, load: "Callable[[], Scene]", tone: Callable[[Any], Any] | None = None) -> None:
     from .io import require_writable, save_image
 
     require_writable(options.output)
     settings = _settings(options)
     _set_up_jax(options.precision, options.devices)
-    scene = _resized(_load(options.scene, options.precision), options.width, options.height)
-    image, report = _timed_render(scene, settings)
-    save_image(options.output, image)
+    image, report = _timed_render(_resized(load(), options.width, options.height), settings)
+    save_image(options.output, tone(image) if tone else image)
     print(f"{options.output}: {report}")
+
+
+def _convert(options: argparse.Namespace) -> None:
+    from pathlib import Path
+
+    from ._heightfield import Heightfield
+    from ._info import heightfield_line
+    from .io import load_heights, require_writable_heights, save_heights
+
+    require_writable_heights(options.output)
+    terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+    rasters = {Path(path).suffix.lower() for path in (options.terrain, options.output)} <= {".tif", ".tiff"}
+    save_heights(options.output, terrain, options.terrain if rasters else None)
+    field = Heightfield(terrain.heights, terrain.dx, terrain.dy, terrain.x0, terrain.y0)
+    alone = " (.npy holds the heights alone)" if Path(options.output).suffix.lower() == ".npy" else ""
+    print(f"{options.output}: {heightfield_line(field)}{alone}")
 
 
 def _fit(options: argparse.Namespace) -> None:
@@ -142,7 +214,7 @@ def _settings(options: argparse.Namespace) -> "Settings":
     from ._settings import Settings
 
     names = ("samples", "traversal", "shading", "normals", "shadows", "max_depth", "max_steps", "chunk", "detail")
-    return Settings(**{name: getattr(options, name) for name in names if getattr(options, name) is not None})
+    return Settings(**{name: getattr(options, name) for name in names if getattr(options, name, None) is not None})
 
 
 def _load(path: str, precision: str) -> "Scene":
@@ -233,22 +305,11 @@ class _Progress:
 
 
 def _info(options: argparse.Namespace) -> None:
-    import numpy as np
-
-    from ._heightfield import Heightfield
+    from ._info import scene_lines
 
     scene = _load(options.scene, "float32")
-    camera = scene.camera
-    eye = np.asarray(camera.world_from_camera)[:3, 3]
-    print(f"{options.scene}: {camera.width} x {camera.height} pixels, {scene.samples} samples a pixel")
-    print(f"camera: {type(camera).__name__}, at {_numbers(eye)}")
-    for k, obj in enumerate(scene.objects):
-        what = _heightfield(obj.shape) if isinstance(obj.shape, Heightfield) else _cylinder(obj.shape)
-        place = "" if obj.world_from_object is None else ", with a transform"
-        print(f"object {k}: {what}, {_material(obj.material)}{place}")
-    for k, light in enumerate(scene.lights):
-        values = ", ".join(f"{name} {_numbers(value)}" for name, value in vars(light).items())
-        print(f"light {k}: {type(light).__name__}, {values}")
+    print(f"{options.scene}: {scene.camera.width} x {scene.camera.height} pixels, {scene.samples} samples a pixel")
+    print("\n".join(scene_lines(scene)))
 
 
 def _tradeoff(options: argparse.Namespace) -> None:
@@ -306,38 +367,6 @@ class _Counter:
 
     def __exit__(self, *_: object) -> None:
         self._clear()
-
-
-def _heightfield(field: "Heightfield") -> str:
-    import numpy as np
-
-    heights = np.asarray(field.heights)
-    ny, nx = heights.shape
-    finite = heights[np.isfinite(heights)]
-    span = _numbers([finite.min(), finite.max()]) if finite.size else "none"
-    holes = f", {heights.size - finite.size} holes" if finite.size < heights.size else ""
-    return (
-        f"Heightfield, {ny} x {nx} heights, cells {field.dx:.6g} x {field.dy:.6g}, "
-        f"origin {_numbers([field.x0, field.y0])}, range {span}{holes}"
-    )
-
-
-def _cylinder(cylinder: "Cylinder") -> str:
-    return f"Cylinder, radius {float(cylinder.radius):.6g}, z {_numbers([cylinder.z_min, cylinder.z_max])}"
-
-
-def _material(material: Any) -> str:
-    from ._texture import ImageTexture
-
-    (name, value), *_ = vars(material).items()
-    what = (
-        f"an image of {value.texels.shape[1]} x {value.texels.shape[0]}" if isinstance(value, ImageTexture) else _numbers(value)
-    )
-    return f"{type(material).__name__.lower()}, {name} {what}"
-
-
-def _numbers(values: Any) -> str:
-    return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
 
 
 if __name__ == "__main__":

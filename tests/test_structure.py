@@ -13,6 +13,7 @@ FLOW = (
     "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade",
     "_silhouette", "_lottery", "_edges", "_boundaries", "_render", "_jacobian", "io",
     "_unknowns", "_problem", "_residuals", "_solvers", "_uncertainty", "_descent", "_fit", "_plots", "_report", "_fit_command",
+    "_hillshade", "_info",
     "_worker", "_measure", "_tradeoff", "_sweeping", "_front", "_curves", "__init__", "__main__",
 )  # fmt: skip
 
