@@ -29,6 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"jaxhf: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):  # which is what JAX calls it
+            raise
+        print("jaxhf: error: memory ran out; a smaller picture, --chunk or terrain needs less", file=sys.stderr)
+        return 2
     return 0
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxhf
+from jaxhf import __main__ as command
 
 SCENE = Path(__file__).parents[1] / "scenes" / "debug4x4.toml"  # 320 x 240
 REPORT = re.compile(
@@ -128,6 +129,16 @@ def test_info():
     )
     assert lines[3].startswith("light 0: Point, p (-0.9, -1.3, 1.5), intensity (18, 18, 18)")
     assert lines[4].startswith("light 1: Sky, radiance (0.05, 0.07, 0.1)")
+
+
+@pytest.mark.parametrize("error", [MemoryError("8 GiB"), RuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
+def test_no_memory_is_an_error_in_one_line(monkeypatch, capsys, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(command, "_info", fail)
+    assert command.main(["info", str(SCENE)]) == 2
+    assert capsys.readouterr().err == "jaxhf: error: memory ran out; a smaller picture, --chunk or terrain needs less\n"
 
 
 # Errors of the user's.

@@ -128,6 +128,13 @@ def test_what_the_file_says_reaches_fit(found):
     assert (options["prior_std"], options["max_steps"], options["uncertainty"]) == (30, 9, 2)
 
 
+def test_the_case_that_comes_along_can_be_read():
+    case = load_case(Path(__file__).parents[1] / "scenes" / "recover" / "case.toml", np.dtype("float32"))
+    assert [np.shape(target) for target in case.targets] == 3 * [(128, 128)]  # grey
+    assert all(0.1 < np.mean(target) < 0.4 for target in case.targets)
+    assert case.scenes[0].heights.shape == (41, 41)
+
+
 def test_results_lie_where_the_terrain_lies(folder, found):
     tifffile = pytest.importorskip("tifffile")
 

@@ -8,7 +8,7 @@ import pytest
 
 import jaxhf
 from jaxhf._measure import Derivative, Picture
-from jaxhf.io._procedural import bumps, fractal
+from jaxhf.io._procedural import bumps, fractal, waves
 
 WIDTH, HEIGHT = 128, 96
 
@@ -31,13 +31,21 @@ def hills(dtype: Any) -> jaxhf.Scene:
     return jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte((0.8, 0.4, 0.3)))], camera, [jaxhf.Point((1.5, 0.2, 1.0), 3.0)])
 
 
+def dunes(dtype: Any) -> jaxhf.Scene:
+    """Written after the promises, which it therefore cannot have moved: grazing light, seen from near the ground."""
+    field = jaxhf.Heightfield(waves([120, 90], seed=11, direction=40.0, range=(0.0, 0.08)).astype(dtype))
+    camera = jaxhf.Perspective.look_at((0.5, -0.15, 0.22), (0.45, 0.6, 0.0), fov=55, width=WIDTH, height=HEIGHT)
+    lights = [jaxhf.Directional.from_angles(azimuth=80, altitude=12), jaxhf.Sky(0.15)]
+    return jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte((0.9, 0.7, 0.4)))], camera, lights)
+
+
 @functools.cache
 def reference(scene: Any) -> dict[str, np.ndarray]:
     return Picture(scene(np.float64), jaxhf.Settings(samples=256)).reference()
 
 
 @pytest.mark.parametrize("preset", PROMISES)
-@pytest.mark.parametrize("scene", [mountains, hills])
+@pytest.mark.parametrize("scene", [mountains, hills, dunes])
 def test_promise(scene, preset):
     picture = Picture(scene(np.float32), getattr(jaxhf.Settings, preset)())
     assert picture.run().dtype == np.float32
