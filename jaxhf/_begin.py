@@ -49,8 +49,7 @@ def begin(
       footprint: see `first_hit`.
     """
     width, height = grid.pyramid.width, grid.pyramid.height
-    if 3 + width.bit_length() + (height - 1).bit_length() > 32:
-        raise ValueError(f"Heightfield: at most 2**28 cells can be traced, heights have shape {grid.shape}")
+    assert 3 + width.bit_length() + (height - 1).bit_length() <= 32, "Heightfield checks that a walk's state fits"
     valid = finite(ray.o) & finite(ray.d) & ((ray.d[0] != 0) | (ray.d[1] != 0) | (ray.d[2] != 0))
     dx, dy, dz = ray.d[0], ray.d[1], ray.d[2]
     inverse = inv_x, inv_y, inv_z = reciprocal(dx), reciprocal(dy), reciprocal(dz)

@@ -28,6 +28,7 @@ from ._scene import Scene, localise, localise_camera
 from ._settings import Settings
 from ._shade import Vertex, World, first_vertex, in_shadow, make_surface, make_world, radiance
 from ._store import stored
+from ._types import float_leaf
 
 AOVS = ("depth", "normal", "uv", "status", "object", "cell", "shadow", "steps", "exhausted")
 """Arbitrary output variables, each (h, w) or (h, w, c), of the ray through the pixel's centre:
@@ -344,6 +345,7 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings
     if leaving is not None:
         start, axes = leaving, leaving.t.ndim
     elif isinstance(o, jax.Array):
+        o = float_leaf(o)
         start, axes = jnp.asarray(o - jnp.broadcast_to(jnp.asarray(corner, o.dtype), o.shape), dtype), o.ndim - 1
     else:
         start, axes = jnp.asarray(np.asarray(o, np.float64) - corner, dtype), np.ndim(o) - 1

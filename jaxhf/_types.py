@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -25,13 +26,14 @@ MatrixLeaf = Float[AnyArray, "4 4"]
 
 
 def float_leaf(value: Any) -> Any:
-    """Keeps a JAX array or tracer as it is; turns anything else into a float64 NumPy array.
+    """Keeps a JAX array or tracer of floats as it is; turns anything else into a float64 NumPy array.
 
     Positions therefore keep double precision until `localise` has moved the origin next to the terrain, even where JAX
-    itself runs in single precision.
+    itself runs in single precision. Whole numbers in JAX become floats, as what is computed in their type loses its
+    fractions.
     """
     if isinstance(value, jax.Array):
-        return value
+        return value if jnp.issubdtype(value.dtype, jnp.inexact) else value.astype(jnp.result_type(float))
     return np.asarray(value, dtype=np.float64)
 
 

@@ -265,6 +265,15 @@ def test_shapes_and_precision():
             jaxhf.cast(field, o, d)
 
 
+def test_rays_from_whole_numbers_start_there():
+    """Beside a corner at (-2.5, 9.5); the same in NumPy, where they were floats before it was subtracted."""
+    field = jaxhf.Heightfield(MILD.heights, 0.5, 2.0, x0=-2.5, y0=9.5)
+    o, d = np.array([0, 12, 5]), np.array([0, 0, -1])
+    expected, found = jaxhf.cast(field, o, d), jaxhf.cast(field, jnp.asarray(o), jnp.asarray(d))
+    np.testing.assert_array_equal(found.p, expected.p)
+    np.testing.assert_array_equal(found.p[:2], (0, 12))
+
+
 def test_under_jit_and_vmap():
     """The same answers inside of a compiled function, over a batch of heights, and ray by ray."""
     o, d = (jnp.asarray(value) for value in slanted(MILD, 48, seed=20))

@@ -4,9 +4,11 @@ import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import jaxhf
 from jaxhf.io import load_case
+from jaxhf.io._place import Place, at_vertices
 
 SCENE = """[camera]
 type = "perspective"
@@ -117,6 +119,17 @@ def test_every_key_arrives(folder):
     assert isinstance(second.lights[0], jaxhf.Sky)
 
 
+@pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 255), (np.uint16, 65535)])
+def test_weights_in_a_png_are_no_colours(folder, dtype, top):
+    """Their share of the top, not what sRGB makes of it; a mask is what is not black."""
+    stored = np.array([[0, 1, 2, 3], [128, 100, 50, 4], [255, 200, 7, 9]], dtype)
+    Image.fromarray(stored).save(folder / "weights.png")
+    (weights,) = case(folder, WHOLE + 'weights = "weights.png"\n').weights
+    np.testing.assert_allclose(np.asarray(weights), stored / top, rtol=1e-6)
+    (weights,) = case(folder, WHOLE + 'mask = "weights.png"\n').weights
+    np.testing.assert_array_equal(weights, stored > 0)
+
+
 def test_what_is_not_given_is_left_to_fit(folder):
     found = case(folder, SCENE + PICTURE)
     assert found.options == {}
@@ -152,6 +165,111 @@ def test_the_map_of_a_geotiff_is_kept_unless_the_scene_puts_it_elsewhere(folder)
     scene = SCENE[: SCENE.index("shape")]
     assert case(folder, scene + field + PICTURE).like == folder / "dem.tif"
     assert case(folder, scene + field + "x0 = 3\n" + PICTURE).like is None
+
+
+def terrain_file(path, place, shape, holes=()):
+    """Heights that rise by 1 to the east and by 2 to the north for each unit of the map, on a plane: the same by any grid."""
+    dx, dy, x0, y0 = place
+    heights = (x0 + dx * np.arange(shape[1])) + 2 * (y0 + dy * np.arange(shape[0]))[:, None]
+    heights[tuple(np.array(holes, int).reshape(-1, 2).T)] = np.nan
+    if path.name.startswith("degrees"):  # they start in the north, and their bounds are half a cell further out
+        bounds = {"xmin": x0 - dx / 2, "ymin": y0 - dy / 2, "ymax": 90}
+        np.savez(path, elevation=heights[::-1], dx=dx, dy=dy, **bounds)
+    else:
+        jaxhf.save_heights(path, jaxhf.Terrain(heights, *place))
+    return heights
+
+
+def with_prior(tile, prior, more=""):
+    field = SCENE[: SCENE.index("heights =")] + f'file = "{tile}"\n{more}'
+    return field + PICTURE + f'\n[fit]\nprior = "{prior}"\nstart = "{prior}"\nprior_std = "{prior}"\n'
+
+
+TILE = (30.0, 20.0, 500000.0, 4100000.0)  # of 4 x 5 vertices: 120 by 60
+REGIONS = {
+    "larger": (TILE, (90.0, 70.0, 499700.0, 4099900.0), (5, 9)),
+    "of the same size": (TILE, TILE, (4, 5)),
+    # Rasters with the same corners: the centres of larger pixels lie further inside.
+    "coarse": (TILE, (75.0, 40.0, 500022.5, 4100010.0), (2, 2)),
+    "degrees": ((0.01, 0.01, 10.0, 45.0), (0.02, 0.03, 9.96, 44.9), (6, 7)),
+    "degrees from 0 on": ((0.01, 0.01, -10.0, 45.0), (0.02, 0.03, 349.96, 44.9), (6, 7)),
+}
+
+
+@pytest.mark.parametrize("name", REGIONS)
+def test_a_prior_lies_where_its_file_says(folder, name):
+    tile, region, shape = REGIONS[name]
+    ending = "degrees.npz" if "degrees" in name else "utm.npz"
+    expected = terrain_file(folder / ending, tile, (4, 5))
+    prior = ending.replace(".", "_prior.")
+    held = terrain_file(folder / prior, region, shape)
+    found = case(folder, with_prior(ending, prior)).options
+    if name == "coarse":
+        inside = found["prior"][1:3, 1:4]
+        np.testing.assert_allclose(inside, expected[1:3, 1:4], rtol=1e-12)
+        np.testing.assert_array_equal(found["prior"][[0, 0, -1, -1], [0, -1, 0, -1]], held.ravel())
+    else:
+        shift = 360 * (name == "degrees from 0 on")
+        np.testing.assert_allclose(found["prior"], expected + shift, rtol=1e-12)
+    for option in ("start", "prior_std"):
+        np.testing.assert_array_equal(found[option], found["prior"])
+    # Without a place, or over a terrain without one, it is left to `fit`.
+    np.save(folder / "bare.npy", held)
+    assert case(folder, with_prior(ending, "bare.npy")).options["prior"].shape == shape
+    np.save(folder / "tile.npy", expected)
+    assert case(folder, with_prior("tile.npy", prior)).options["prior"].shape == shape
+    placed = dict(zip(("dx", "dy", "x0", "y0"), tile, strict=True))
+    placed = "".join(f"{key} = {value}\n" for key, value in placed.items())
+    if "degrees" in name:
+        with pytest.raises(
+            jaxhf.SceneError, match=r":23: fit\.start: it must lie in the coordinates of the terrain, .* degrees"
+        ):
+            case(folder, with_prior("tile.npy", prior, placed))
+    else:
+        np.testing.assert_array_equal(case(folder, with_prior("tile.npy", prior, placed)).options["prior"], found["prior"])
+
+
+def test_a_prior_covers_the_terrain(folder):
+    terrain_file(folder / "tile.npz", TILE, (4, 5))
+    terrain_file(folder / "east.npz", (30.0, 20.0, 500016.0, 4100000.0), (4, 5))
+    message = (
+        r":19: fit\.start: it must cover the terrain, whose x goes from 500000 to 500120; "
+        r"its own goes from 500016 to 500136"
+    )
+    with pytest.raises(jaxhf.SceneError, match=message):
+        case(folder, with_prior("tile.npz", "east.npz"))
+    terrain_file(folder / "north.npz", (30.0, 20.0, 500000.0, 4100011.0), (4, 5))
+    with pytest.raises(jaxhf.SceneError, match="whose y goes from 4100000 to 4100060; its own goes from 4100011 to 4100071"):
+        case(folder, with_prior("tile.npz", "north.npz"))
+    with pytest.raises(ValueError, match=r"it must have the terrain's coordinates, EPSG:32617; it has EPSG:32616"):
+        at_vertices(np.zeros((2, 2)), Place(*TILE, system=32616), Place(*TILE, system=32617), (2, 2))
+
+
+def test_a_hole_in_a_prior_is_an_error_where_the_terrain_is(folder):
+    terrain_file(folder / "tile.npz", TILE, (4, 5))
+    region = (30.0, 20.0, 499970.0, 4099980.0)
+    border = [(0, k) for k in range(7)] + [(k, 6) for k in range(6)]
+    whole = terrain_file(folder / "region.npz", region, (6, 7), holes=border)
+    np.testing.assert_allclose(case(folder, with_prior("tile.npz", "region.npz")).options["prior"], whole[1:5, 1:6])
+    terrain_file(folder / "region.npz", region, (6, 7), holes=[*border, (2, 3)])
+    with pytest.raises(
+        jaxhf.SceneError,
+        match=r":19: fit\.start: it must have a height everywhere, 1 of 20 are holes; the first is row 1 column 2",
+    ):
+        case(folder, with_prior("tile.npz", "region.npz"))
+    np.save(folder / "bare.npy", np.array([[1, 2], [np.nan, 3]]))
+    with pytest.raises(jaxhf.SceneError, match="1 of 4 are holes; the first is row 1 column 0"):
+        case(folder, with_prior("tile.npz", "bare.npy"))
+
+
+def test_scale_and_nodata_hold_for_priors_too(folder):
+    terrain_file(folder / "tile.npz", TILE, (4, 5))
+    np.save(folder / "bare.npy", np.array([[1.0, 2], [3, 4]]))
+    found = case(folder, with_prior("tile.npz", "bare.npy", "z_scale = -2\n")).options
+    np.testing.assert_array_equal(found["prior"], [[-2, -4], [-6, -8]])
+    np.testing.assert_array_equal(found["prior_std"], [[2, 4], [6, 8]])
+    with pytest.raises(jaxhf.SceneError, match="1 of 4 are holes; the first is row 1 column 0"):
+        case(folder, with_prior("tile.npz", "bare.npy", "nodata = 3\n"))
 
 
 WHOLE = SCENE + PICTURE

@@ -377,6 +377,11 @@ WORLD_ERRORS = [
     ("grey", 'Material "matte"\n"color Kd" [.5]', 3, "'color Kd' takes 3 numbers, found 1 number"),
     ("type of Kd", 'Material "matte"\n"float Kd" .5', 3, "Material \"matte\" takes 'color Kd' or 'texture Kd', not 'float Kd'"),
     ("Kd overflows", 'Material "matte"\n"color Kd" [1 1 1e999]', 3, "'color Kd' must be finite, it is [1 1 1e999]"),
+    ("negative Kd", f'Material "matte"\n"color Kd" [1 -1 1]\n{FIELD}', 3, "Kd must be 0 or more, it is [ 1. -1.  1.]"),
+    ("negative Kr", f'Material "mirror"\n"color Kr" [1 -1 1]\n{FIELD}', 3, "Kr must be 0 or more"),
+    ("negative I", 'LightSource "point"\n"color I" [1 -1 1]', 3, "I must be 0 or more"),
+    ("negative scale", 'LightSource "distant" "color L" [1 1 1]\n"color scale" [1 -1 1]', 3, "scale must be 0 or more"),
+    ("negative L", 'LightSource "distant"\n"color L" [1 -1 1]', 3, "L must be 0 or more"),
     ("parameter", 'Material "mirror"\n"color Kd" [1 1 1]', 3, "unknown parameter 'color Kd' of Material \"mirror\""),
     ("nearest", 'LightSource "point"\n"color J" [1 1 1]', 3, "LightSource \"point\"; did you mean 'color I'?"),
     (

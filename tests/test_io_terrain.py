@@ -7,13 +7,14 @@ import sys
 import zipfile
 import zlib
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxhf.io import Terrain, jacksboro, load_heights, save_heights
 from jaxhf.io._files import MAX_PIXELS
-from jaxhf.io._terrain import metres_per_degree
+from jaxhf.io._place import metres_per_degree
 
 # What a file with the north first holds: two rows, the northern one 1 2 3.
 NORTH_FIRST = np.array([[1, 2, 3], [4, 5, 6]], np.uint16)
@@ -23,17 +24,34 @@ IS_AREA, IS_POINT = 1, 2
 PROJECTED, GEOGRAPHIC = 1, 2
 
 
-def write_tiff(path, heights, *, raster=IS_AREA, model=PROJECTED, scale=(30.0, 20.0, 0.0), tie=None, nodata=None, **options):
-    """A GeoTIFF by hand: GTModelTypeGeoKey 1024, GTRasterTypeGeoKey 1025, ModelPixelScale 33550, ModelTiepoint 33922."""
+def write_tiff(
+    path, heights, *, raster=IS_AREA, model=PROJECTED, scale=(30.0, 20.0, 0.0), tie=None, nodata=None, keys=None, metadata=None,
+    **options
+):  # fmt: skip
+    """A GeoTIFF by hand: ModelPixelScale 33550, ModelTiepoint 33922; GTModelTypeGeoKey 1024, GTRasterTypeGeoKey 1025.
+
+    Of further `keys`, floats stand in a tag of their own.
+    """
     tifffile = pytest.importorskip("tifffile")
     tags = []
     if scale is not None:
         tags.append((33550, "d", 3, scale, True))
     if tie is not None:
         tags.append((33922, "d", 6, tie, True))
-        tags.append((34735, "H", 12, (1, 1, 0, 2, 1024, 0, 1, model, 1025, 0, 1, raster), True))
+        keys = {1024: model, 1025: raster, **(keys or {})}
+        doubles = [value for value in keys.values() if isinstance(value, float)]
+        entries = [
+            (key, 34736, 1, doubles.index(value)) if isinstance(value, float) else (key, 0, 1, value)
+            for key, value in sorted(keys.items())
+        ]
+        directory = (1, 1, 0, len(keys), *(number for entry in entries for number in entry))
+        tags.append((34735, "H", len(directory), directory, True))
+        if doubles:
+            tags.append((34736, "d", len(doubles), doubles, True))
     if nodata is not None:
         tags.append((42113, "s", 0, nodata, True))
+    if metadata is not None:
+        tags.append((42112, "s", 0, f"<GDALMetadata>{metadata}</GDALMetadata>", True))
     tifffile.imwrite(path, heights, extratags=tags, photometric="minisblack", **options)
 
 
@@ -94,6 +112,58 @@ def test_tiff_in_degrees_becomes_local_metres(tmp_path):
     # The mean latitude is 45 degrees: 78,847 m and 111,132 m to a degree there, as tables of WGS84 have it.
     np.testing.assert_allclose((terrain.dx, terrain.dy), (788.47, 1111.32), rtol=1e-5)
     assert placed(terrain)[2:] == (0, 0)
+
+
+MOON, MARS = 1737400.0, 3396190.0
+
+
+def ellipse_at_60(a, c):
+    """By the parametric latitude b: the parallel's radius a cos(b), and the meridian's radius of curvature."""
+    b = np.arctan(c / a * np.tan(np.radians(60)))
+    return a * np.cos(b), ((a * np.sin(b)) ** 2 + (c * np.cos(b)) ** 2) ** 1.5 / (a * c)
+
+
+EARTH_AT_60 = ellipse_at_60(6378137.0, 6356752.314245)
+IN_DEGREES = {"model": GEOGRAPHIC, "scale": (0.01, 0.01, 0), "tie": (0, 0, 0, 10, 60.01, 0)}  # in the middle 60 degrees north
+
+
+@pytest.mark.parametrize(
+    ("keys", "along_x", "along_y"),
+    [
+        # A sphere's radius r: r cos(60) and r to a radian.
+        ({2048: 32767, 2057: MOON, 2058: MOON}, MOON / 2, MOON),
+        ({2048: 32767, 2057: MOON, 2059: 0.0}, MOON / 2, MOON),
+        ({2048: 49900, 2057: MARS, 2058: 3376200.0}, *ellipse_at_60(MARS, 3376200.0)),
+        # The Earth's systems without axes, and none at all: WGS84.
+        ({2048: 4269}, *EARTH_AT_60),
+        ({2048: 32767, 2056: 7030}, *EARTH_AT_60),
+        ({}, *EARTH_AT_60),
+    ],
+)
+def test_degrees_are_those_of_the_files_globe(tmp_path, keys, along_x, along_y):
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
+    terrain = load_heights(tmp_path / "x.tif")
+    np.testing.assert_allclose((terrain.dx, terrain.dy), np.radians(0.01) * np.array((along_x, along_y)), rtol=1e-7)
+
+
+@pytest.mark.parametrize("keys", [{2048: 32767}, {2048: 30100}, {2048: 32767, 2057: MOON}])
+def test_a_globe_of_unknown_size_needs_a_cell_size(tmp_path, keys):
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
+    with pytest.raises(ValueError, match=r"x\.tif: its degrees are on a globe of unknown size: dx and dy must be given"):
+        load_heights(tmp_path / "x.tif", dx=3.0)
+    assert placed(load_heights(tmp_path / "x.tif", dx=3.0, dy=4.0)) == (3, 4, 0, 0)
+
+
+SCALED = '<Item name="OFFSET" sample="0" role="offset">-500</Item><Item name="SCALE" sample="0" role="scale">0.25</Item>'
+
+
+def test_gdals_scale_and_offset_are_applied(tmp_path):
+    """To the stored value, which is also what nodata means; other items and other bands do not count."""
+    others = '<Item name="AREA">Point</Item><Item name="SCALE" sample="1" role="scale">9</Item>'
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST, scale=None, nodata="5", metadata=SCALED + others)
+    terrain = load_heights(tmp_path / "x.tif", z_scale=2.0)
+    np.testing.assert_array_equal(terrain.heights, [[-998, np.nan, -997], [-999.5, -999, -998.5]])
+    assert terrain.heights.dtype == np.float32
 
 
 @pytest.mark.parametrize(
@@ -216,7 +286,7 @@ BAD_FILES = [
         "metres.npz",
         save(elevation=np.zeros((2, 2)), dx=30.0, dy=30.0, xmin=0.0, ymin=5e6, ymax=5e6),
         {},
-        "degrees must lie on the Earth",
+        "degrees must lie on a globe",
     ),
     ("cut.npz", cut_npz, {}, "not a zip file"),
     ("lying.npz", lying_npz, {}, "its header declares 2048000000 bytes of data, 0 are there"),
@@ -226,6 +296,24 @@ BAD_FILES = [
     ("text.tif", lambda path: path.write_text("no"), {}, "not a TIFF"),
     ("rgb.tif", lambda path: write_rgb(path), {}, "must be one band, it has 3"),
     ("nodata.tif", lambda path: write_tiff(path, NORTH_FIRST, scale=None, nodata="none"), {}, "must be a number, it is 'none'"),
+    (
+        "scale.tif",
+        lambda path: write_tiff(path, NORTH_FIRST, scale=None, metadata=SCALED.replace("0.25", "x")),
+        {},
+        "number, it is 'x'",
+    ),
+    (
+        "xml.tif",
+        lambda path: write_tiff(path, NORTH_FIRST, scale=None, metadata="<Item>"),
+        {},
+        "its GDAL_METADATA tag must be XML",
+    ),
+    (
+        "grads.tif",
+        lambda path: write_tiff(path, NORTH_FIRST, keys={2054: 9105}, **IN_DEGREES),
+        {},
+        "GeogAngularUnitsGeoKey is 9105",
+    ),
     ("high.npy", save(a=np.full((2, 2), 1e300)), {"z_scale": 1e10}, "heights times z_scale must fit into float64"),
     ("half.tif", lambda path: write_tiff(path, NORTH_FIRST, tie=None), {}, "rotated rasters are not read"),
     ("x.npy", save(a=np.zeros((2, 2))), {"dx": 0.0}, "dx must be positive and finite, it is 0.0"),
@@ -290,6 +378,25 @@ def test_a_geotiff_may_take_over_the_place_of_another(tmp_path, model, raster):
     with pytest.raises(ValueError, match=r"a\.tif: it must have the shape of the heights, \(3, 3\); it has \(2, 3\)"):
         save_heights(tmp_path / "c.tif", Terrain(np.zeros((3, 3))), like=tmp_path / "a.tif")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "b.tif"]
+
+
+def test_bare_heights_are_written_where_no_place_goes_with_them(tmp_path):
+    save_heights(tmp_path / "x.npy", jnp.asarray([[1.0, 2.5], [3, 4]], jnp.float32))
+    again = load_heights(tmp_path / "x.npy").heights
+    np.testing.assert_array_equal(again, [[1, 2.5], [3, 4]])
+    assert again.dtype == np.float32
+    for name, heights, message in (
+        ("y.npz", np.zeros((2, 2)), "y.npz: what is written must be a Terrain, whose place goes with it; it is a ndarray"),
+        (
+            "y.npy",
+            np.zeros(4),
+            "y.npy: heights must be a Terrain, or float32 or float64 of shape (ny, nx); they are float64 of shape (4,)",
+        ),
+        ("y.npy", np.zeros((2, 2), int), "they are int64 of shape (2, 2)"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            save_heights(tmp_path / name, heights)
+    assert [path.name for path in tmp_path.iterdir()] == ["x.npy"]
 
 
 def test_where_heights_cannot_be_written(tmp_path):

@@ -4,13 +4,14 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxhf import Cylinder, Directional, Heightfield, ImageTexture, Matte, Mirror, Orthographic, Perspective, Point, Sky
-from jaxhf.io import SceneError, _toml_tables, load_heights, load_scene
+from jaxhf.io import SceneError, _toml_tables, load_case, load_heights, load_scene
 from jaxhf.io._procedural import grid
 from jaxhf.io._toml_lines import line_numbers
 from jaxhf.io._toml_values import STEPS
@@ -63,6 +64,16 @@ def test_the_smallest_scene(tmp_path):
     assert isinstance(scene.objects[0].material, Matte)
     np.testing.assert_array_equal(np.asarray(scene.objects[0].material.albedo), (0.7, 0.7, 0.7))
     assert read(tmp_path, CAMERA + FIELD, dtype=np.float64).heights.dtype == jnp.float64
+
+
+@pytest.mark.parametrize("load", [load_scene, load_case])
+def test_heights_are_read_in_a_precision_that_can_be_rendered(tmp_path, load):
+    (tmp_path / "scene.toml").write_text(CAMERA + FIELD)
+    for dtype in (int, np.float16, np.complex64):
+        with pytest.raises(ValueError, match=f"^dtype must be float32 or float64, it is {np.dtype(dtype)}$"):
+            load(tmp_path / "scene.toml", dtype)
+    with jax.enable_x64(False), pytest.raises(ValueError, match=r"^dtype float64 needs JAX's x64 mode"):
+        load(tmp_path / "scene.toml", np.float64)
 
 
 def test_every_part_of_a_scene(tmp_path):
@@ -153,6 +164,13 @@ def test_the_last_transform_acts_first(tmp_path):
     np.testing.assert_allclose(world @ [1, 0, 0, 1], (10, 2, 0, 1), atol=1e-15)
     world = read(tmp_path, CAMERA + FIELD + "transform = [{ scale = [1, 2, 3] }]").objects[0].world_from_object
     np.testing.assert_array_equal(world, np.diag([1, 2, 3, 1]))
+
+
+def test_colours_may_be_larger_than_one_and_scales_negative(tmp_path):
+    scene = read(tmp_path, CAMERA + FIELD + "albedo = 45\ntransform = [{ scale = [1, 1, -1] }]")
+    assert isinstance(scene.objects[0].material, Matte)
+    np.testing.assert_array_equal(np.asarray(scene.objects[0].material.albedo), (45, 45, 45))
+    np.testing.assert_array_equal(scene.objects[0].world_from_object, np.diag([1, 1, -1, 1]))
 
 
 def test_an_image_lies_with_its_top_in_the_north(tmp_path):
@@ -266,6 +284,14 @@ MISTAKES = [
     (view('type = "perspective"\neye = [0, 0, nan]\ntarget = [0, 0, 0]'), 7, "camera.eye must be a list of 3 finite numbers"),
     (light('type = "sky"\nradiance = [1, 2]'), 12, "lights[0].radiance must be a finite number or a list of 3, it is [1, 2]"),
     (surface("albedo = [1, 2]"), 10, "objects[0].albedo must be a finite number or a list of 3, or the name of a texture"),
+    (surface("albedo = -1"), 10, "objects[0].albedo must be 0 or more, or the name of a texture, it is -1"),
+    (surface('material = "mirror"\nreflectance = [1, -0.5, 1]'), 11, "reflectance must be 0 or more, it is [1, -0.5, 1]"),
+    (light('type = "sky"\nradiance = -3'), 12, "lights[0].radiance must be 0 or more, it is -3"),
+    (light('type = "directional"\nradiance = -3'), 12, "lights[0].radiance must be 0 or more, it is -3"),
+    (light('type = "point"\nposition = [0, 0, 1]\nintensity = -3'), 13, "lights[0].intensity must be 0 or more, it is -3"),
+    (texture('source = "checker"\nsize = [2, 2]\nfirst = -1'), 13, "textures.t.first must be 0 or more, it is -1"),
+    (f"{CAMERA}{FIELD}[[pictures]]\n", 10, "'pictures' makes this a fit file, for `jaxhf fit`"),
+    (f"{CAMERA}{FIELD}[fit]\nnoise = 1\n", 10, "'fit' makes this a fit file, for `jaxhf fit`"),
     (field('source = "fractal"\nsize = 5'), 9, "objects[0].size must be a list of 2 whole numbers, rows and columns, it is 5"),
     (field('source = "fractal"\nsize = [5.0, 5]'), 9, "objects[0].size must be a list of 2 whole numbers"),
     (field("file = 3"), 8, "objects[0].file must be a string, it is 3"),

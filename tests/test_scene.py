@@ -4,12 +4,14 @@ import dataclasses
 import re
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
 
 import jaxhf
+from jaxhf._scene import localise
 
 NAN, INF = np.nan, np.inf
 GRID = np.zeros((2, 3))
@@ -72,6 +74,14 @@ BAD = [
     (field(GRID, dx=NAN), "Heightfield: dx must be positive and finite, it is nan"),
     (field(GRID, x0=NAN), "Heightfield: x0 must be finite, it is nan"),
     (field(GRID, y0=-INF), "Heightfield: y0 must be finite, it is -inf"),
+    (field(np.zeros((2, 2), np.float16)), "Heightfield: heights must be float32, float64 or whole numbers, they are float16"),
+    (field(jnp.zeros((2, 2), jnp.bfloat16)), "Heightfield: heights must be float32, float64 or whole numbers, they are bf"),
+    (field(np.zeros((2, 2), complex)), "Heightfield: heights must be float32, float64 or whole numbers, they are complex128"),
+    (
+        field(jaxhf.Terrain(GRID)),
+        "Heightfield: heights must be an array of numbers, they are a Terrain: take its .heights, .dx, .dy, .x0 and .y0",
+    ),
+    (field("high"), "Heightfield: heights must be an array of numbers, they are a str"),
     (placed(np.zeros((4, 4))), "Object: world_from_object must be affine (last row 0 0 0 1), its last row is [0.0, 0"),
     (placed(matrix(m22=0)), "Object: world_from_object must be invertible, it flattens space: "),
     (placed(matrix(m10=2, m11=0, m01=0)), "Object: world_from_object must be invertible, it flattens space: "),
@@ -189,6 +199,45 @@ def test_precision_of_heights():
     assert jaxhf.Heightfield(np.array([[1, 2], [3, 4]], np.uint8)).heights.dtype == jnp.float32
     assert jaxhf.Heightfield(np.zeros((2, 2), np.float32)).heights.dtype == jnp.float32
     assert jaxhf.Heightfield(np.zeros((2, 2))).heights.dtype == jnp.float64
+
+
+@pytest.mark.parametrize(("ny", "nx", "padded"), [(11520, 23040, "16384 x 32768"), (2, 2**27 + 2, "2 x 268435456")])
+def test_no_more_cells_than_can_be_traced(ny, nx, padded):
+    """Shapes alone: both are fewer than 2^28 heights."""
+    with pytest.raises(
+        ValueError, match=re.escape(f"at most 2**28 cells, each side rounded up to a power of two; shape {(ny, nx)}")
+    ) as error:
+        jax.eval_shape(jaxhf.Heightfield, jax.ShapeDtypeStruct((ny, nx), jnp.float32))
+    assert str(error.value).endswith(f"makes {padded}")
+
+
+@pytest.mark.parametrize(("ny", "nx"), [(11520, 16385), (16384, 16384), (2, 2**27 + 1)])
+def test_as_many_cells_as_can_be_traced(ny, nx):
+    def lowered(heights):
+        return jaxhf.cast(jaxhf.Heightfield(heights), (0.5, 0.5, 9.0), (0, 0, -1.0)).t
+
+    assert jax.eval_shape(lowered, jax.ShapeDtypeStruct((ny, nx), jnp.float32)).shape == ()
+
+
+@pytest.mark.parametrize("dtype", [jnp.int32, jnp.uint8, bool])
+def test_whole_numbers_in_jax_become_floats(dtype):
+    """Whatever moves them later would lose its fractions."""
+    three, square = jnp.array([0, 0, 1], dtype), jnp.eye(4).astype(dtype)
+    leaves: tuple[Any, ...] = (
+        jaxhf.Point(three, three).p, jaxhf.Point(three, three).intensity, jaxhf.Directional(three, three).radiance,
+        jaxhf.Matte(three).albedo, jaxhf.Matte(jnp.array(1, dtype)).albedo, jaxhf.Cylinder(jnp.array(1, dtype)).radius,
+        jaxhf.Object(FIELD, None, square).world_from_object, jaxhf.Perspective(square).world_from_camera,
+    )  # fmt: skip
+    assert {leaf.dtype for leaf in leaves} == {np.dtype(np.float64)}
+    np.testing.assert_array_equal(leaves[0], (0, 0, 1))
+
+
+def test_a_light_at_whole_numbers_stands_there_beside_a_shifted_grid():
+    """Localised, the grid's corner (0.5, 0.25) is the origin."""
+    made = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(GRID, x0=0.5, y0=0.25))], CAMERA, [jaxhf.Point(jnp.array([0, 0, 5]))])
+    (light,) = localise(made).lights
+    assert isinstance(light, jaxhf.Point)
+    np.testing.assert_array_equal(light.p, (-0.5, -0.25, 5))
 
 
 def test_defaults():

@@ -8,6 +8,7 @@ from ._files import (
     PathLike,
     by_ending,
     require_file,
+    require_precision,
     require_writable_text as require_writable_text,
     save_text as save_text,
 )
@@ -27,12 +28,12 @@ def load_scene(path: PathLike, dtype: DTypeLike = np.float32) -> Scene:
 
     Args:
       path: the file; those that it names lie in its folder or below.
-      dtype: of the heights, and thereby the precision of the picture; float64 needs JAX's x64 mode.
+      dtype: of the heights, and thereby the precision of the picture: float32, or float64, which needs JAX's x64 mode.
 
     Raises:
       FileNotFoundError: `path` is not there.
-      ValueError: its ending is another.
+      ValueError: its ending or `dtype` is another, or x64 mode is off for float64.
       SceneError: something is wrong in the file; the message gives its line.
     """
-    path = require_file(path)
+    dtype, path = require_precision(dtype), require_file(path)
     return by_ending(_READERS, path, "read a scene from")(path, dtype)

@@ -8,7 +8,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
 import numpy as np
+from numpy.typing import DTypeLike
 
 from ._source import nearest
 
@@ -90,6 +92,16 @@ def save_text(path: PathLike, text: str) -> None:
     """Writes a text as UTF-8; the file appears whole or not at all."""
     with replacing(Path(path)) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def require_precision(dtype: DTypeLike) -> np.dtype:
+    """The type that heights are read in; ValueError where it is not float32 or float64, or JAX would narrow it in silence."""
+    found = np.dtype(dtype)
+    if found not in (np.float32, np.float64):
+        raise ValueError(f"dtype must be float32 or float64, it is {found}")
+    if jax.dtypes.canonicalize_dtype(found) != found:
+        raise ValueError("dtype float64 needs JAX's x64 mode: jax.config.update('jax_enable_x64', True)")
+    return found
 
 
 def require_pixels(height: int, width: int) -> None:

@@ -31,29 +31,41 @@ def load_image(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
       FileNotFoundError: no file is there.
       ValueError: the ending is not known, or the file is not a whole image of that kind.
     """
+    return _load(path, linear_from_srgb)
+
+
+def load_numbers(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
+    """As `load_image`, for an image whose values are not colours: those of .png and .jpg are shares of 255, or of 65535."""
+    return _load(path, lambda encoded: encoded)
+
+
+def _load(path: PathLike, decode: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     path = require_file(path)
     reader = by_ending(_READERS, path, "read an image with")
     with reading(path):
         image = reader(path)
+    if image.dtype.kind == "u":
+        top = np.iinfo(image.dtype).max
+        image = decode(np.arange(top + 1) / top).astype(np.float32)[image]
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
 def save_image(path: PathLike, image: Any) -> None:
     """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
 
-    .png: 8-bit sRGB of the values clipped to 0..1; nan becomes 0. .exr and .pfm: float32. .npy: in the precision of
-    `image`. The last three keep nan and inf. The file appears whole or not at all: what was there before stays
-    until its successor is complete.
+    Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8-bit sRGB of the values clipped to 0..1;
+    nan becomes 0. .exr and .pfm: float32. .npy: in the precision of `image`. The last three keep nan and inf. The file
+    appears whole or not at all: what was there before stays until its successor is complete.
 
     Raises:
-      FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of real numbers.
+      FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of floats.
     """
     path = require_writable(path)
     pixels = np.asarray(image)
     if pixels.dtype.kind == "V":  # bfloat16 and its like, which .npy would store without their meaning
         pixels = pixels.astype(np.float32)
-    if pixels.dtype.kind not in "fiub":
-        raise ValueError(f"{path}: an image must hold real numbers, this one holds {pixels.dtype}")
+    if pixels.dtype.kind != "f":
+        raise ValueError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
         raise ValueError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
     with replacing(path) as temporary:
@@ -87,13 +99,14 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-# One reader a format: a path to float32, shape (h, w, 3) or (h, w).
+# One reader a format: a path to shape (h, w, 3) or (h, w), float32 or, where values are encoded, uint8 or uint16.
 
 
 def _read_png(path: Path) -> np.ndarray:
     png = read_png(path)
     if png.depth == 16:
-        return _decoded(samples_16(png)[:, :, : 3 if png.channels > 2 else 1], 65535)
+        samples = samples_16(png)
+        return samples[:, :, :3] if png.channels > 2 else samples[:, :, 0]
     return _read_pillow(path, PngImageFile)
 
 
@@ -107,12 +120,7 @@ def _read_pillow(path: Path, kind: type[ImageFile]) -> np.ndarray:
         image = kind(file)
         require_pixels(image.height, image.width)
         image.info.pop("transparency", None)  # or convert warns that it will be lost
-        return _decoded(np.asarray(image.convert("RGB")), 255)
-
-
-def _decoded(samples: np.ndarray, top: int) -> np.ndarray:
-    linear = linear_from_srgb(np.arange(top + 1) / top).astype(np.float32)[samples]
-    return linear[:, :, 0] if linear.shape[2] == 1 else linear
+        return np.asarray(image.convert("RGB"))
 
 
 def _openexr(doing: str) -> Any:

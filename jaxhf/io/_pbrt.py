@@ -255,8 +255,8 @@ class _Reader:
             return Matte(0.5)
         with located(args.word):
             if args.kind == "mirror":
-                return Mirror(args["color Kr"])
-            return Matte(args["color Kd"] if args["texture Kd"] is None else self._texture(args))
+                return Mirror(args.colour("color Kr"))
+            return Matte(args.colour("color Kd") if args["texture Kd"] is None else self._texture(args))
 
     def _texture(self, args: Arguments) -> ImageTexture:
         name, known = args["texture Kd"], self.graphics.textures

@@ -102,12 +102,12 @@ def _stratified(args: Arguments) -> int:
 
 def _point_light(args: Arguments, world_from_object: Matrix) -> Point:
     # pbrt-v2 moves the light by "from" after the current transformation, so "from" counts in world units.
-    return Point(world_from_object[:3, 3] + args["point from"], args["color I"] * args["color scale"])
+    return Point(world_from_object[:3, 3] + args["point from"], args.colour("color I") * args.colour("color scale"))
 
 
 def _distant_light(args: Arguments, world_from_object: Matrix) -> Directional:
     towards = world_from_object[:3, :3] @ (args["point from"] - args["point to"])
-    return Directional(towards, args["color L"] * args["color scale"])
+    return Directional(towards, args.colour("color L") * args.colour("color scale"))
 
 
 def _heightfield(args: Arguments, dtype: np.dtype) -> Heightfield:

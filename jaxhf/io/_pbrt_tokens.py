@@ -221,6 +221,11 @@ class Arguments:
         if not valid:
             raise self.error(declared, f"{declared.split()[1]} must {rule}, it is {self.values[declared]}")
 
+    def colour(self, declared: str) -> Any:
+        """Of a light or a surface: SceneError where it is negative."""
+        self.require(declared, bool(np.all(self[declared] >= 0)), "be 0 or more")
+        return self[declared]
+
 
 def read_arguments(statement: Statement, kinds: Mapping[str, Parameters], at: int = 0) -> Arguments:
     """The kind of a `Shape "kind" "type name" value ...` and its parameters; `at`: how many strings precede the kind."""

@@ -5,15 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ._files import PathLike, by_ending, reading, replacing, require_folder
-from ._terrain import Terrain, require_tifffile
+from ._geotiff import require_tifffile
+from ._terrain import Terrain
 
 # ModelPixelScale, ModelTiepoint, ModelTransformation and the three tags of GeoKeys: where a raster lies, on which Earth.
 _PLACE_TAGS = (33550, 33922, 34264, 34735, 34736, 34737)
 
 
-def save_heights(path: PathLike, terrain: Terrain, like: PathLike | None = None) -> None:
+def save_heights(path: PathLike, terrain: Terrain | ArrayLike, like: PathLike | None = None) -> None:
     """Writes heights, .npy, .npz or .tif, with their spacing and origin (.npy: without). The file appears whole or not at all.
 
     .tif starts in the north and is a GeoTIFF (OGC 19-008r4): its coordinates are those of `terrain`, of no named system, or
@@ -21,15 +23,31 @@ def save_heights(path: PathLike, terrain: Terrain, like: PathLike | None = None)
 
     Args:
       path: the file.
-      terrain: the heights; nan and inf are kept.
+      terrain: the heights; nan and inf are kept. For .npy, which holds no more, floats of shape (ny, nx) will do.
       like: a GeoTIFF of the same shape, whose place on the map a .tif takes over tag by tag.
 
     Raises:
-      FileNotFoundError, PermissionError, ValueError: as `require_writable_heights`; or `like` has another shape.
+      FileNotFoundError, PermissionError, ValueError: as `require_writable_heights`; or `terrain` is neither, or `like` has
+        another shape.
     """
     path = require_writable_heights(path)
+    terrain = _terrain(path, terrain)
     with replacing(path) as temporary:
         _WRITERS[path.suffix.lower()](temporary, terrain, None if like is None else Path(like))
+
+
+def _terrain(path: Path, given: Any) -> Terrain:
+    if isinstance(given, Terrain):
+        return given
+    if path.suffix.lower() != ".npy":
+        raise ValueError(f"{path}: what is written must be a Terrain, whose place goes with it; it is a {type(given).__name__}")
+    heights = np.asarray(given)
+    if heights.dtype not in (np.float32, np.float64) or heights.ndim != 2:
+        raise ValueError(
+            f"{path}: heights must be a Terrain, or float32 or float64 of shape (ny, nx); "
+            f"they are {heights.dtype} of shape {heights.shape}"
+        )
+    return Terrain(heights)
 
 
 def require_writable_heights(path: PathLike) -> Path:

@@ -40,7 +40,7 @@ def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
       SceneError: anything is wrong in it; with its line.
     """
     part = open_toml(path)
-    values = part.read(SCENE)
+    values = read_scene(part)
     parts = {
         "camera": read_camera(part.at("camera", table=values["camera"])),
         "lights": read_lights(part, values["lights"]),
@@ -62,6 +62,14 @@ def open_toml(path: Path) -> Part:
     except (UnicodeDecodeError, RecursionError) as error:
         raise SceneError(path, None, f"this is not TOML: {error}") from error
     return Part(path, line_numbers(text), (), content)
+
+
+def read_scene(part: Part) -> dict[str, Any]:
+    """The values of a scene's outermost table."""
+    for name in ("pictures", "fit"):
+        if name in part.table:
+            raise part.at(name).error(f"{name!r} makes this a fit file, for `jaxhf fit`; a scene has no such table")
+    return part.read(SCENE)
 
 
 def read_camera(part: Part) -> Camera:

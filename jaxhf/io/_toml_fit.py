@@ -2,7 +2,7 @@
 
 import dataclasses
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,15 +12,17 @@ from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
 from .._camera import Camera
+from .._heightfield import Heightfield
 from .._light import Light
 from .._scene import Object, Scene
 from .._settings import Settings
-from ._files import PathLike, by_ending, require_file
-from ._images import load_image
+from ._files import PathLike, by_ending, require_file, require_precision
+from ._images import load_image, load_numbers
 from ._pbrt import load_pbrt
-from ._terrain import load_heights
-from ._toml import named_file, open_toml, read_camera, read_lights, read_objects
+from ._terrain import jacksboro_file
+from ._toml import named_file, open_toml, read_camera, read_lights, read_objects, read_scene
 from ._toml_checks import Part
+from ._toml_known import Sought, known_deviations, known_heights, sought_heightfield
 from ._toml_tables import SCENE, Key, Keys
 from ._toml_values import flag, number, number_list, number_or_word, table, tables, whole, whole_or_word, word
 
@@ -107,6 +109,7 @@ class _Base(NamedTuple):
     samples: int
     camera: Callable[[tuple[int, ...]], Camera] | None
     like: Path | None
+    sought: Sought
 
 
 def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
@@ -114,20 +117,20 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
 
     Args:
       path: the file; those that it names lie in its folder or below.
-      dtype: of the heights, and thereby the precision of the fit; float64 needs JAX's x64 mode.
+      dtype: of the heights, and thereby the precision of the fit: float32, or float64, which needs JAX's x64 mode.
 
     Raises:
       FileNotFoundError: `path` is not there.
-      ValueError: its ending is another.
+      ValueError: its ending or `dtype` is another, or x64 mode is off for float64.
       SceneError: something is wrong in the file; the message gives its line.
     """
-    path = require_file(path)
+    dtype, path = require_precision(dtype), require_file(path)
     by_ending({".toml": None}, path, "read what to fit from")
     part = open_toml(path)
     values = part.read(_CASE)
     settings = _given(part.at("settings", table=values["settings"]), _SETTINGS)
     settings = part.at("settings", table=values["settings"]).made(Settings, **settings)
-    base = _base(part, values, np.dtype(dtype))
+    base = _base(part, values, dtype)
     if not values["pictures"]:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
     chosen = part.at("fit", table=values["fit"])
@@ -135,7 +138,8 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     noise = options.pop("noise", _FIT["noise"].default)
     for name in ("start", "prior", "prior_std"):
         if isinstance(options.get(name), str):
-            options[name] = _read(chosen, name, load_heights, options[name]).heights
+            known = known_deviations if name == "prior_std" else known_heights
+            options[name] = _read(chosen, name, partial(known, base.sought), options[name])
     scenes, targets, weights, noises, names = [], [], [], [], []
     for k, picture_table in enumerate(values["pictures"]):
         picture = part.at("pictures", k, table=picture_table)
@@ -172,24 +176,31 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     path = place.made(named_file, part, values["scene"])
     if place.made(by_ending, {".toml": True, ".pbrt": False}, path, "read a scene from"):
         other = open_toml(path)
-        return _toml_base(other, other.read(SCENE), dtype)
+        return _toml_base(other, read_scene(other), dtype)
     scene = load_pbrt(path, dtype)
-    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, None)
+    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, None, _sought(part, [], scene.objects))
 
 
 def _toml_base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     objects = read_objects(part, values, dtype)
     camera = None if values["camera"] is None else partial(_sized, part.at("camera", table=values["camera"]))
     lights = read_lights(part, values["lights"])
-    return _Base(tuple(objects), tuple(lights), values["samples"], camera, _like(part, values["objects"]))
+    sought = _sought(part, values["objects"], objects)
+    return _Base(tuple(objects), tuple(lights), values["samples"], camera, _like(sought), sought)
 
 
-def _like(part: Part, objects: list[dict[str, Any]]) -> Path | None:
+def _sought(part: Part, tables: list[dict[str, Any]], objects: Sequence[Object]) -> Sought:
+    """The first heightfield; it has a table in TOML only."""
+    shape = next((obj.shape.heights.shape for obj in objects if isinstance(obj.shape, Heightfield)), ())
+    item = next((item for item in tables if item["shape"] == "heightfield"), {})
+    path = named_file(part, item["file"]) if "file" in item else None
+    return sought_heightfield(item, shape, Path(jacksboro_file()) if item.get("source") == "jacksboro" else path)
+
+
+def _like(sought: Sought) -> Path | None:
     """The GeoTIFF of the first heightfield, unless the scene puts it elsewhere."""
-    first = next((item for item in objects if item["shape"] == "heightfield"), {})
-    if not str(first.get("file", "")).lower().endswith((".tif", ".tiff")):
-        return None
-    return None if {"dx", "dy", "x0", "y0"} & first.keys() else named_file(part, first["file"])
+    on_map = sought.path is not None and sought.path.suffix.lower() in (".tif", ".tiff") and not sought.given
+    return sought.path if on_map else None
 
 
 def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any:
@@ -210,7 +221,7 @@ def _weights(picture: Part, given: dict[str, Any], size: tuple[int, ...]) -> Flo
         return None
     if len(present) > 1:
         raise picture.at("weights").error(f"{picture.name} must have mask or weights, it has both")
-    weights = _read(picture, present[0], load_image, given[present[0]]).mean(axis=-1)
+    weights = _read(picture, present[0], load_numbers, given[present[0]]).mean(axis=-1)
     if weights.shape != size:
         place = picture.at(present[0])
         raise place.error(f"{place.name} must have the size of the image, {_by(size)}; it is {_by(weights.shape)}")

@@ -71,12 +71,20 @@ def size(value: Any) -> list[int]:
     return value
 
 
-def colour(value: Any) -> list[float]:
+def factors(value: Any) -> list[float]:
+    """Three numbers, or one that stands for all of them."""
     if _is_number(value):
         return [float(value)] * 3
     if not _is_list(value, 3, _is_number):
         raise ValueError("a finite number or a list of 3")
     return [float(item) for item in value]
+
+
+def colour(value: Any) -> list[float]:
+    found = factors(value)
+    if min(found) < 0:
+        raise ValueError("0 or more")
+    return found
 
 
 def colour_or_name(value: Any) -> list[float] | str:
@@ -122,7 +130,7 @@ def steps(value: Any) -> Float[np.ndarray, "4 4"]:
 STEPS: dict[str, tuple[Callable[[Any], list[float]], Callable[..., np.ndarray]]] = {
     "translate": (numbers(3), translate),
     "rotate": (numbers(4), rotate),
-    "scale": (colour, scale),
+    "scale": (factors, scale),
 }
 
 
