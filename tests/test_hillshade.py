@@ -27,7 +27,7 @@ def slope(east: float, north: float) -> Terrain:
 
 @pytest.mark.parametrize(("east", "north"), [(0.5, 0.0), (0.0, -0.7), (-0.3, 0.4)])
 def test_planes_have_the_shade_of_their_slope(tmp_path, east, north):
-    """Horn's formula and all others agree on a plane: the cosine between its normal and the light; as GDAL's, but for the sky."""
+    """All formulae agree on a plane: the cosine between its normal and the light; as GDAL's, but for the sky."""
     path = tmp_path / "plane.npz"
     jaxhf.save_heights(path, slope(east, north))
     options = ["--azimuth", "30", "--altitude", "60", "--sky", "0.25", "--precision", "float64"]
