@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ._measure import LEAST_SECONDS
 from ._tradeoff import COLUMNS, FIGURES, FINEST_DERIVATIVE, Configuration, Sweep, describe
 from ._worker import MeasurementError, Worker, available_bytes
 from .io._sweep import append_row, load_reference
@@ -167,11 +168,12 @@ def _minutes(sweep: Sweep, missing: Sequence[Configuration], start: float, frame
     for one in missing:
         starts += {"picture": 1.5, "derivative": 8, "fit": 12}[one.task] * start
         share = (one.settings.samples or 1) / samples * (2 if one.precision == "float64" else 1)
-        runs += (repeats + 1) * frame * (1 + (share if one.task == "picture" else 1))
+        share = share if one.task == "picture" else 1
+        runs += (repeats + 1) * (max(frame, LEAST_SECONDS) + max(frame * share, LEAST_SECONDS))
     total = starts / _together(sweep) + runs
     lacking = _lacking_references(sweep, missing)
     if "picture" in lacking:
         total += 2 * start + 2 * frame * sweep.reference_samples / samples
     if "derivative" in lacking:
         total += 8 * start
-    return max(1, math.ceil(total / 60))
+    return max(1, math.ceil(1.2 * total / 60))  # rather too many than too few

@@ -102,11 +102,18 @@ def serve(prepare: Callable[[dict[str, Any]], Mapping[str, Callable[[], Mapping[
         print(json.dumps(answers[line.strip()]()), flush=True)
 
 
-def timed(frame: Callable[[], object]) -> dict[str, float]:
-    """What one run takes: seconds by the clock, and by the processors together, which a busy machine disturbs less."""
+def timed(frame: Callable[[], object], least: float = 0.0) -> dict[str, float]:
+    """What one run takes: seconds by the clock, and by the processors together, which a busy machine disturbs less.
+
+    Args:
+      least: runs are repeated until they have taken so many seconds together; the mean counts.
+    """
     begin, cpu = time.perf_counter(), time.process_time()
-    frame()
-    return {"seconds": time.perf_counter() - begin, "cpu_seconds": time.process_time() - cpu}
+    runs, elapsed = 0, 0.0
+    while not runs or elapsed < least:
+        frame()
+        runs, elapsed = runs + 1, time.perf_counter() - begin
+    return {"seconds": elapsed / runs, "cpu_seconds": (time.process_time() - cpu) / runs}
 
 
 def usable_cores() -> int:
