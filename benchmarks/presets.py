@@ -88,7 +88,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=240)
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    print("eight sweeps, about 15 minutes on two free cores", flush=True)
+    print("eight sweeps, about 17 minutes on two free cores", flush=True)
     scenes = Path(__file__).parents[1] / "scenes"
     found, derivatives = {}, {}
 

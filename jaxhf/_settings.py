@@ -47,17 +47,17 @@ class Settings:
     @classmethod
     def draft(cls) -> "Settings":
         """One sample a pixel: to find a view. RMSE of the picture at most 0.35 of its mean, see docs/tradeoff.md."""
-        return cls(samples=1, edge_samples=1000)
+        return cls(samples=1, edge_samples=10_000)
 
     @classmethod
     def balanced(cls) -> "Settings":
         """Nine samples a pixel: to look at. RMSE of the picture at most 0.07 of its mean, see docs/tradeoff.md."""
-        return cls(samples=9, edge_samples=10_000)
+        return cls(samples=9, edge_samples=100_000)
 
     @classmethod
     def exact(cls) -> "Settings":
         """64 samples a pixel: to measure with. RMSE of the picture at most 0.02 of its mean, see docs/tradeoff.md."""
-        return cls(samples=64, edge_samples=100_000)
+        return cls(samples=64, edge_samples=300_000)
 
     def __post_init__(self):
         for name, kind in (("traversal", Traversal), ("shading", Shading), ("normals", NormalScheme)):
