@@ -67,12 +67,16 @@ def plot(
     for name, settings in PRESETS.items():
         for axes, value in ((by_count, settings.samples), (by_edges, settings.edge_samples)):
             axes.axvline(value, color="0.7", linestyle=":")
-            axes.text(value, 1.0, f" {name}", color="0.4", transform=axes.get_xaxis_transform(), va="top")
+            axes.text(
+                value, 0.99, f"{name} ", color="0.4", transform=axes.get_xaxis_transform(), va="top", ha="right", rotation=90
+            )
     by_count.set(xscale="log", yscale="log", xlabel="samples a pixel", ylabel="RMSE, of the mean radiance")
     by_time.set(xscale="log", yscale="log", xlabel="time, of that of 4 samples")
     by_edges.set(yscale="log", xlabel="points on edges", ylabel="relative error of the derivative")
     by_edges.set_xscale("symlog", linthresh=1000)
-    by_edges.set_xlim(-100, 400_000)
+    by_edges.set_xticks([0, 1000, 10_000, 100_000, 300_000], ["0", "1000", "10 000", "100 000", "300 000"], rotation=30)
+    by_edges.set_xticks([], minor=True)
+    by_edges.set_xlim(-100, 600_000)
     by_count.set_xticks([1, 4, 9, 16, 64], ["1", "4", "9", "16", "64"])
     by_count.set_xticks([], minor=True)
     by_count.set_xlim(0.8, 110)
