@@ -32,7 +32,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):  # which is what JAX calls it
             raise
-        print("jaxhf: error: memory ran out; a smaller picture, --chunk or terrain needs less", file=sys.stderr)
+        print(
+            "jaxhf: error: memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)",
+            file=sys.stderr,
+        )
         return 2
     return 0
 
@@ -104,7 +107,7 @@ def _add_hillshade(commands: Any) -> None:
         "--altitude", type=float, default=45.0, metavar="DEGREES", help="of the light, above the horizon [45]"
     )
     hillshade.add_argument(
-        "--sky", type=float, default=0.0, metavar="RADIANCE", help="light from everywhere, level ground being 1 [0]"
+        "--sky", type=float, default=0.0, metavar="RADIANCE", help="light from everywhere, also seen through holes [0]"
     )
     hillshade.add_argument(
         "--no-shadows", dest="shadows", action="store_false", default=None, help="shade slopes, cast no shadows"
@@ -151,7 +154,7 @@ def _add_machine(command: argparse.ArgumentParser) -> None:
 
 
 def _render(options: argparse.Namespace) -> None:
-    _draw(options, lambda: _load(options.scene, options.precision))
+    _draw(options, lambda: _resized(_load(options.scene, options.precision), options.width, options.height))
 
 
 def _hillshade(options: argparse.Namespace) -> None:
@@ -161,7 +164,9 @@ def _hillshade(options: argparse.Namespace) -> None:
     def scene() -> "Scene":
         terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
         terrain = replace(terrain, heights=terrain.heights.astype(options.precision))
-        return hillshade_scene(terrain, options.azimuth, options.altitude, options.sky)
+        _require_size(options.width, options.height)
+        size = options.width, options.height
+        return hillshade_scene(terrain, options.azimuth, options.altitude, options.sky, *size)
 
     _draw(options, scene, printed if options.output.lower().endswith(".png") else None)
 
@@ -172,7 +177,7 @@ def _draw(options: argparse.Namespace, load: "Callable[[], Scene]", tone: Callab
     require_writable(options.output)
     settings = _settings(options)
     _set_up_jax(options.precision, options.devices)
-    image, report = _timed_render(_resized(load(), options.width, options.height), settings)
+    image, report = _timed_render(load(), settings)
     save_image(options.output, tone(image) if tone else image)
     print(f"{options.output}: {report}")
 
@@ -180,7 +185,6 @@ def _draw(options: argparse.Namespace, load: "Callable[[], Scene]", tone: Callab
 def _convert(options: argparse.Namespace) -> None:
     from pathlib import Path
 
-    from ._heightfield import Heightfield
     from ._info import heightfield_line
     from .io import load_heights, require_writable_heights, save_heights
 
@@ -188,9 +192,8 @@ def _convert(options: argparse.Namespace) -> None:
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
     rasters = {Path(path).suffix.lower() for path in (options.terrain, options.output)} <= {".tif", ".tiff"}
     save_heights(options.output, terrain, options.terrain if rasters else None)
-    field = Heightfield(terrain.heights, terrain.dx, terrain.dy, terrain.x0, terrain.y0)
     alone = " (.npy holds the heights alone)" if Path(options.output).suffix.lower() == ".npy" else ""
-    print(f"{options.output}: {heightfield_line(field)}{alone}")
+    print(f"{options.output}: {heightfield_line(terrain)}{alone}")
 
 
 def _fit(options: argparse.Namespace) -> None:
@@ -207,12 +210,12 @@ def _set_up_jax(precision: str, devices: int | None) -> None:
     """What can only be said before JAX is first used."""
     import jax
 
-    from ._worker import usable_cores
+    from ._worker import default_devices
 
     if devices is not None and devices < 1:
         raise ValueError(f"--devices must be a whole number from 1 on, it is {devices}")
     jax.config.update("jax_enable_x64", precision == "float64")
-    jax.config.update("jax_num_cpu_devices", devices or min(usable_cores(), 16))
+    jax.config.update("jax_num_cpu_devices", devices or default_devices())
 
 
 def _settings(options: argparse.Namespace) -> "Settings":
@@ -230,11 +233,15 @@ def _load(path: str, precision: str) -> "Scene":
     return load_scene(path, np.dtype(precision))
 
 
-def _resized(scene: "Scene", width: int | None, height: int | None) -> "Scene":
-    old = scene.camera
+def _require_size(width: int | None, height: int | None) -> None:
     for name, value in (("width", width), ("height", height)):
         if value is not None and value < 1:
             raise ValueError(f"--{name} must be a whole number of pixels from 1 on, it is {value}")
+
+
+def _resized(scene: "Scene", width: int | None, height: int | None) -> "Scene":
+    old = scene.camera
+    _require_size(width, height)
     if width is None and height is None:
         return scene
     if width is None:

@@ -1,5 +1,7 @@
 """Shaded maps: terrain from straight above, north up."""
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -13,15 +15,23 @@ from .io import Terrain
 from .io._images import linear_from_srgb
 
 
-def hillshade_scene(terrain: Terrain, azimuth: float = 315.0, altitude: float = 45.0, sky: float = 0.0) -> Scene:
-    """A white map of one pixel a cell (in height as many as keep pixels square), in light as cartographers give it.
+def hillshade_scene(
+    terrain: Terrain,
+    azimuth: float = 315.0,
+    altitude: float = 45.0,
+    sky: float = 0.0,
+    width: int | None = None,
+    height: int | None = None,
+) -> Scene:
+    """A white map in light as cartographers give it; of one pixel a cell across, unless its size is given.
 
     Level ground has the radiance sin(altitude) + sky.
 
     Args:
       terrain: the heights.
       azimuth, altitude: of the light, degrees clockwise from north, and above the horizon.
-      sky: radiance of a sky without shadows, which keeps slopes that face away from being black.
+      sky: radiance of a sky without shadows, which keeps slopes that face away from being black. Holes show it.
+      width, height: pixels; see `from_above`.
 
     Raises:
       ValueError: the light is not above the horizon, the sky is not 0 or more, or there is no height.
@@ -32,17 +42,35 @@ def hillshade_scene(terrain: Terrain, azimuth: float = 315.0, altitude: float = 
         raise ValueError(f"hillshade: sky must be 0 or more, it is {sky}")
     if terrain.nodata.all():
         raise ValueError("hillshade: there is no height in the terrain")
-    ny, nx = terrain.heights.shape
-    across, up = (nx - 1) * terrain.dx, (ny - 1) * terrain.dy
-    width, height = nx - 1, max(1, round((nx - 1) * up / across))
-    lowest, highest = np.nanmin(terrain.heights), np.nanmax(terrain.heights)
-    x, y, z = terrain.x0 + across / 2, terrain.y0 + up / 2, float(highest + (highest - lowest) + max(terrain.dx, terrain.dy))
-    camera = Orthographic.look_at(
-        (x, y, z), (x, y, z - 1), up=(0, 1, 0), extent=min(across, across * height / width), width=width, height=height
-    )
     field = Heightfield(terrain.heights, terrain.dx, terrain.dy, terrain.x0, terrain.y0)
     lights = [Directional.from_angles(azimuth, altitude), *([Sky(sky)] if sky else [])]
-    return Scene([Object(field, Matte(1.0))], camera, lights, samples=1)
+    if width is None and height is None:
+        width = terrain.heights.shape[1] - 1
+    return Scene([Object(field, Matte(1.0))], from_above(terrain, width, height), lights, samples=1)
+
+
+def from_above(grid: Terrain | Heightfield, width: int | None, height: int | None) -> Orthographic:
+    """A camera that sees all of a grid from straight above, north up; where its proportions are others, what is beside it, too.
+
+    Args:
+      width, height: pixels; one of the two may be None, and then keeps them square: it is rounded up, so that less than
+        half a pixel on either side is beside the grid.
+    """
+    ny, nx = grid.heights.shape
+    across, up = (nx - 1) * grid.dx, (ny - 1) * grid.dy
+    if width is None:
+        assert height is not None
+        width = _pixels(height * across / up)
+    if height is None:
+        height = _pixels(width * up / across)
+    finite = np.asarray(grid.heights)[np.isfinite(grid.heights)]
+    x, y, z = grid.x0 + across / 2, grid.y0 + up / 2, float(finite.max()) + max(across, up)
+    extent = max(across / width, up / height) * min(width, height)
+    return Orthographic.look_at((x, y, z), (x, y, z - 1), up=(0, 1, 0), extent=extent, width=width, height=height)
+
+
+def _pixels(exact: float) -> int:
+    return math.ceil(exact - 1e-9)  # of a product that is whole but for rounding
 
 
 def printed(image: Float[AnyArray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:

@@ -9,6 +9,7 @@ from ._cylinder import Cylinder
 from ._heightfield import Heightfield
 from ._scene import Scene
 from ._texture import ImageTexture
+from .io import Terrain
 
 
 def scene_lines(scene: Scene) -> Iterator[str]:
@@ -24,7 +25,7 @@ def scene_lines(scene: Scene) -> Iterator[str]:
         yield f"light {k}: {type(light).__name__}, {values}"
 
 
-def heightfield_line(field: Heightfield) -> str:
+def heightfield_line(field: Heightfield | Terrain) -> str:
     heights = np.asarray(field.heights)
     ny, nx = heights.shape
     finite = heights[np.isfinite(heights)]

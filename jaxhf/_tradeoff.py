@@ -16,7 +16,7 @@ from ._measure import resized
 from ._render import settle
 from ._scene import Scene
 from ._settings import Settings
-from ._worker import usable_cores
+from ._worker import default_devices
 from .io import PathLike, load_scene
 from .io._sweep import read_rows
 
@@ -213,7 +213,7 @@ def plan(
     longest = PIXELS // 2 if quick else PIXELS
     scale = width / camera.width if width else min(1.0, longest / max(camera.width, camera.height))
     size = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
-    devices = devices or min(usable_cores(), 16)
+    devices = devices or default_devices()
     fits = fits or not _FIT_VALUES.keys().isdisjoint(knobs)
     if fits and not np.isfinite(scene.heights).all():
         raise ValueError(f"{path}: a fit's terrain must be without holes, this one has {np.sum(~np.isfinite(scene.heights))}")

@@ -121,6 +121,11 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def default_devices() -> int:
+    """How many devices share the work where nobody says: each of a CPU's has a copy of the terrain."""
+    return min(usable_cores(), 16)
+
+
 def available_bytes() -> float:
     """Of memory, caches that the system would give up included; without end where the system does not say (not Linux)."""
     said = Path("/proc/meminfo")

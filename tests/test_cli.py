@@ -138,7 +138,10 @@ def test_no_memory_is_an_error_in_one_line(monkeypatch, capsys, error):
 
     monkeypatch.setattr(command, "_info", fail)
     assert command.main(["info", str(SCENE)]) == 2
-    assert capsys.readouterr().err == "jaxhf: error: memory ran out; a smaller picture, --chunk or terrain needs less\n"
+    assert (
+        capsys.readouterr().err
+        == "jaxhf: error: memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)\n"
+    )
 
 
 # Errors of the user's.

@@ -2,6 +2,7 @@
 
 import itertools
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,6 +60,23 @@ def test_north_is_up_and_shadows_fall_away_from_the_light():
     assert dark[:, 1].mean() > column + 2
     unshadowed = np.asarray(jaxhf.render(scene, jaxhf.Settings(shadows=False)))[..., 0]
     assert (unshadowed > 0).sum() > (image > 0).sum() + 10
+
+
+@pytest.mark.parametrize("shape", [(4, 61), (61, 4), (9, 30)])
+@pytest.mark.parametrize("size", [{}, {"width": 20}, {"height": 7}, {"width": 12, "height": 12}])
+def test_all_of_the_terrain_is_seen(shape, size):
+    """Whatever the proportions and the rounding; what is beside it in a picture of other proportions is black."""
+    scene = hillshade_scene(Terrain(np.zeros(shape), 2.0, 3.0, 100.0, 50.0), 315.0, 45.0, 0.0, **size)
+    camera: Any = scene.camera
+    height, width = camera.height, camera.width
+    assert {"width": width, "height": height}.items() >= size.items()
+    middle = np.array([2 * (shape[1] - 1), 3 * (shape[0] - 1)]) / 2
+    np.testing.assert_allclose(camera.world_from_camera[:2, 3], np.add(middle, [100, 50]))
+    half = float(camera.extent) / 2 * np.array([width, height]) / min(width, height)
+    assert (half >= middle * (1 - 1e-12)).all()
+    assert np.isclose(half, middle).any()
+    if len(size) < 2:  # less than half a pixel on either side is beside it
+        assert (half - middle < half / np.array([width, height])).all()
 
 
 def test_holes_are_black_and_the_rest_is_not():

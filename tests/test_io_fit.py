@@ -272,6 +272,21 @@ def test_scale_and_nodata_hold_for_priors_too(folder):
         case(folder, with_prior("tile.npz", "bare.npy", "nodata = 3\n"))
 
 
+def test_the_files_own_nodata_goes_before_the_terrains(folder):
+    tifffile = pytest.importorskip("tifffile")
+    terrain_file(folder / "tile.npz", TILE, (4, 5))
+    heights = np.array([[1.0, 2], [-9999, 3]], np.float32)
+    tifffile.imwrite(folder / "tagged.tif", heights, photometric="minisblack", extratags=[(42113, "s", 0, "-9999", True)])
+    with pytest.raises(jaxhf.SceneError, match="1 of 4 are holes; the first is row 0 column 0"):
+        case(folder, with_prior("tile.npz", "tagged.tif", "nodata = 3\n"))
+
+
+def test_a_terrain_that_is_moved_and_scaled_in_the_scene_is_still_its_own_prior(folder):
+    heights = terrain_file(folder / "tile.npz", TILE, (4, 5))
+    found = case(folder, with_prior("tile.npz", "tile.npz", "dx = 9.0\ndy = 6.0\nx0 = 0\ny0 = 0\n")).options
+    np.testing.assert_array_equal(found["prior"], heights)
+
+
 WHOLE = SCENE + PICTURE
 BAD = {
     "unknown key": (WHOLE + "\n[fits]\n", r":17: unknown key 'fits'; did you mean 'fit'"),

@@ -99,7 +99,7 @@ def _geo_place(scale: Sequence[float], tie: Sequence[float], keys: Mapping[str, 
     centre = 0.0 if keys.get("GTRasterTypeGeoKey") == 2 else 0.5
     west, south = x + (centre - column) * dx, y - (ny - 1 + centre - row) * dy
     degrees = keys.get("GTModelTypeGeoKey") == 2  # geographic
-    if degrees and keys.get("GeogAngularUnitsGeoKey", 9102) != 9102:
+    if degrees and keys.get("GeogAngularUnitsGeoKey", 9102) not in (0, 9102, 9122):  # undefined, or EPSG's codes of degrees
         raise ValueError(f"its coordinates must be in degrees, GeogAngularUnitsGeoKey is {int(keys['GeogAngularUnitsGeoKey'])}")
     code = keys.get("GeographicTypeGeoKey" if degrees else "ProjectedCSTypeGeoKey")
     system = None if code is None or code == _USER_DEFINED else int(code)

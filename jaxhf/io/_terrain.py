@@ -89,16 +89,25 @@ def load_heights(
 
 
 def load_placed(
-    path: PathLike, given: Mapping[str, float], z_scale: float = 1.0, nodata: float | None = None
+    path: PathLike,
+    given: Mapping[str, float],
+    z_scale: float = 1.0,
+    nodata: float | None = None,
+    nodata_overrules: bool = True,
 ) -> tuple[Terrain, Place]:
-    """As `load_heights`, where `given` are those of dx, dy, x0, y0 that overrule the file; with what the file says itself."""
+    """As `load_heights`, where `given` are those of dx, dy, x0, y0 that overrule the file; with what the file says itself.
+
+    Without `nodata_overrules`, `nodata` counts only where the file names no such value.
+    """
     path = require_file(path)
     reader = by_ending(_READERS, path, "read heights from")
     with reading(path):
         if not math.isfinite(z_scale) or z_scale == 0:
             raise ValueError(f"z_scale must be finite and not zero, it is {z_scale}")
         raw = reader(path)
-        heights = _heights(raw if nodata is None else raw._replace(nodata=nodata), z_scale)
+        if nodata is not None and (nodata_overrules or raw.nodata is None):
+            raw = raw._replace(nodata=nodata)
+        heights = _heights(raw, z_scale)
         place = raw.place.with_metres(len(heights), given)._asdict()
         known = {name: float(place[name]) for name in _GRID if place[name] is not None}
         return Terrain(heights, **known), raw.place

@@ -38,8 +38,8 @@ def known_heights(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
       FileNotFoundError, ValueError: as `load_heights`; or the file does not cover the terrain, or has holes in it.
     """
     cell = {"dx": 1.0, "dy": 1.0}  # in the scene's unit, which does not count here: degrees may be on any globe
-    terrain, place = load_placed(path, cell, sought.z_scale, sought.nodata)
-    heights, wanted = terrain.heights, _wanted(sought, place.degrees)
+    terrain, place = load_placed(path, cell, sought.z_scale, sought.nodata, nodata_overrules=False)
+    heights, wanted = terrain.heights, _wanted(sought, path, place)
     if place.known and wanted.known:
         if place.degrees and not wanted.degrees:
             raise ValueError("it must lie in the coordinates of the terrain, it lies in degrees")
@@ -58,11 +58,18 @@ def known_deviations(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
     return known_heights(sought._replace(z_scale=abs(sought.z_scale)), path)
 
 
-def _wanted(sought: Sought, degrees: bool) -> Place:
-    """The place of the terrain: where its file has them, in degrees if they are asked for, else in the scene's coordinates."""
+def _wanted(sought: Sought, path: Path, known: Place) -> Place:
+    """The place of the terrain to compare with that of another file.
+
+    Where the terrain's own file has it, if both name the same coordinates or are the same file, as its table may have moved
+    or scaled it in the scene; else in the scene.
+    """
     if sought.path is not None:
         _, place = load_placed(sought.path, sought.given)
-        return place if degrees and place.degrees else place.with_metres(sought.shape[0], sought.given)
+        same = place.degrees == known.degrees and (
+            place.degrees or (place.system is not None and place.system == known.system) or path == sought.path
+        )
+        return place if same else place.with_metres(sought.shape[0], sought.given)
     square = {name: sought.given[other] for name, other in (("dx", "dy"), ("dy", "dx")) if other in sought.given}
     return Place()._replace(**{**square, **sought.given})
 
