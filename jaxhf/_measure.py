@@ -21,7 +21,7 @@ from ._scene import Object, Scene
 from ._settings import Settings
 from ._worker import peak_mb, serve, timed
 from .io import load_scene
-from .io._sweep import load_reference, save_reference
+from .io._sweep import known_reference, load_reference, save_reference
 
 DERIVATIVE_PIXELS = 160  # of the longer side: a derivative costs some times a picture
 WAVES = 8  # a side: the gradient is compared along the 8 x 8 smoothest changes of the heights
@@ -198,10 +198,7 @@ def _prepare(job: dict[str, Any]) -> dict[str, Callable[[], Mapping[str, Any]]]:
     if job["task"] == "reference":
 
         def make_reference() -> dict[str, Any]:
-            try:
-                others = load_reference(job["reference"], job["identity"])
-            except (FileNotFoundError, ValueError):
-                others = {}
+            others = known_reference(job["reference"], job["identity"])
             made = _make(job, job["of"], dataclasses.replace(settings, **job["finest"]))
             assert not isinstance(made, Recovery)
             save_reference(job["reference"], job["identity"], others | made.reference())

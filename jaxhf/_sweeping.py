@@ -12,7 +12,7 @@ import numpy as np
 from ._measure import LEAST_SECONDS
 from ._tradeoff import COLUMNS, FIGURES, FINEST_DERIVATIVE, Configuration, Sweep, describe
 from ._worker import MeasurementError, Worker, available_bytes
-from .io._sweep import append_row, load_reference
+from .io._sweep import append_row, known_reference
 
 _SWOLLEN = 3  # the peak of a derivative's process, of a picture's
 
@@ -46,12 +46,13 @@ def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Calla
         peak_mb = yardstick.answer()["peak_mb"]
         start = time.perf_counter() - begin
         frame = yardstick.ask("frame")["seconds"]
-        minutes = _minutes(sweep, missing, start, frame, repeats)
+        lacking = _lacking_references(sweep, missing)
+        minutes = _minutes(sweep, missing, lacking, start, frame, repeats)
         tell(
             f"{sweep.path}: {len(missing)} of {len(sweep.configurations)} configurations to measure, "
             f"{sweep.width} x {sweep.height} pixels; about {minutes} minutes"
         )
-        for task in _lacking_references(sweep, missing):
+        for task in lacking:
             progress(0, len(missing), f"the {task}'s reference, in double precision")
             try:
                 _make_reference(sweep, task)
@@ -146,10 +147,7 @@ def _job(sweep: Sweep, configuration: Configuration) -> dict[str, Any]:
 
 def _lacking_references(sweep: Sweep, missing: Sequence[Configuration]) -> list[str]:
     """Of which tasks a reference is to be made; one of another scene, or damaged, does not count."""
-    try:
-        there = load_reference(sweep.reference, sweep.identity).keys()
-    except (FileNotFoundError, ValueError):
-        there = frozenset()
+    there = known_reference(sweep.reference, sweep.identity)
     tasks = {one.task for one in missing}
     return [task for task, part in (("picture", "hits"), ("derivative", "gradient")) if task in tasks and part not in there]
 
@@ -161,8 +159,10 @@ def _make_reference(sweep: Sweep, task: str) -> None:
         worker.answer()
 
 
-def _minutes(sweep: Sweep, missing: Sequence[Configuration], start: float, frame: float, repeats: int) -> int:
-    """About how long it takes, from the base's start (with compilation) and frame."""
+def _minutes(
+    sweep: Sweep, missing: Sequence[Configuration], lacking: Sequence[str], start: float, frame: float, repeats: int
+) -> int:
+    """About how long it takes, lacking references included, from the base's start (with compilation) and frame."""
     samples = sweep.configurations[0].settings.samples or 1
     starts, runs = 0.0, 0.0
     for one in missing:
@@ -171,7 +171,6 @@ def _minutes(sweep: Sweep, missing: Sequence[Configuration], start: float, frame
         share = share if one.task == "picture" else 1
         runs += (repeats + 1) * (max(frame, LEAST_SECONDS) + max(frame * share, LEAST_SECONDS))
     total = starts / _together(sweep) + runs
-    lacking = _lacking_references(sweep, missing)
     if "picture" in lacking:
         total += 2 * start + 2 * frame * sweep.reference_samples / samples
     if "derivative" in lacking:

@@ -60,6 +60,14 @@ def save_reference(path: PathLike, identity: str, arrays: Mapping[str, np.ndarra
         np.savez(file, **everything)
 
 
+def known_reference(path: PathLike, identity: str) -> dict[str, np.ndarray]:
+    """As `load_reference`; nothing where there is no file, or one that is damaged or of something else."""
+    try:
+        return load_reference(path, identity)
+    except (FileNotFoundError, ValueError):
+        return {}
+
+
 def load_reference(path: PathLike, identity: str) -> dict[str, np.ndarray]:
     """The arrays; FileNotFoundError where there is no file, ValueError where it is damaged or of something else."""
     path = Path(path)
