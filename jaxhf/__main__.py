@@ -61,9 +61,6 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--max-depth", type=int, metavar="N", help="mirror bounces [4]")
     render.add_argument("--max-steps", type=int, metavar="N", help="step budget of a walk [as many as any ray needs]")
     render.add_argument("--chunk", type=int, metavar="RAYS", help="rays traced together [1024]")
-    render.add_argument(
-        "--detail", type=float, metavar="PIXELS", help="how far from its ray a hit may be seen [off: hits are exact]"
-    )
     _add_machine(render)
     render.set_defaults(run=_render)
 
@@ -221,7 +218,7 @@ def _set_up_jax(precision: str, devices: int | None) -> None:
 def _settings(options: argparse.Namespace) -> "Settings":
     from ._settings import Settings
 
-    names = ("samples", "traversal", "shading", "normals", "shadows", "max_depth", "max_steps", "chunk", "detail")
+    names = ("samples", "traversal", "shading", "normals", "shadows", "max_depth", "max_steps", "chunk")
     return Settings(**{name: getattr(options, name) for name in names if getattr(options, name, None) is not None})
 
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from ._grid import Grid, triangle_plane
-from ._ray import Footprint, Ray
+from ._ray import Ray
 from ._transform import finite, lesser
 from ._types import Flag, Index, Scalar
 from ._walk import FAR, LEAVING, MISS, WALKING, Walk, reciprocal
@@ -36,7 +36,6 @@ def begin(
     departure: Departure | None,
     t_max: Scalar | None,
     active: Flag | None,
-    footprint: Footprint | None,
 ) -> tuple[Walk, jax.Array, Flag]:
     """A walk, the state in which it begins, and whether the ray is finite and has a direction.
 
@@ -46,7 +45,6 @@ def begin(
       departure: for rays that leave this surface.
       t_max: where to give up.
       active: False: the walk does not begin at all.
-      footprint: see `first_hit`.
     """
     width, height = grid.pyramid.width, grid.pyramid.height
     assert 3 + width.bit_length() + (height - 1).bit_length() <= 32, "Heightfield checks that a walk's state fits"
@@ -96,7 +94,6 @@ def begin(
         t_stop=jnp.full_like(x, jnp.inf),
         ahead=None if departure is None else (departure.upper == begins_upper) & (rate != 0),
         noise=None if departure is None else jnp.where(departure.active, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
-        footprint=None if footprint is None else Footprint(footprint(t_start), footprint.spread),
     )
     t_stop = lesser(lesser(walk.distance_x(end_x), walk.distance_y(end_y)), walk.t_end)
     walk = eqx.tree_at(lambda walk: walk.t_stop, walk, t_stop if t_max is None else lesser(t_stop, t_max - t_start))

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ._ray import Footprint, Ray
-from ._transform import Affine, affine, dot, largest_component, length, require_invertible, unit
+from ._ray import Ray
+from ._transform import Affine, affine, require_invertible, unit
 from ._types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
 
 
@@ -71,21 +71,6 @@ class Perspective(eqx.Module):
         half = jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2)
         return Ray(world.offset, unit(world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))))
 
-    def footprint(self, x: Scalar, y: Scalar, share: float) -> Footprint:
-        """How long a line that begins on `ray(x, y)` may be, whatever its direction, to be seen within `share` of a pixel.
-
-        A point at depth Z on the ray c = (c_x, c_y, 1) moves by w in the camera's frame, and in the picture by
-        (w_xy - c_xy w_z) / (p (Z + w_z)), where p is a pixel at depth 1. This is at most |w| |c| / (p (Z - |w|)), thus at
-        most `share` as long as |w| (1 + k) <= k Z with k = share p / |c|.
-        """
-        world = affine(jnp.asarray(self.world_from_camera))
-        sx, sy = _screen(self, x, y)
-        half = jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2)
-        c = jnp.stack([sx * half, sy * half, jnp.ones_like(half)])
-        k = share * _pixel(self, half) / length(c)
-        spread = k / (1 + k) / (length(world.vector(c)) * _most_stretched(world.inverse()))
-        return Footprint(jnp.zeros_like(spread), spread)
-
     def film_from_world(self) -> Projection:
         """The inverse of `ray`: where in the picture a point is seen."""
         camera = affine(jnp.asarray(self.world_from_camera)).inverse()
@@ -131,13 +116,6 @@ class Orthographic(eqx.Module):
         origin = world.point(jnp.stack([sx * half, sy * half, jnp.zeros_like(half)]))
         return Ray(origin, unit(world.linear[:, 2]))
 
-    def footprint(self, x: Scalar, y: Scalar, share: float) -> Footprint:
-        """How long a line that begins on `ray(x, y)` may be, whatever its direction, to be seen within `share` of a pixel."""
-        del x, y  # the same for all rays
-        camera = affine(jnp.asarray(self.world_from_camera)).inverse()
-        width = share * _pixel(self, jnp.asarray(self.extent) / 2) / _most_stretched(camera)
-        return Footprint(width, jnp.zeros_like(width))
-
     def film_from_world(self) -> Projection:
         """The inverse of `ray`: where in the picture a point is seen."""
         camera = affine(jnp.asarray(self.world_from_camera)).inverse()
@@ -156,22 +134,6 @@ def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
     """Pixels to the screen on which the shorter side runs from -1 to 1, x right, y up."""
     short = min(camera.width, camera.height)
     return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
-
-
-def _pixel(camera: Camera, half: Scalar) -> Scalar:
-    """The side of a pixel, in the units of `half`, to which the shorter side's half of the screen corresponds."""
-    return 2 * half / min(camera.width, camera.height)
-
-
-def _most_stretched(camera: Affine) -> Scalar:
-    """An upper bound of |camera.vector(w)| / |w|, exact where that is the same for all w.
-
-    The square of its maximum is the largest eigenvalue of linear^T linear, which is at most the largest sum of
-    magnitudes in a row.
-    """
-    columns = [camera.linear[:, k] for k in range(3)]
-    rows = jnp.stack([sum(jnp.abs(dot(one, other)) for other in columns) for one in columns])
-    return jnp.sqrt(largest_component(rows))
 
 
 def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:

@@ -5,7 +5,6 @@ arithmetic, so the derivative costs no memory a step and works in forward and in
 """
 
 import dataclasses
-import functools
 
 import equinox as eqx
 import jax
@@ -17,10 +16,10 @@ from ._begin import Departure
 from ._cylinder import Tube, tube_distance
 from ._grid import Grid, plane_through, triangle_corners, triangle_plane
 from ._lanes import only_where
-from ._ray import Footprint, Ray
+from ._ray import Ray
 from ._settings import Settings
 from ._store import stored
-from ._transform import dot, finite, largest_component, length, power_of_two, unit
+from ._transform import dot, finite, largest_component, power_of_two, unit
 from ._traverse import distance, first_hit, occluded
 from ._types import Flag, Index, Point2, Scalar, Vector
 from ._walk import CellHit, Status
@@ -113,7 +112,6 @@ def intersect(
     origin: Origin | None = None,
     active: Flag | None = None,
     count_steps: bool = False,
-    footprint: Footprint | None = None,
 ) -> Hit:
     """The first hit of a world-frame ray on one surface.
 
@@ -124,7 +122,6 @@ def intersect(
       origin: None for rays that start in free space.
       active: False spares the ray the search: it ends as a miss.
       count_steps: whether to count the steps of the search.
-      footprint: how far, in world units, a hit on a heightfield may be off, see docs/level-of-detail.md; None: it is exact.
     """
     valid = finite(ray.o) & finite(ray.d)
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
@@ -138,11 +135,10 @@ def intersect(
         active=active,
         departure=None if origin is None else stored(origin.departure(surface), surface.sure),
         count_steps=count_steps,
-        footprint=None if footprint is None else _in_heights(surface, footprint, scale),
     )
     found = stored(found, surface.sure)
     met = found.status == int(Status.HIT)
-    hit = surface_interaction(surface, local, found, near_surface=footprint is not None)
+    hit = surface_interaction(surface, local, found)
     t = jnp.where(met, hit.t / scale, jnp.inf)
     hit = dataclasses.replace(hit, t=t, status=found.status, steps=found.steps)
     return stored(hit, surface.sure)
@@ -160,12 +156,6 @@ def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
     return stored((Ray(local.o, local.d / scale), scale), grid.sure)
 
 
-def _in_heights(grid: Grid, footprint: Footprint, scale: Scalar) -> Footprint:
-    """How far apart heights of the grid may be, along a ray of `_in_grid`, to be no further apart than `footprint`."""
-    unit_height = length(grid.world_from_grid.linear[:, 2])
-    return stored(Footprint(footprint.width / unit_height, footprint.spread / (unit_height * scale)), grid.sure)
-
-
 def blocked(
     surface: Surface, ray: Ray, settings: Settings, origin: Origin, active: Flag, t_max: Scalar | None
 ) -> tuple[Flag, Flag]:
@@ -179,10 +169,8 @@ def blocked(
     return occluded(surface, local, max_steps=settings.max_steps, active=active, departure=departure, t_max=t_max)
 
 
-def surface_interaction(grid: Grid, ray: Ray, found: CellHit, near_surface: bool = False) -> Hit:
+def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
     """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray (grid frame).
-
-    Where a walk may also end near the surface, `p` is the point straight above or below the ray's; see `distance`.
 
     What stands at the vertices is fetched before the conditional, which in a reverse derivative would return the derivative
     of all heights and normals once a tile.
@@ -196,7 +184,7 @@ def surface_interaction(grid: Grid, ray: Ray, found: CellHit, near_surface: bool
             normals = _moved(normals, grid.perturbation.normals)
     plane = plane_through(heights, found.upper)
     met = found.status == int(Status.HIT)
-    return only_where(met, functools.partial(_interaction, near_surface), grid, ray, found, plane, normals)
+    return only_where(met, _interaction, grid, ray, found, plane, normals)
 
 
 def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -205,7 +193,6 @@ def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array) -> tu
 
 
 def _interaction(
-    near_surface: bool,
     grid: Grid,
     ray: Ray,
     found: CellHit,
@@ -213,7 +200,7 @@ def _interaction(
     normals: tuple[Vector, Vector, Vector] | None,
 ) -> Hit:
     """As `surface_interaction`, from the triangle's plane and the normals at its vertices."""
-    t = distance(plane, ray, found, grid.z_top if near_surface else None)
+    t = distance(plane, ray, found)
     dtype = t.dtype
     place = ray(t)
     u, v = place[0] - found.ix.astype(dtype), place[1] - found.iy.astype(dtype)

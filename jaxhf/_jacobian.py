@@ -25,7 +25,7 @@ from ._edges import EdgePoint, deciding_vertices, picture_point, with_tangent
 from ._film import sample_offset
 from ._grid import Corners, Grid, triangle_places
 from ._lottery import sources
-from ._render import Tiling, camera_ray, settle, settled_key
+from ._render import Tiling, settle, settled_key
 from ._scene import Scene
 from ._settings import Settings
 from ._shade import Vertex, World, direct, make_world, mirrors
@@ -108,14 +108,9 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int) -> L
     if key is not None and sources(world, settings):
         drawn = draw_boundaries(world, camera, settings, key, mesh)
     points = _points(camera, settings)
-    shade = functools.partial(_all_samples, world, camera, mesh, channels)
-    exact = dataclasses.replace(settings, detail=None)
-    if drawn is None:
-        light, slopes, places = shade(settings, points)
-    elif settings == exact:  # one program for both
-        light, slopes, places = shade(settings, _in_a_row(points, _finer_points(camera, settings, drawn)))
-    else:
-        light, slopes, places = _in_a_row(shade(settings, points), shade(exact, _finer_points(camera, settings, drawn)))
+    if drawn is not None:
+        points = _in_a_row(points, _finer_points(camera, settings, drawn))
+    light, slopes, places = map_over(mesh, functools.partial(_samples, settings, channels), (world, camera), points)
     image, edges = _in_pixels(light, camera, settings), None
     if drawn is not None:
         followed = functools.partial(_edge_points, settings, channels)
@@ -183,12 +178,6 @@ def _finer_points(camera: Camera, settings: Settings, boundaries: Boundaries) ->
     )
 
 
-def _all_samples(
-    world: World, camera: Camera, mesh: Mesh, channels: int, settings: Settings, points: tuple[jax.Array, ...]
-) -> tuple[jax.Array, ...]:
-    return map_over(mesh, functools.partial(_samples, settings, channels), (world, camera), points)
-
-
 def _samples(settings: Settings, channels: int, seen: tuple[World, Camera], points: tuple[jax.Array, ...]):
     """Light at points of the picture, (lanes, c), its derivatives and in what: see `Linearised`."""
     world, camera = seen
@@ -201,8 +190,8 @@ def _samples(settings: Settings, channels: int, seen: tuple[World, Camera], poin
             dataclasses.replace(surface, perturbation=corners) if isinstance(surface, Grid) else surface
             for surface in world.surfaces
         )
-        ray, footprint = stored(camera_ray(camera, settings, x, y), world.surfaces[0].sure)
-        light, _, vertex = direct(dataclasses.replace(world, surfaces=surfaces), ray, settings, footprint)
+        ray = stored(camera.ray(x, y), world.surfaces[0].sure)
+        light, _, vertex = direct(dataclasses.replace(world, surfaces=surfaces), ray, settings)
         return _channels(light, channels), _places(world, vertex)
 
     def shade(perturbations: jax.Array) -> tuple[jax.Array, jax.Array]:

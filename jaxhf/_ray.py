@@ -1,4 +1,4 @@
-"""One ray, and how wide a part of the picture is where it goes."""
+"""One ray."""
 
 import equinox as eqx
 
@@ -13,16 +13,3 @@ class Ray(eqx.Module):
 
     def __call__(self, t: Scalar) -> Vector:
         return self.o + t * self.d
-
-
-class Footprint(eqx.Module):
-    """How far apart two points may lie at a ray's `t` and still be seen as close as was asked: `width + spread * t`.
-
-    The idea of a pixel's footprint along a ray is that of Igehy (Tracing ray differentials, SIGGRAPH 1999).
-    """
-
-    width: Scalar
-    spread: Scalar
-
-    def __call__(self, t: Scalar) -> Scalar:
-        return self.width + self.spread * t

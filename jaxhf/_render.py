@@ -23,7 +23,7 @@ from ._grid import Grid
 from ._heightfield import Heightfield
 from ._hit import Hit, intersect, leave
 from ._lottery import sources
-from ._ray import Footprint, Ray
+from ._ray import Ray
 from ._scene import Scene, localise, localise_camera
 from ._settings import Settings
 from ._shade import Vertex, World, first_vertex, in_shadow, make_surface, make_world, radiance
@@ -240,19 +240,13 @@ def _trace_tile(world: World, camera: Camera, settings: Settings, aovs: tuple[st
         image, exhausted = _pixel(world, camera, settings, x, y)
         outputs = {"image": image}
         if aovs:
-            ray, footprint = camera_ray(camera, settings, x + 0.5, y + 0.5)
-            outputs |= _observe(world, ray, footprint, settings, aovs)
+            outputs |= _observe(world, camera.ray(x + 0.5, y + 0.5), settings, aovs)
         if "exhausted" in aovs:
             outputs["exhausted"] = exhausted
         return outputs
 
     columns, rows = Tiling(camera, settings).pixels(tile)
     return jax.vmap(one)(columns.astype(dtype), rows.astype(dtype))
-
-
-def camera_ray(camera: Camera, settings: Settings, x: jax.Array, y: jax.Array) -> tuple[Ray, Footprint | None]:
-    """The camera's ray through the point (x, y) of the picture, and how far its hit may be off."""
-    return camera.ray(x, y), None if settings.detail is None else camera.footprint(x, y, settings.detail)
 
 
 def _pixel(world: World, camera: Camera, settings: Settings, x: jax.Array, y: jax.Array):
@@ -262,8 +256,8 @@ def _pixel(world: World, camera: Camera, settings: Settings, x: jax.Array, y: ja
 
     def sample(k, sums):
         dx, dy = sample_offset(k, side, x.dtype)
-        ray, footprint = stored(camera_ray(camera, settings, x + dx, y + dy), world.surfaces[0].sure)
-        light, exhausted = radiance(world, ray, settings, footprint)
+        ray = stored(camera.ray(x + dx, y + dy), world.surfaces[0].sure)
+        light, exhausted = radiance(world, ray, settings)
         return sums[0] + light, sums[1] + exhausted
 
     sums = (jnp.zeros(3, x.dtype), jnp.zeros((), jnp.int32))
@@ -273,10 +267,8 @@ def _pixel(world: World, camera: Camera, settings: Settings, x: jax.Array, y: ja
     return total / (side * side), exhausted
 
 
-def _observe(
-    world: World, ray: Ray, footprint: Footprint | None, settings: Settings, aovs: tuple[str, ...]
-) -> dict[str, jax.Array]:
-    vertex = first_vertex(world, ray, settings, count_steps="steps" in aovs, footprint=footprint)
+def _observe(world: World, ray: Ray, settings: Settings, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
+    vertex = first_vertex(world, ray, settings, count_steps="steps" in aovs)
     hit, found = vertex.hit, vertex.index >= 0
     makers: dict[str, Callable[[], jax.Array]] = {
         "depth": lambda: jnp.where(found, hit.t, jnp.inf),
@@ -310,8 +302,7 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
     world = make_world(scene, settings)
 
     def one(x: jax.Array, y: jax.Array) -> Vertex:
-        ray, footprint = camera_ray(scene.camera, settings, x, y)
-        return first_vertex(world, ray, settings, footprint=footprint)
+        return first_vertex(world, scene.camera.ray(x, y), settings)
 
     return jax.vmap(one)(x, y)
 
@@ -323,7 +314,7 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings
       heightfield: the surface, in the frame of the rays.
       o, d: origins and directions, shape (..., 3) each, broadcast against each other; a direction need not be unit. NumPy
         and Python numbers keep double precision until the grid's x0 and y0 have been subtracted.
-      settings: max_steps, shading, normals and chunk count here; detail does not, as no ray here belongs to a pixel.
+      settings: max_steps, shading, normals and chunk count here.
       leaving: for rays that start on the surface: hits of an earlier `cast` on the same heightfield, whose leading axes are
         broadcast against those of `d`; `o` must then be None. A ray leaves on the side of its triangle to which `d` points
         and cannot meet that triangle again, so that no offset by an epsilon is needed.

@@ -28,9 +28,6 @@ class Settings:
         boundaries is taken, and about as many samples more for it in the pixels where these are seen, see
         docs/gradients.md; 0: the derivative that each sample has by itself, no more. The picture is the same.
       chunk: rays that are traced together; rounded down to a square of 8 x 8, 16 x 16, ... pixels.
-      detail: a share of a pixel. A camera ray that gets into a block of cells whose heights, lowest to highest, would be seen
-        within it need not find out where in the block it hits: by how much it may then be off is proven in
-        docs/level-of-detail.md. Shadow and mirrored rays, and the points on edges, are exact. None: all rays are.
     """
 
     traversal: Traversal = "pyramid"
@@ -42,7 +39,6 @@ class Settings:
     max_depth: int = 4
     edge_samples: int = 0
     chunk: int = 1024
-    detail: float | None = None
 
     @classmethod
     def draft(cls) -> "Settings":
@@ -73,9 +69,3 @@ class Settings:
                 raise ValueError(f"Settings: {name} must be a whole number from {least} on, it is {value!r}")
         if self.samples is not None and math.isqrt(self.samples) ** 2 != self.samples:
             raise ValueError(f"Settings: samples must be a square number (1, 4, 9, ...), it is {self.samples}")
-        if self.detail is None:
-            return
-        if isinstance(self.detail, bool) or not isinstance(self.detail, int | float) or not 0 < self.detail < math.inf:
-            raise ValueError(f"Settings: detail must be a positive number of pixels, or None, it is {self.detail!r}")
-        if self.traversal != "pyramid":
-            raise ValueError(f"Settings: detail needs the traversal pyramid, it is {self.traversal}")

@@ -16,7 +16,7 @@ from ._hit import Hit, Origin, Surface, blocked, intersect
 from ._lanes import only_where
 from ._light import Directional, Light, Point, Sky
 from ._material import Material, Matte, Mirror
-from ._ray import Footprint, Ray
+from ._ray import Ray
 from ._scene import Scene, Shape
 from ._settings import Settings
 from ._store import stored
@@ -79,20 +79,12 @@ def first_vertex(
     origin: Vertex | None = None,
     active: Flag | None = None,
     count_steps: bool = False,
-    footprint: Footprint | None = None,
 ) -> Vertex:
-    """The nearest hit over all objects. A ray that one object could not decide (EXHAUSTED, INVALID) has that status.
-
-    With a `footprint` hits on heightfields need only be that close, see `intersect`; those of rays that start on a surface
-    are exact all the same.
-    """
-    if footprint is not None and origin is not None:
-        free = origin.index < 0
-        footprint = jax.tree.map(lambda leaf: jnp.where(free, leaf, 0), footprint)
+    """The nearest hit over all objects. A ray that one object could not decide (EXHAUSTED, INVALID) has that status."""
     nearest, index, steps = None, jnp.full((), -1, jnp.int32), jnp.zeros((), jnp.int32)
     for k, surface in enumerate(world.surfaces):
         start = None if origin is None else Origin(origin.hit, origin.index == k)
-        hit = intersect(surface, ray, settings, start, active, count_steps, footprint)
+        hit = intersect(surface, ray, settings, start, active, count_steps)
         if hit.steps is not None:
             steps = steps + hit.steps
         if nearest is None:
@@ -110,17 +102,14 @@ def first_vertex(
     return stored(vertex, world.surfaces[0].sure) if len(world.surfaces) > 1 else vertex
 
 
-def radiance(world: World, ray: Ray, settings: Settings, footprint: Footprint | None = None) -> tuple[Vector, Index]:
-    """What comes along a camera ray against its direction, shape (3,), and how many walks ran out of steps on the way.
-
-    For the footprint, which is that of the camera ray alone, see `first_vertex`.
-    """
+def radiance(world: World, ray: Ray, settings: Settings) -> tuple[Vector, Index]:
+    """What comes along a camera ray against its direction, shape (3,), and how many walks ran out of steps on the way."""
     if not mirrors(world.materials, settings):
-        return direct(world, ray, settings, footprint)[:2]
+        return direct(world, ray, settings)[:2]
 
     def bounce(carry, _):
         ray, origin, throughput, total, active, exhausted = carry
-        reached = only_where(active, functools.partial(_bounce, settings), world, ray, origin, active, footprint)
+        reached = only_where(active, functools.partial(_bounce, settings), world, ray, origin, active)
         mirrored_ray, vertex, reflectance, light, goes_on, more = reached
         carry = mirrored_ray, vertex, throughput * reflectance, total + throughput * light, goes_on, exhausted + more
         return carry, None
@@ -137,15 +126,15 @@ def mirrors(materials: Iterable[Material], settings: Settings) -> bool:
     return settings.max_depth > 0 and any(isinstance(material, Mirror) for material in materials)
 
 
-def direct(world: World, ray: Ray, settings: Settings, footprint: Footprint | None) -> tuple[Vector, Index, Vertex]:
+def direct(world: World, ray: Ray, settings: Settings) -> tuple[Vector, Index, Vertex]:
     """`radiance` where there are no mirrors, and from where it comes."""
-    vertex = first_vertex(world, ray, settings, footprint=footprint)
+    vertex = first_vertex(world, ray, settings)
     light, exhausted = _outgoing(world, ray, vertex, vertex.hit.status != int(Status.EXHAUSTED), settings)
     return light, exhausted + _count(vertex.hit.status == int(Status.EXHAUSTED)), vertex
 
 
 def _bounce(
-    settings: Settings, world: World, ray: Ray, origin: Vertex, active: Flag, footprint: Footprint | None
+    settings: Settings, world: World, ray: Ray, origin: Vertex, active: Flag
 ) -> tuple[Ray, Vertex, Vector, Vector, Flag, Index]:
     """Follows `ray` to where it arrives.
 
@@ -153,7 +142,7 @@ def _bounce(
       The mirrored ray, where it starts, and by how much it weighs less; the light from there; whether to go on; how many
       walks ran out of steps.
     """
-    vertex = first_vertex(world, ray, settings, origin, active, footprint=footprint)
+    vertex = first_vertex(world, ray, settings, origin, active)
     out_of_steps = active & (vertex.hit.status == int(Status.EXHAUSTED))
     light, exhausted = _outgoing(world, ray, vertex, active & ~out_of_steps, settings)
     mirrored, reflectance = _mirrored(world, vertex)

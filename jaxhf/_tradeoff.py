@@ -42,7 +42,6 @@ _VALUES: dict[str, tuple[Any, ...]] = {
     "shadows": (False,),
     "max_depth": (0, 1, 2),
     "chunk": (256, 4096, 16384),
-    "detail": (0.5, 1.0, 2.0),
 }
 _DERIVATIVE_VALUES: dict[str, tuple[Any, ...]] = {
     "edge_samples": (0, 1000, 100_000),
@@ -56,7 +55,6 @@ _QUICK: dict[str, tuple[Any, ...]] = {
     "samples": (1, 4, 16),
     "normals": ("central",),
     "chunk": (4096,),
-    "detail": (1.0,),
     "edge_samples": (0, 100_000),
 }
 

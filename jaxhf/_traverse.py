@@ -8,8 +8,7 @@ from jax import lax
 from ._begin import Departure, begin
 from ._grid import Grid, triangle_plane
 from ._march import march
-from ._ray import Footprint, Ray
-from ._transform import greater
+from ._ray import Ray
 from ._types import Flag, Scalar
 from ._walk import CellHit, Status
 
@@ -23,7 +22,6 @@ def first_hit(
     departure: Departure | None = None,
     t_max: Scalar | None = None,
     count_steps: bool = False,
-    footprint: Footprint | None = None,
 ) -> CellHit:
     """Finds the first triangle in which `ray` meets the surface.
 
@@ -40,11 +38,9 @@ def first_hit(
       departure: for rays that leave this surface.
       t_max: where to give up; a hit beyond it may or may not be reported.
       count_steps: whether to count the steps.
-      footprint: a block whose heights differ by less, at the distance where the ray enters it, is not looked into, see
-        docs/level-of-detail.md; None: there is no such block.
     """
-    grid, ray, departure, t_max, footprint = lax.stop_gradient((grid, ray, departure, t_max, footprint))
-    walk, state, valid = begin(grid, ray, departure, t_max, active, footprint)
+    grid, ray, departure, t_max = lax.stop_gradient((grid, ray, departure, t_max))
+    walk, state, valid = begin(grid, ray, departure, t_max, active)
     bound = enough_steps(grid)
     state, steps = march(walk, state, bound if max_steps is None else min(max_steps, bound), count_steps)
     return walk.finish(state, valid, steps)
@@ -62,37 +58,25 @@ def enough_steps(grid: Grid) -> int:
     return sum(math.ceil(cells_x / 2**level) + math.ceil(cells_y / 2**level) - 1 for level in levels)
 
 
-def distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: CellHit, z_top: Scalar | None = None) -> Scalar:
+def distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: CellHit) -> Scalar:
     """t at which `ray` (in the grid's frame) meets the plane of the triangle that was found, see `triangle_plane`.
 
     Plain arithmetic that is differentiable in the heights and in the ray. It starts at the cell, as the subtraction
     of far heights would cancel; t is clamped to the part of the ray over the triangle, without touching its derivative. A
     ray that lies in the plane meets it all along: then t is that of the cell, with the derivative zero.
 
-    A walk that may end near the surface can give a triangle that the ray does not meet. Then t is where the ray is nearest to
-    it over the triangle, with the derivative zero: that of the plane's t, which may be anywhere, is as large as it likes.
-
     Args:
       plane: of the triangle.
       ray: in the grid's frame.
       found: where the walk ended.
-      z_top: the grid's, for a walk that may end near the surface; None: the ray meets the triangle.
     """
     a, b, c = plane
     o, d = ray(found.t_near), ray.d
     u, v = o[0] - found.ix.astype(o.dtype), o[1] - found.iy.astype(o.dtype)
     slope = d[2] - a * d[0] - b * d[1]
     grazing = (slope == 0) | (found.status != int(Status.HIT))
-    nearest = found.t_near
-    if z_top is not None:
-        at_near = c + a * u + b * v - o[2]
-        at_far = at_near - slope * (found.t_far - found.t_near)
-        rounding = 32 * jnp.finfo(o.dtype).eps * greater(z_top, jnp.abs(ray.o[2]))
-        passes = (jnp.minimum(at_near, at_far) > rounding) | (jnp.maximum(at_near, at_far) < -rounding)
-        nearest = jnp.where(passes & (jnp.abs(at_far) < jnp.abs(at_near)), found.t_far, nearest)
-        grazing = grazing | passes
     step = jnp.where(grazing, 0, (c + a * u + b * v - o[2]) / jnp.where(grazing, 1, slope))
-    t = nearest + step
+    t = found.t_near + step
     return t + lax.stop_gradient(jnp.clip(t, found.t_near, found.t_far) - t)
 
 

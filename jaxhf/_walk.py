@@ -21,7 +21,6 @@ from jaxtyping import Bool, Float, UInt32
 
 from ._grid import corners
 from ._pyramid import Pyramid
-from ._ray import Footprint
 from ._transform import greater, lesser
 from ._types import Flag, Index, Scalar
 
@@ -42,8 +41,7 @@ class Status(enum.IntEnum):
 # The state of a walk is one unsigned integer, as every further carried array would repeat the step's arithmetic in a
 # kernel of its own. From its lowest bit on: the status (2 bits); whether the ray is above the surface; x, with the size of
 # the block; y. The code of x is 2 x + size: the lowest bit that is set in it tells the size, as x is a multiple of it. After
-# a hit, when the size is known to be one cell, that bit says whether it was the upper triangle. A miss with a size of more
-# than one cell is a hit somewhere in that block.
+# a hit, when the size is known to be one cell, that bit says whether it was the upper triangle.
 MISS, HIT = int(Status.MISS), int(Status.HIT)
 WALKING = int(Status.EXHAUSTED)  # what a walk that still goes on ends with when its budget runs out
 LEAVING = 3  # still in the triangle that the ray starts from
@@ -96,7 +94,6 @@ class Walk(eqx.Module):
       ahead: for a ray that departs from a triangle, whether the cell's diagonal may lie before it; None where none does.
       noise: for such rays, a g no larger than this has no sign: near a vertex the ray crosses into a neighbour at once,
         where g is all rounding, and a neighbour in the same plane would be met.
-      footprint: heights that differ by less count as one, see `first_hit`; its t counts from where the walk begins.
     """
 
     rows: Float[jax.Array, " vertices"]
@@ -120,7 +117,6 @@ class Walk(eqx.Module):
     t_stop: Scalar
     ahead: Flag | None
     noise: Scalar | None
-    footprint: Footprint | None
 
     @property
     def bits_x(self) -> int:
@@ -163,8 +159,7 @@ class Walk(eqx.Module):
     def skip(self, state: jax.Array) -> jax.Array:
         """One block: passes it where the ray is clear of it, else goes down to the part of it that the ray is in.
 
-        A cell of which the ray is not clear is left to `visit`. Where heights that are seen as close as the footprint says
-        count as one, a block of such ends the walk; where in it the ray hits `finish` finds.
+        A cell of which the ray is not clear is left to `visit`.
         """
         above, ix, iy, size = self._unpack(state)
         near, out_x, out_y = self._passage(ix, iy, size)
@@ -183,10 +178,6 @@ class Walk(eqx.Module):
             part_y = jnp.where(self.distance_y(iy + half) < near, iy + half, iy)
             part = self.pack(WALKING, above, 2 * part_x + half, part_y)
             inside = jnp.where(size > 1, part, state)
-            if self.footprint is not None:
-                opposite = self.pyramid.bound(~above, 31 - lax.clz(size), ix ^ flip_x, iy ^ flip_y)
-                thin = bound + opposite < self.footprint(near)  # the highest - the lowest
-                inside = jnp.where((size > 1) & thin, (state >> 2) << 2, inside)
         return jnp.where((state & 3) == WALKING, jnp.where(clear, onwards, inside), state)
 
     def visit(self, state: jax.Array) -> jax.Array:
@@ -267,42 +258,7 @@ class Walk(eqx.Module):
         along = lesser(greater(along, jnp.zeros_like(along)), jnp.ones_like(along))
         return t * self.dz - ((low - self.z_ray) + along * (high - low))
 
-    def _settled(self, state: jax.Array) -> jax.Array:
-        """A state that ended in a block as one that ended in a triangle of it.
-
-        That over which the ray gets to the middle height; where it has passed that as it enters the block, or goes away from
-        it, the first; where it leaves the block before, the last.
-        """
-        above, ix, iy, size = self._unpack(state)
-        ended = ((state & 3) == MISS) & (size > 1)
-        size = jnp.where(ended, size, 1)
-        near, out_x, out_y = self._passage(ix, iy, size)
-        out = greater(lesser(lesser(out_x, out_y), self.t_stop), near)
-        flip_x, flip_y = self.flip
-        level, block_x, block_y = 31 - lax.clz(size), ix ^ flip_x, iy ^ flip_y
-        highest, negated_lowest = (
-            self.pyramid.bound(jnp.full_like(above, side), level, block_x, block_y) for side in (True, False)
-        )
-        rise = jnp.where(ended, (highest - negated_lowest) / 2, 0) - self.z_ray
-        towards = jnp.where(above, self.dz < 0, self.dz > 0)
-        t = jnp.where(towards, rise / jnp.where(towards, self.dz, 1), near)
-        t = lesser(greater(t, near), out)
-        # In the block, and within the grid, which may end inside it.
-        cells_x, cells_y = self.nx - 1, self.rows.shape[0] // self.nx - 1
-        end_x = jnp.where(self.back_x, self.pyramid.width, cells_x)
-        end_y = jnp.where(self.back_y, self.pyramid.height, cells_y)
-        cell_x = jnp.floor(self.x + t * self.dx).astype(jnp.int32)
-        cell_y = jnp.floor(self.y + t * self.dy).astype(jnp.int32)
-        cell_x = jnp.clip(cell_x, ix, jnp.minimum(ix + size, end_x) - 1)
-        cell_y = jnp.clip(cell_y, iy, jnp.minimum(iy + size, end_y) - 1)
-        across, _ = self._diagonal(cell_x, cell_y)
-        upper = (t * self.rate < across) != self.back_x
-        found = self.pack(HIT, above, 2 * cell_x + upper.astype(jnp.int32), cell_y)
-        return jnp.where(ended, found, state)
-
     def finish(self, state: jax.Array, valid: Flag, steps: Index | None) -> CellHit:
-        if self.footprint is not None:
-            state = self._settled(state)
         met = (state & 3) == HIT
         above, code, iy = self._fields(state)
         ix, iy = jnp.where(met, code >> 1, 0), jnp.where(met, iy, 0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf import _edges, _heightfield, _hit, _lottery, _ray, _render, _scene, _shade, _transform, _walk
+from jaxhf import _edges, _heightfield, _hit, _lottery, _render, _scene, _shade, _transform
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
@@ -174,16 +174,6 @@ FEATURES: dict[str, tuple[Case, Case, list[Change]]] = {
         PLAIN,
         Case(scene(), jaxhf.Settings(shading="flat", shadows=False, max_steps=6)),
         [fails_everywhere(_hit.first_hit, lambda max_steps=None, **_: max_steps is not None)],
-    ),
-    "level of detail": (
-        PLAIN,
-        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, detail=0.5)),
-        [
-            fails_in(jaxhf.Perspective, "footprint"),
-            fails_everywhere(_hit._in_heights),
-            fails_in(_walk.Walk, "_settled"),
-            fails_in(_ray.Footprint, "__call__"),
-        ],
     ),
 }
 

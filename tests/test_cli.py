@@ -219,7 +219,6 @@ BAD = {
     "unknown traversal": (GOOD, "scene.toml", ["--traversal", "x"], r"traversal.*'x'"),
     "unknown normals": (GOOD, "scene.toml", ["--normals", "x"], r"normals.*six-angle.*'x'"),
     "unknown precision": (GOOD, "scene.toml", ["--precision", "float16"], r"--precision.*'float16'"),
-    "no detail": (GOOD, "scene.toml", ["--detail", "0"], r"detail must be .* it is 0\.0"),
     "no budget": (GOOD, "scene.toml", ["--max-steps", "0"], r"max_steps must be .* it is 0"),
     "unknown option": (GOOD, "scene.toml", ["--spp", "3"], r"--spp"),
     "no such folder": (GOOD, "scene.toml", ["-o", "nowhere/out.png"], r"nowhere/out\.png: there is no folder"),

@@ -72,7 +72,6 @@ checkpoint_every = 3
 [settings]
 shadows = false
 samples = 9
-detail = 0.5
 """
 )
 
@@ -100,7 +99,7 @@ def test_every_key_arrives(folder):
     assert found.noise == (0.5, 0.02)
     np.testing.assert_array_equal(found.weights[0], np.arange(12).reshape(3, 4) > 5)
     np.testing.assert_array_equal(found.weights[1], np.arange(12).reshape(3, 4) / 4)
-    assert found.settings == jaxhf.Settings(shadows=False, samples=9, detail=0.5)
+    assert found.settings == jaxhf.Settings(shadows=False, samples=9)
     np.testing.assert_array_equal(found.options.pop("prior"), np.arange(9).reshape(3, 3))
     assert found.options == {
         "start": 3, "prior_std": 0.5, "prior_length": 4, "prior_exponent": 3, "smoothness": 2, "albedo": "map",

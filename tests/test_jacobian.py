@@ -64,15 +64,9 @@ def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
     ("which", "settings", "channels"),
     [
         ("one", jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3),
-        pytest.param(
-            "one",
-            jaxhf.Settings(samples=1, chunk=256, edge_samples=300, detail=0.5, shading="flat"),
-            1,
-            marks=pytest.mark.slow,
-        ),
-        ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat", detail=0.5), 1),
+        ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat"), 1),
     ],
-    ids=["smooth with edges", "with edges, near the surface", "flat, near the surface, several objects"],
+    ids=["smooth with edges", "flat, several objects"],
 )
 def test_matrix_is_the_derivative_of_render(which, settings, channels):
     """In every height, to rounding."""

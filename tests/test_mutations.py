@@ -70,15 +70,15 @@ MUTATIONS = {
     ),
     "derivative of the hit": Mutation(
         "_hit.py",
-        "t = distance(plane, ray, found, grid.z_top if near_surface else None)",
-        "t = lax.stop_gradient(distance(plane, ray, found, grid.z_top if near_surface else None))",
+        "t = distance(plane, ray, found)",
+        "t = lax.stop_gradient(distance(plane, ray, found))",
         "test_gradient.py::test_every_leaf_pixel_by_pixel[parallel]",
     ),
     "which vertices a sample shows": Mutation(
         "_jacobian.py",
         "before + jnp.stack(here)",
         "jnp.stack(here)",
-        "test_jacobian.py::test_matrix_is_the_derivative_of_render[flat, near the surface, several objects]",
+        "test_jacobian.py::test_matrix_is_the_derivative_of_render[flat, several objects]",
     ),
     "pixels looked at again": Mutation(
         "_jacobian.py",

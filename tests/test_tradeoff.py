@@ -122,9 +122,9 @@ def test_recommendations_by_hand(error, seconds, picture, derivative):
 
 
 def test_what_is_recommended_can_be_written_as_it_stands():
-    (line,) = recommend([row(detail="1.0", samples="16", normals="four", shadows="False", max_steps="32")], 1.0, None)
+    (line,) = recommend([row(samples="16", normals="four", shadows="False", max_steps="32")], 1.0, None)
     settings = eval(line[line.index("Settings(") : line.index("), float32") + 1], {"Settings": jaxhf.Settings})
-    assert settings == jaxhf.Settings(detail=1.0, samples=16, normals="four", shadows=False, max_steps=32)
+    assert settings == jaxhf.Settings(samples=16, normals="four", shadows=False, max_steps=32)
 
 
 def test_curves_change_one_knob():
@@ -159,7 +159,7 @@ def test_plan_sweeps_what_the_scene_has():
     landsea, texture, debug = (plan(SCENES / f"{name}.toml") for name in ("landsea", "texture", "debug4x4"))
     swept = {knob for changed in knobs_of(landsea) for knob in changed}
     assert swept == {
-        "precision", "traversal", "max_steps", "samples", "shading", "normals", "shadows", "max_depth", "chunk", "detail",
+        "precision", "traversal", "max_steps", "samples", "shading", "normals", "shadows", "max_depth", "chunk",
     }  # fmt: skip
     assert {knob for changed in knobs_of(texture) for knob in changed} == swept - {"max_depth"}
     assert knobs_of(texture)[0] == set()

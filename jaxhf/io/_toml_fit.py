@@ -62,7 +62,6 @@ _SETTINGS: Keys = {
     **{name: Key(word, None) for name in ("traversal", "shading", "normals")},
     "shadows": Key(flag, None),
     **{name: Key(whole, None) for name in ("samples", "max_steps", "max_depth", "edge_samples", "chunk")},
-    "detail": Key(number, None),
 }
 
 
