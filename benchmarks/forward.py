@@ -20,7 +20,7 @@ import numpy as np
 from peers import embree_frame, mitsuba_scene, povray_seconds
 
 import jaxhf
-from jaxhf.io._procedural import fractal
+from jaxhf.io.procedural import fractal
 
 CAMERAS = {  # eye, target, field of view: a fifth of the picture covered, all of it covered
     "A": ((1.2, -0.9, 0.7), (0.5, 0.5, 0.05), 45.0),

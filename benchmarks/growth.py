@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxhf._worker import MeasurementError, Worker, available_bytes, peak_mb, serve, timed
+from jaxhf.core.machine import available_bytes, peak_mb
+from jaxhf.study.worker import MeasurementError, Worker, serve, timed
 
 BASE = {"heights": 1024, "pixels": 512, "samples": 1, "images": 1}
 UNITS = {"heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores"}

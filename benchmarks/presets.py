@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jaxhf
-from jaxhf._curves import screenless_pyplot
-from jaxhf._sweeping import run
-from jaxhf._tradeoff import Measured, Sweep, plan
+from jaxhf.study.plan import Measured, Sweep, plan
+from jaxhf.study.plots import screenless_pyplot
+from jaxhf.study.sweep import run
 
 SCENES = ("jacksboro", "landsea", "texture", "debug4x4")
 PRESETS = {"draft": jaxhf.Settings.draft(), "balanced": jaxhf.Settings.balanced(), "exact": jaxhf.Settings.exact()}

@@ -19,7 +19,7 @@ import scipy.optimize
 from peers import View, common_work, mitsuba_picture
 
 import jaxhf
-from jaxhf.io._procedural import fractal
+from jaxhf.io.procedural import fractal
 
 LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6), (-0.3, -0.5, 0.6))
 

@@ -8,12 +8,16 @@ import jax
 from forward import report, scene, terrain
 
 import jaxhf
-from jaxhf import _boundaries, _heightfield, _hit, _render, _shade, _store
-from jaxhf._devices import local_mesh
-from jaxhf._render import settle
-from jaxhf._scene import localise
+from jaxhf.boundary import term as _boundaries
+from jaxhf.core import materialise as _store
+from jaxhf.core.devices import local_mesh
+from jaxhf.rendering import render as _render
+from jaxhf.scene.localise import localise
+from jaxhf.shade import lighting as _lighting
+from jaxhf.trace import intersect as _hit, normals as _normals, world as _world
+from jaxhf.trace.world import settle
 
-USERS = (_boundaries, _heightfield, _hit, _render, _shade)
+USERS = (_boundaries, _normals, _hit, _render, _lighting, _world)
 FORMS: dict[str, Callable] = {
     "stored": _store.stored,
     "nothing": lambda tree, sure: tree,

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from seeds import SCENES
 
-from jaxhf._worker import Worker, peak_mb, serve, timed
+from jaxhf.core.machine import peak_mb
+from jaxhf.study.worker import Worker, serve, timed
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "pyramid, triangles on demand, normals of six, smooth": {},
@@ -38,9 +39,9 @@ def without_bounds() -> None:
     import equinox as eqx
     import jax.numpy as jnp
 
-    from jaxhf import _march, _shade, _walk
+    from jaxhf.trace import search as _march, walk as _walk, world as _world
 
-    make_grid = _shade.make_grid
+    make_grid = _world.make_grid
 
     def grid_of(*arguments: Any, **options: Any) -> Any:
         grid = make_grid(*arguments, **options)
@@ -48,7 +49,7 @@ def without_bounds() -> None:
 
     _march._SKIPS = 0
     _walk.Walk.skip = lambda self, state: state
-    _shade.make_grid = grid_of
+    _world.make_grid = grid_of
 
 
 def with_stored_triangles() -> None:
@@ -56,12 +57,12 @@ def with_stored_triangles() -> None:
     import equinox as eqx
     import jax
 
-    from jaxhf import _grid, _hit, _shade, _walk
+    from jaxhf.trace import grid as _grid, intersect as _hit, triangle as _triangle, walk as _walk, world as _world
 
     class Triangles(eqx.Module):
         heights: jax.Array
 
-    corners, triangle_corners, make_grid = _grid.corners, _grid.triangle_corners, _shade.make_grid
+    corners, triangle_corners, make_grid = _triangle.corners, _triangle.triangle_corners, _world.make_grid
 
     def at(triangles: Triangles, place: Any) -> jax.Array:
         return triangles.heights.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
@@ -85,9 +86,9 @@ def with_stored_triangles() -> None:
         stored = jax.numpy.stack([z00, z10, z11, z00, z01, z11], -1).reshape(-1)
         return eqx.tree_at(lambda grid: grid.rows, grid, Triangles(stored))
 
-    _grid.corners = _walk.corners = corners_of
+    _triangle.corners = _walk.corners = corners_of
     _grid.triangle_corners = _hit.triangle_corners = triangle_corners_of
-    _shade.make_grid = grid_of
+    _world.make_grid = grid_of
 
 
 def prepare(job: dict[str, Any]) -> Mapping[str, Callable[[], Mapping[str, Any]]]:

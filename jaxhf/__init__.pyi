@@ -1,23 +1,21 @@
-from ._camera import Orthographic as Orthographic, Perspective as Perspective
-from ._cylinder import Cylinder as Cylinder
-from ._descent import Step as Step, Stop as Stop
-from ._fit import Fit as Fit, fit as fit
-from ._heightfield import Heightfield as Heightfield, vertex_normals as vertex_normals
-from ._hit import Hit as Hit
-from ._light import Directional as Directional, Point as Point, Sky as Sky
-from ._material import Matte as Matte, Mirror as Mirror
-from ._render import AOVS as AOVS, Prepared as Prepared, cast as cast, prepare as prepare, render as render
-from ._scene import Object as Object, Scene as Scene
-from ._settings import Settings as Settings
-from ._texture import ImageTexture as ImageTexture
-from ._walk import Status as Status
-from .io import (
-    SceneError as SceneError,
-    Terrain as Terrain,
-    jacksboro as jacksboro,
-    load_heights as load_heights,
-    load_image as load_image,
-    load_scene as load_scene,
-    save_heights as save_heights,
-    save_image as save_image,
-)
+from .core.settings import Settings as Settings
+from .fitting.fit import Fit as Fit, fit as fit
+from .fitting.history import Step as Step, Stop as Stop
+from .io.errors import SceneError as SceneError
+from .io.images import load_image as load_image, save_image as save_image
+from .io.save_terrain import save_heights as save_heights
+from .io.scenes import load_scene as load_scene
+from .io.terrain import Terrain as Terrain, jacksboro as jacksboro, load_heights as load_heights
+from .rendering.aovs import AOVS as AOVS
+from .rendering.cast import cast as cast
+from .rendering.render import Prepared as Prepared, prepare as prepare, render as render
+from .scene.camera import Orthographic as Orthographic, Perspective as Perspective
+from .scene.cylinder import Cylinder as Cylinder
+from .scene.heightfield import Heightfield as Heightfield
+from .scene.light import Directional as Directional, Point as Point, Sky as Sky
+from .scene.material import Matte as Matte, Mirror as Mirror
+from .scene.scene import Object as Object, Scene as Scene
+from .scene.texture import ImageTexture as ImageTexture
+from .trace.hit import Hit as Hit
+from .trace.normals import vertex_normals as vertex_normals
+from .trace.status import Status as Status

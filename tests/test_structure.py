@@ -1,60 +1,72 @@
-"""The imports are a picture of the renderer: they point one way, from scene file to image."""
+"""The folders are a picture of the renderer: imports point one way, from scene file to image."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "jaxhf"
-# Along the flow: a module imports only from modules before it.
-FLOW = (
-    "_types", "_store", "_lanes", "_devices", "_settings", "_ray", "_transform", "_texture", "_material", "_light", "_camera",
-    "_film", "_heightfield", "_pyramid", "_grid", "_cylinder",
-    "_scene", "_walk", "_begin", "_march", "_traverse", "_hit", "_shade",
-    "_silhouette", "_lottery", "_edges", "_boundaries", "_render", "_jacobian", "io",
-    "_unknowns", "_problem", "_residuals", "_solvers", "_uncertainty", "_descent", "_fit", "_plots", "_report", "_fit_command",
-    "_hillshade", "_info",
-    "_worker", "_measure", "_tradeoff", "_sweeping", "_front", "_curves", "__init__", "__main__",
-)  # fmt: skip
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "jaxhf"
+# Along the flow: a package imports only from those before it. Two that stand together know nothing of each other.
+ORDER = "core < scene < trace io < shade < boundary < rendering < fitting < study < cli"
+READ_FILES = {"fitting", "study", "cli"}  # the only ones that import from io
+
+FLOORS = [floor.split() for floor in ORDER.split(" < ")]
+FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
+MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name not in ("__init__.py", "__main__.py"))
 
 
-def _stage(path: Path) -> str:
-    relative = path.relative_to(PACKAGE)
-    return "io" if relative.parts[0] == "io" else relative.stem
+def _parts(path: Path) -> tuple[str, ...]:
+    """A module's place below the package, ("trace", "walk")."""
+    return path.relative_to(PACKAGE).with_suffix("").parts
 
 
-def _imported(path: Path) -> list[str]:
-    """The stages that a module imports, wherever in it the import stands."""
-    stages = []
+def _imported(path: Path) -> set[tuple[str, ...]]:
+    """The modules of jaxhf that a module imports, wherever in it the import stands."""
+    found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.level:
-            inside_io = _stage(path) == "io" and node.level == 1
-            stages += ["io"] if inside_io else [node.module.split(".")[0]] if node.module else [a.name for a in node.names]
+            base = _parts(path)[: -node.level] if node.level else ()
+            whole = (*base, *(node.module.split(".") if node.module else ()))
+            names = [(*whole, alias.name) for alias in node.names]
+            found |= {name if PACKAGE.joinpath(*name).with_suffix(".py").exists() else whole for name in names}
         elif isinstance(node, ast.ImportFrom | ast.Import):
             names = [node.module or ""] if isinstance(node, ast.ImportFrom) else [alias.name for alias in node.names]
             assert not any(name.split(".")[0] == "jaxhf" for name in names), f"{path}: imports within the package are relative"
-    return stages
+    return found
 
 
-@pytest.mark.parametrize(
-    "path", sorted([*PACKAGE.rglob("*.py"), *PACKAGE.rglob("*.pyi")]), ids=lambda path: str(path.relative_to(PACKAGE))
-)
+def test_every_file_has_its_room():
+    directly = {path.name for path in PACKAGE.iterdir() if path.is_file()}
+    assert directly == {"__init__.py", "__init__.pyi", "__main__.py", "py.typed"}
+    assert {path.name for path in PACKAGE.iterdir() if path.is_dir() and path.name != "__pycache__"} == FLOOR.keys()
+    assert len(FLOORS) <= 10
+    tested = {path.name for path in (ROOT / "tests").iterdir() if path.is_dir() and path.name != "__pycache__"}
+    assert tested <= FLOOR.keys()
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: "/".join(_parts(path)))
 def test_imports_follow_the_flow(path):
-    here = FLOW.index(_stage(path))
-    for name in _imported(path):
-        assert FLOW.index(name) < here or name == _stage(path) == "io", f"{path.name} imports {name}, which comes after it"
+    here = _parts(path)[0]
+    for other in {name[0] for name in _imported(path)} - {here}:
+        assert FLOOR[other] < FLOOR[here], f"{path}: {here} imports {other}, which does not come before it"
+        assert other != "io" or here in READ_FILES, f"{path}: {here} imports io"
 
 
-def test_rays_are_batched_in_three_places_and_compiled_in_one():
-    """Pixels in one, points on edges in another, both for the matrix of a fit in the third.
+def test_no_circle():
+    graph = {_parts(path): _imported(path) for path in MODULES}
+    assert len(list(TopologicalSorter(graph).static_order())) >= len(MODULES)  # CycleError where there is one
 
-    Besides, two modules say what `vmap` is to make of a function of one ray.
-    """
-    batching, rules = ("_render", "_boundaries", "_jacobian"), ("_lanes", "_march")
-    for path in PACKAGE.rglob("*.py"):
-        text, stage = path.read_text(), _stage(path)
-        assert ("custom_vmap" in text) == (stage in rules), path.name
-        assert stage in (*batching, *rules) or "jax.vmap" not in text, f"{path.name} batches rays"
-        assert stage in (*batching, "_devices") or "lax.map(" not in text, f"{path.name} batches rays"
-        assert stage == "_render" or "jax.jit" not in text, f"{path.name} compiles"
-        assert stage == "_devices" or "shard_map" not in text, f"{path.name} deals out work"
+
+def test_rays_are_batched_and_compiled_in_few_places():
+    """Rays are batched where pictures, boundaries and a fit's matrix are made; two modules say what `vmap` makes of one ray."""
+    batching = {"rendering/tiles", "rendering/render", "rendering/cast", "boundary/term", "fitting/linearise"}
+    rules = {"core/masked", "trace/search"}
+    for path in MODULES:
+        text, name = path.read_text(), "/".join(_parts(path))
+        assert ("custom_vmap" in text) == (name in rules), name
+        assert name in batching | rules or "jax.vmap" not in text, f"{name} batches rays"
+        assert name in batching | {"core/devices"} or "lax.map(" not in text, f"{name} batches rays"
+        assert name.startswith("rendering/") or "jax.jit" not in text, f"{name} compiles"
+        assert name == "core/devices" or "shard_map" not in text, f"{name} deals out work"

@@ -1,0 +1,1 @@
+"""The derivative of moving silhouettes and shadow boundaries."""

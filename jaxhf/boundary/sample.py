@@ -1,0 +1,346 @@
+"""The part of the picture's derivative that comes from moving silhouettes, terminators and shadow boundaries.
+
+Where a boundary sweeps over a pixel, the pixel changes although the radiance along each of its rays does not. That part
+is an integral along the boundaries in the picture (Li et al., Differentiable Monte Carlo ray tracing through edge
+sampling, SIGGRAPH Asia 2018, equation 5; for shadows Zhang et al., Path-space differentiable rendering, SIGGRAPH 2020):
+
+    d pixel = integral of (L(x - eps n) - L(x + eps n)) (n . dx) dl
+
+On a heightfield every boundary is the image of edges: of those that separate triangles facing the eye or a light from
+triangles facing away, where they stand; and of the latter's shadows. A point is drawn on such an edge and followed to its
+place x in the picture by plain arithmetic, which carries the derivative; all else is discrete or held constant.
+docs/gradients.md derives this.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Float, Int
+
+from ..core.affine import affine
+from ..core.ray import Ray
+from ..core.settings import Settings
+from ..core.types import Flag, Index, Point2, Scalar, Vector
+from ..core.vector import largest_component, power_of_two, unit
+from ..scene.camera import Camera
+from ..scene.light import Point, Sky
+from ..trace.cylinder import tube_distance
+from ..trace.grid import Grid, triangle_plane
+from ..trace.status import Status
+from ..trace.triangle import plane_through, triangle_corners, triangle_places
+from ..trace.world import Vertex, World, first_vertex, nowhere
+from .guiding import Lottery, sources
+from .silhouette import STEPS, framed_part
+
+
+class EdgePoint(eqx.Module):
+    """A point on an edge, and where its shadow falls. Discrete, but for its place along the edge.
+
+    Attributes:
+      valid: whether there is such a point, and it can be seen in the picture but for what hides it.
+      edge: its number, see `sources`.
+      surface: whose edge it is.
+      light: by which it is cast; -1: it is seen where it stands.
+      start, end: the edge's vertices, (ix, iy).
+      s: the place between them, 0..1.
+      measure: of s for which this point stands: one over the density with which it was drawn.
+      receiver: the surface on which its shadow falls.
+      cell, upper: the triangle there.
+      t: how far away that is.
+    """
+
+    valid: Flag
+    edge: Index
+    surface: Index
+    light: Index
+    start: Int[jax.Array, "2"]
+    end: Int[jax.Array, "2"]
+    s: Scalar
+    measure: Scalar
+    receiver: Index
+    cell: Int[jax.Array, "2"]
+    upper: Flag
+    t: Scalar
+
+
+def draw(world: World, camera: Camera, settings: Settings, lottery: Lottery, k: Index, u: Point2) -> EdgePoint:
+    """The k-th stratum's point; `u` are two numbers in 0..1 that choose its ticket and its place in the ticket's part."""
+    dtype = u.dtype
+    ticket = jnp.minimum((u[0] * lottery.stratum.astype(dtype)).astype(jnp.int32), lottery.stratum - 1)
+    ticket = ticket + k * lottery.stratum
+    cumulative = lottery.cumulative
+    edge = jnp.searchsorted(cumulative, ticket, side="right").astype(jnp.int32)
+    valid = ticket < cumulative[-1]
+    edge = jnp.minimum(edge, cumulative.shape[0] - 1)
+    before = jnp.where(edge > 0, cumulative[jnp.maximum(edge - 1, 0)], 0)
+    held = jnp.maximum(cumulative[edge] - before, 1)
+    s = ((ticket - before).astype(dtype) + u[1]) / held.astype(dtype)
+    measure = lottery.stratum.astype(dtype) / held.astype(dtype)
+
+    none = jnp.zeros((), jnp.int32)
+    surface, light, kind, ix, iy = none, none - 1, none, none, none
+    for source in sources(world, settings):
+        here = (edge >= source.first) & (edge < source.end)
+        local, area = edge - source.first, source.ny * source.nx
+        surface = jnp.where(here, source.surface, surface)
+        light = jnp.where(here, -1 if source.light is None else source.light, light)
+        kind = jnp.where(here, local // area, kind)
+        ix, iy = jnp.where(here, local % source.nx, ix), jnp.where(here, local % area // source.nx, iy)
+    steps = jnp.array(STEPS, jnp.int32)
+    start = jnp.stack([ix, iy])
+    point = EdgePoint(
+        valid=valid, edge=edge, surface=surface, light=light, start=start, end=start + steps[kind], s=s, measure=measure,
+        receiver=none, cell=jnp.zeros(2, jnp.int32), upper=jnp.zeros((), bool), t=jnp.zeros((), dtype),
+    )  # fmt: skip
+    # Of an edge that is seen where it stands, only the part in the frame is drawn from.
+    film = camera.film_from_world()
+    a, b = (film(_on_edge(world, point, jnp.full((), end, dtype))) for end in (0, 1))
+    first, last = framed_part(camera, a, b)
+    stands = light < 0
+    first, last = jnp.where(stands, first, 0), jnp.where(stands, last, 1)
+    return eqx.tree_at(
+        lambda point: (point.valid, point.s, point.measure),
+        point,
+        (valid & (last > first), first + s * (last - first), measure * (last - first)),
+    )
+
+
+def cast_shadow(world: World, point: EdgePoint, settings: Settings) -> EdgePoint:
+    """Follows the light past the point to what its shadow falls on. No derivative."""
+    p = _on_edge(world, point, point.s)
+    away = _away_from_light(world, point, p)
+    origin = _departure(world, point, away)
+    casts = point.valid & (point.light >= 0)
+    vertex = first_vertex(world, Ray(p, away), settings, origin, casts)
+    met = vertex.hit.status == int(Status.HIT)
+    return eqx.tree_at(
+        lambda point: (point.valid, point.receiver, point.cell, point.upper, point.t),
+        point,
+        (
+            point.valid & (met | (point.light < 0)),
+            jnp.maximum(vertex.index, 0),
+            vertex.hit.cell,
+            vertex.hit.triangle == 1,
+            jnp.where(met, vertex.hit.t, 0),
+        ),
+    )
+
+
+def _departure(world: World, point: EdgePoint, away: Vector) -> Vertex:
+    """The edge's triangle over which the light goes on, as what it leaves: it cannot be met again.
+
+    On an edge with exactly one triangle facing the light, the light passes both on the same side.
+    """
+    origin = nowhere(away.dtype)
+    ix, iy = point.start[0], point.start[1]
+    along_x, along_y = point.end[1] == iy, point.end[0] == ix
+    for k, grid in enumerate(world.surfaces):
+        if not isinstance(grid, Grid):
+            continue
+        local = grid.grid_from_world.vector(away)
+        # The triangles to the left of the edge (above it, where it runs along x) and to its right.
+        left_x, left_y, left_upper = jnp.where(along_y, ix - 1, ix), iy, ~along_x & ~along_y
+        right_x, right_y, right_upper = ix, jnp.where(along_x, iy - 1, iy), along_x | along_y
+        leftwards = jnp.where(along_x, local[1] > 0, jnp.where(along_y, local[0] < 0, local[1] > local[0]))
+        left = (_has_cell(grid, left_x, left_y) & leftwards) | ~_has_cell(grid, right_x, right_y)
+        cell_x, cell_y = jnp.where(left, left_x, right_x), jnp.where(left, left_y, right_y)
+        cell_x, cell_y = jnp.clip(cell_x, 0, grid.cells[0] - 1), jnp.clip(cell_y, 0, grid.cells[1] - 1)
+        upper = jnp.where(left, left_upper, right_upper)
+        a, b, _ = triangle_plane(grid, cell_x, cell_y, upper)
+        side = jnp.where(local[2] - a * local[0] - b * local[1] >= 0, 1, -1).astype(jnp.int32)
+        x, y = _between_ends(point, point.s)
+        cells_x, cells_y = grid.cells
+        here = eqx.tree_at(
+            lambda vertex: (vertex.hit.cell, vertex.hit.triangle, vertex.hit.side, vertex.hit.uv, vertex.index),
+            origin,
+            (
+                jnp.stack([cell_x, cell_y]),
+                upper.astype(jnp.int32),
+                side,
+                jnp.stack([x / cells_x, y / cells_y]),
+                jnp.full((), k, jnp.int32),
+            ),
+        )
+        origin = jax.tree.map(lambda new, old, k=k: jnp.where(point.surface == k, new, old), here, origin)
+    return origin
+
+
+def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
+    """Whether there is such a cell, with all its vertices."""
+    x, y = jnp.clip(ix, 0, grid.cells[0] - 1), jnp.clip(iy, 0, grid.cells[1] - 1)
+    z = grid.z
+    return (x == ix) & (y == iy) & jnp.isfinite(z[y, x] + z[y, x + 1] + z[y + 1, x] + z[y + 1, x + 1])
+
+
+def _between_ends(point: EdgePoint, s: Scalar) -> tuple[Scalar, Scalar]:
+    a, b = point.start.astype(s.dtype), point.end.astype(s.dtype)
+    return a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1])
+
+
+def _on_edge(
+    world: World,
+    point: EdgePoint,
+    s: Scalar,
+    lift: Scalar | None = None,
+    perturbation: Float[jax.Array, "5"] | None = None,
+) -> Vector:
+    """World frame, `lift` above the edge (in the grid's frame); differentiable in the heights and in the transform."""
+    chosen = None
+    for k, grid in enumerate(world.surfaces):
+        if isinstance(grid, Grid):
+            x, y = _between_ends(point, s)
+            z0, z1 = (grid.rows.at[place].get(mode="clip") for place in _ends(grid, point))
+            if perturbation is not None:
+                z0, z1 = z0 + perturbation[0], z1 + perturbation[1]
+            z0, z1 = (jnp.where(jnp.isfinite(z), z, 0) for z in (z0, z1))
+            z = z0 + s * (z1 - z0)
+            p = grid.world_from_grid.point(jnp.stack([x, y, z if lift is None else z + lift]))
+            chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
+    assert chosen is not None
+    return chosen
+
+
+def _ends(grid: Grid, point: EdgePoint) -> tuple[Index, Index]:
+    """Where the ends of the edge are in the rows of its grid."""
+    start, end = (vertex[1] * grid.shape[1] + vertex[0] for vertex in (point.start, point.end))
+    return start, end
+
+
+def _receiving_cell(grid: Grid, point: EdgePoint) -> Int[jax.Array, "2"]:
+    """In range also where the shadow falls on another surface."""
+    return jnp.clip(point.cell, 0, jnp.array(grid.cells, jnp.int32) - 1)
+
+
+def deciding_vertices(world: World, point: EdgePoint) -> Int[jax.Array, "5"]:
+    """The vertices on whose heights the point's place in the picture depends, numbered over all surfaces.
+
+    The edge's two; and the three of the triangle on which its shadow falls.
+    """
+    places = jnp.zeros(5, jnp.int32)
+    for k, grid, before in world.grids:
+        cell = _receiving_cell(grid, point)
+        ends = jnp.clip(jnp.stack(_ends(grid, point)), 0, grid.rows.shape[0] - 1)
+        triangle = jnp.stack(triangle_places(grid.shape[1], cell[0], cell[1], point.upper))
+        here = jnp.stack([point.surface == k] * 2 + [point.receiver == k] * 3)
+        places = jnp.where(here, before + jnp.concatenate([ends, triangle]), places)
+    return places
+
+
+def _away_from_light(world: World, point: EdgePoint, p: Vector) -> Vector:
+    """The unit direction in which light goes on past p."""
+    chosen = jnp.zeros_like(p)
+    for number, light in enumerate(world.lights):
+        if not isinstance(light, Sky):
+            away = unit(p - light.p) if isinstance(light, Point) else -unit(light.towards)
+            chosen = jnp.where(point.light == number, away, chosen)
+    return chosen
+
+
+def _fallen(world: World, point: EdgePoint, p: Vector, perturbation: Float[jax.Array, "5"] | None = None) -> Vector:
+    """Where the light past p meets the triangle that was found; differentiable."""
+    away = _away_from_light(world, point, p)
+    near = p + jnp.where(point.valid, point.t, 0) * away
+    landed = near
+    for k, surface in enumerate(world.surfaces):
+        if isinstance(surface, Grid):
+            # From `near` on, which lies there but for its derivative: far distances would cancel.
+            local = surface.grid_from_world.ray(Ray(near, away))
+            cell = _receiving_cell(surface, point)
+            heights = triangle_corners(surface.rows, surface.shape[1], cell[0], cell[1], point.upper)
+            if perturbation is not None:
+                heights = tuple(z + more for z, more in zip(heights, perturbation[2:], strict=True))
+            a, b, c = plane_through(heights, point.upper)
+            u, v = local.o[0] - cell[0].astype(p.dtype), local.o[1] - cell[1].astype(p.dtype)
+            # At a length around one, as the derivative has the slope's square in it; a power of two changes no bit.
+            size = largest_component(local.d)
+            size = power_of_two(jnp.where(size > 0, size, 1))
+            d = local.d / size
+            slope = d[2] - a * d[0] - b * d[1]
+            grazing = (slope == 0) | ~point.valid
+            step = jnp.where(grazing, 0, (c + a * u + b * v - local.o[2]) / jnp.where(grazing, 1, slope)) / size
+            landed = jnp.where(point.receiver == k, near + step * away, landed)
+        else:
+            t, found = tube_distance(surface, Ray(p, away), None)
+            landed = jnp.where(point.receiver == k, p + jnp.where(found, t, point.t) * away, landed)
+    return landed
+
+
+def picture_point(
+    world: World,
+    camera: Camera,
+    settings: Settings,
+    point: EdgePoint,
+    s: Scalar,
+    lift: Scalar | None = None,
+    perturbation: Float[jax.Array, "5"] | None = None,
+) -> tuple[Point2, Flag]:
+    """Where the point, or its shadow, is in the picture, and whether within its frame; differentiable.
+
+    In every leaf of the scene, and in s while the shadow stays in its triangle; in `perturbation`, which is added to the
+    heights at its `deciding_vertices`.
+    """
+    p = _on_edge(world, point, s, lift, perturbation)
+    if any(source.light is not None for source in sources(world, settings)):
+        p = jnp.where(point.light >= 0, _fallen(world, point, p, perturbation), p)
+    # Of a point that does not count, a place may be larger than any number, and its derivative, times zero, none.
+    ahead = affine(jnp.asarray(camera.world_from_camera)).point(jnp.array([0, 0, 1], p.dtype))
+    at = camera.film_from_world()(jnp.where(point.valid, p, lax.stop_gradient(ahead)))
+    before = (at[2] > 0) & (at[3] > 0)
+    x = at[:2] / jnp.where(before, at[2], 1)
+    size = jnp.array([camera.width, camera.height], x.dtype)
+    return x, point.valid & before & (x >= 0).all() & (x < size).all()
+
+
+class Crossing(eqx.Module):
+    """A point's place in the picture.
+
+    Attributes:
+      valid: whether it has one.
+      x: pixels from the top left corner.
+      across: normal to the boundary, of the length by which the place moves with s.
+      sides: the places x - eps n and x + eps n, n being the unit normal.
+      speed: at which the boundary moves in the picture as the edge is lifted, pixels by the grid's unit of height.
+    """
+
+    valid: Flag
+    x: Point2
+    across: Point2
+    sides: Float[jax.Array, "2 2"]
+    speed: Scalar
+
+
+def make_crossing(world: World, camera: Camera, settings: Settings, point: EdgePoint) -> Crossing:
+    def place(s: Scalar) -> tuple[Point2, Flag]:
+        return picture_point(world, camera, settings, point, s)
+
+    x, along, valid = jax.jvp(place, (point.s,), (jnp.ones_like(point.s),), has_aux=True)
+    length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
+    # Of what would cross the whole picture within less than the rounding of s, no place is known.
+    valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)
+    x = jnp.where(valid, x, 0)
+    across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
+    n = across / jnp.where(valid, length, 1)
+    step = n * side_step(camera, x.dtype)
+
+    def lifted(lift: Scalar) -> Point2:
+        return picture_point(world, camera, settings, point, point.s, lift)[0]
+
+    _, motion = jax.jvp(lifted, (jnp.zeros_like(point.s),), (jnp.ones_like(point.s),))
+    speed = jnp.abs(n[0] * motion[0] + n[1] * motion[1])
+    return Crossing(valid, x, across, jnp.stack([x - step, x + step]), jnp.where(valid & jnp.isfinite(speed), speed, 0))
+
+
+def side_ray(camera: Camera, crossing: Crossing, side: Point2) -> Ray:
+    """The camera's ray beside a boundary; one that goes nowhere, and costs nothing, where there is no crossing."""
+    ray = camera.ray(side[0], side[1])
+    return Ray(ray.o, jnp.where(crossing.valid, ray.d, 0))
+
+
+def side_step(camera: Camera, dtype) -> float:
+    """How far to either side of a boundary the radiance is taken, in pixels.
+
+    Larger than the rounding of x, that is of some hundred ulps at the picture's size, and else as small as can be: a second
+    boundary between the two rays would be taken for a part of the first.
+    """
+    return max(camera.width, camera.height) * float(jnp.finfo(dtype).eps) ** 0.5 / 4

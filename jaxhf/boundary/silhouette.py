@@ -1,0 +1,153 @@
+"""Which edges of a heightfield bound what is seen or lit: dense arithmetic over the grid, without a derivative.
+
+Edges have a kind, 0 along x, 1 along y, 2 along the diagonal, and begin at a vertex: arrays over them have shape
+(3, ny, nx). Those that would leave the grid are there too, and bound nothing.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float
+
+from ..core.types import Vector
+from ..scene.camera import Camera
+from ..trace.grid import Grid
+
+# From an edge's first vertex to its second.
+STEPS = ((1, 0), (0, 1), (1, 1))
+
+EdgeFlags = Bool[jax.Array, "3 ny nx"]
+EdgeWeights = Float[jax.Array, "3 ny nx"]
+
+
+class Viewpoint(eqx.Module):
+    """An eye or a light: at the place `v`, or infinitely far away in the direction `v`; world frame."""
+
+    v: Vector
+    at_place: bool = eqx.field(static=True)
+
+
+def silhouettes(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
+    """The edges with exactly one of their two triangles facing the viewpoint, and those that have only one triangle.
+
+    (Hertzmann and Zorin, Illustrating smooth surfaces, SIGGRAPH 2000, section 4.1, on polygons.) Edges at the border and
+    at holes have one triangle.
+    """
+    lower, upper = _facing(grid, viewpoint)
+    return _between(lower, upper, lambda a, b: a != b)
+
+
+def all_edges(grid: Grid) -> EdgeFlags:
+    """The edges with at least one triangle."""
+    present = _present(grid)
+    return _between(present, present, lambda a, b: a | b)
+
+
+def _between(lower: jax.Array, upper: jax.Array, compare: Any) -> EdgeFlags:
+    """Compares the two triangles of every edge, given values per cell of its two triangles; beyond the border stands zero."""
+    above, right = jnp.pad(lower, ((0, 1), (0, 1))), jnp.pad(upper, ((0, 1), (0, 1)))
+    below, left = jnp.pad(upper, ((1, 0), (0, 1))), jnp.pad(lower, ((0, 1), (1, 0)))
+    return jnp.stack([compare(above, below), compare(right, left), compare(above, right)])
+
+
+def _present(grid: Grid) -> Bool[jax.Array, "cells_y cells_x"]:
+    z = grid.z
+    return jnp.isfinite(z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:])
+
+
+def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
+    """1 where the viewpoint stands on the +z side of a triangle, -1 on the other, 0 where there is no triangle."""
+    to_grid = grid.grid_from_world
+    v = to_grid.point(viewpoint.v) if viewpoint.at_place else to_grid.vector(viewpoint.v)
+    z00, z10, z01, z11 = grid.z[:-1, :-1], grid.z[:-1, 1:], grid.z[1:, :-1], grid.z[1:, 1:]
+    to_x, to_y, to_z = v[0], v[1], v[2]
+    if viewpoint.at_place:
+        x, y = _vertices(grid)
+        to_x, to_y, to_z = v[0] - x[:-1, :-1], v[1] - y[:-1, :-1], v[2] - z00
+    present = _present(grid)
+
+    def facing(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(present, jnp.where(to_z - a * to_x - b * to_y >= 0, 1, -1), 0).astype(jnp.int8)
+
+    return facing(z10 - z00, z11 - z10), facing(z11 - z01, z01 - z00)
+
+
+def _vertices(grid: Grid) -> tuple[jax.Array, jax.Array]:
+    ny, nx = grid.shape
+    x, y = jnp.meshgrid(jnp.arange(nx, dtype=grid.z.dtype), jnp.arange(ny, dtype=grid.z.dtype))
+    return x, y
+
+
+def _ends(values: Float[jax.Array, "ny nx"]) -> tuple[EdgeWeights, EdgeWeights]:
+    """What stands at the two ends of every edge."""
+    ny, nx = values.shape
+    padded = jnp.pad(values, ((0, 1), (0, 1)), mode="edge")
+    return jnp.stack([values] * 3), jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS])
+
+
+def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
+    """The length in the picture, in pixels, of the part of every edge that lies in its frame; hidden or not."""
+    film = camera.film_from_world().of(grid.world_from_grid)
+    z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
+    x, y = _vertices(grid)
+
+    def seen(row: int) -> jax.Array:
+        return film.linear[row, 0] * x + film.linear[row, 1] * y + film.linear[row, 2] * z + film.offset[row]
+
+    a, b = zip(*(_ends(seen(row)) for row in range(4)), strict=True)
+    first, last = framed_part(camera, a, b)
+    w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
+    ends = [
+        tuple((a[k] + s * (b[k] - a[k])) / jnp.where(w > 0, w, 1) for k in (0, 1))
+        for s, w in zip((first, last), w, strict=True)
+    ]
+    across = jnp.asarray(camera.width + camera.height, z.dtype)
+    dx, dy = (jnp.clip(ends[1][k] - ends[0][k], -across, across) for k in (0, 1))
+    return jnp.where(last > first, jnp.sqrt(dx * dx + dy * dy), 0)
+
+
+def framed_part(camera: Camera, a: Any, b: Any) -> tuple[jax.Array, jax.Array]:
+    """Between which s the points a + s (b - a) lie in the picture's frame and before the camera; first > last: nowhere.
+
+    Clipping in homogeneous coordinates (Liang and Barsky, ACM TOG 3(1), 1984; Blinn and Newell 1978).
+
+    Args:
+      camera: whose frame it is.
+      a, b: the coordinates of `Projection`, scalars or arrays.
+    """
+    first, last = jnp.zeros_like(a[0]), jnp.ones_like(a[0])
+    for at_a, at_b in zip(_inside(camera, a), _inside(camera, b), strict=True):
+        cut = at_a / jnp.where(at_a == at_b, 1, at_a - at_b)
+        first = jnp.where((at_a < 0) & (at_b > 0), jnp.maximum(first, cut), first)
+        last = jnp.where((at_a > 0) & (at_b < 0), jnp.minimum(last, cut), last)
+        last = jnp.where((at_a <= 0) & (at_b <= 0), -1, last)
+    return first, last
+
+
+def _inside(camera: Camera, at: Any) -> tuple[jax.Array, ...]:
+    """Positive within each border of the frame, and before the camera."""
+    x, y, w, depth = at[0], at[1], at[2], at[3]
+    return x, camera.width * w - x, y, camera.height * w - y, depth
+
+
+def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:
+    """How long every edge looks from a light: its length across the light, for one at a place as an angle."""
+    z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
+    x, y = _vertices(grid)
+    (x0, x1), (y0, y1), (z0, z1) = _ends(x), _ends(y), _ends(z)
+    world = grid.world_from_grid
+
+    def turned(vx: jax.Array, vy: jax.Array, vz: jax.Array) -> list[jax.Array]:
+        return [world.linear[k, 0] * vx + world.linear[k, 1] * vy + world.linear[k, 2] * vz for k in range(3)]
+
+    e = turned(x1 - x0, y1 - y0, z1 - z0)
+    to: list[Any] = [light.v[k] for k in range(3)]
+    if light.at_place:
+        to = [light.v[k] - world.offset[k] - p for k, p in enumerate(turned(x0, y0, z0))]
+    square = to[0] * to[0] + to[1] * to[1] + to[2] * to[2]
+    cross = [e[i] * to[j] - e[j] * to[i] for i, j in ((1, 2), (2, 0), (0, 1))]
+    across = jnp.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
+    square = jnp.where(square > 0, square, 1)
+    return across / (square if light.at_place else jnp.sqrt(square))

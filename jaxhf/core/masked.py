@@ -1,0 +1,44 @@
+"""Leaving out what none of the rays that are traced together needs."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.extend.core import jaxpr_as_fun
+
+from .types import Flag
+
+
+def only_where(needed: Flag, fun: Callable[..., Any], *args: Any) -> Any:
+    """`fun(*args)`; under `vmap` zeros instead, without computing anything, where not one of the rays needs it.
+
+    Half of a picture's tiles may show nothing but background. Without `vmap` the function is simply called. It takes part in
+    forward and reverse differentiation; zeros have the derivative zero.
+
+    Args:
+      needed: whether this ray's result is going to be used. Others must not look at theirs.
+      fun: a function of one ray, with no other traced values than its arguments.
+      args: pytrees of arrays.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def run(needed: jax.Array, args: tuple[Any, ...]) -> Any:
+        return fun(*args)
+
+    @run.def_vmap
+    def run_many(axis_size: int, in_batched: Any, needed: jax.Array, args: tuple[Any, ...]) -> Any:
+        lanes, shared = eqx.partition(args, in_batched[1])
+        many = jax.vmap(lambda lanes: fun(*eqx.combine(lanes, shared)), axis_size=axis_size)
+        traced, shapes = jax.make_jaxpr(many, return_shape=True)(lanes)  # once, for its shapes and for the conditional
+        leaves, structure = jax.tree.flatten(shapes)
+
+        def nothing(*_: Any) -> list[jax.Array]:
+            return [jnp.zeros(leaf.shape, leaf.dtype) for leaf in leaves]
+
+        result = lax.cond(needed.any(), jaxpr_as_fun(traced), nothing, *jax.tree.leaves(lanes))
+        return jax.tree.unflatten(structure, result), jax.tree.map(lambda _: True, shapes)
+
+    return run(needed, args)

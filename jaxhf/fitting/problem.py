@@ -1,0 +1,262 @@
+"""What a fit is given, checked and laid out for tracing."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array, Float
+
+from ..core.settings import Settings
+from ..scene.heightfield import Heightfield
+from ..scene.localise import localise
+from ..scene.material import Matte
+from ..scene.scene import Scene
+from ..scene.texture import ImageTexture
+from ..trace.world import settle
+from .basis import Basis, Unknowns, beyond, cosines, resample
+from .linearise import Linearised
+
+Albedo = Literal["known", "constant", "map"]
+Loss = Literal["squares", "huber", "cauchy", "geman"]
+
+
+class Group(eqx.Module):
+    """Pictures whose scenes differ in numbers only; they are rendered one after the other by one program.
+
+    Attributes:
+      scenes: one scene, whose leaves have a leading axis of n scenes.
+      targets: shape (n, h, w, c), c = 1 for grey.
+      weights: 1 / standard deviation of each value, zero where there is none, shape (n, h, w, c).
+      places: which of the caller's pictures these are.
+    """
+
+    scenes: Scene
+    targets: Float[Array, "n h w c"]
+    weights: Float[Array, "n h w c"]
+    places: tuple[int, ...] = eqx.field(static=True)
+
+
+class Prior(eqx.Module):
+    """Heights that are known beforehand, and how well.
+
+    Attributes:
+      heights: shape (my, mx), see `Basis.margin`.
+      weight: 1 / their standard deviation; shape (my, mx). Where errors hang together, times what `stiffness`
+        takes away.
+      stiffness: 1 / the amplitude of each cosine in the errors over their deviation; None: they do not hang together.
+    """
+
+    heights: Float[Array, "my mx"]
+    weight: Float[Array, "my mx"]
+    stiffness: Float[Array, "my mx"] | None = None
+
+
+class Problem(eqx.Module):
+    """All that the residuals depend on beside the unknowns. What is not asked for is None.
+
+    Attributes:
+      groups: the pictures.
+      basis: from waves to heights; another for each level.
+      prior: see `Prior`.
+      smoothness: 1 / the standard deviation of the Laplacian of the heights (a sum of differences to the neighbours).
+      albedo_smoothness: the same of the albedo's factors.
+      loss_scale: from where on a residual, in standard deviations, counts less; changes with the level.
+      loss: how much less.
+      settings: how to render.
+      mesh: the devices that share the work.
+      linearised: the pictures of each group with their derivatives in the heights, which are taken at the unknowns of which
+        residuals are asked; None: residuals render.
+    """
+
+    groups: tuple[Group, ...]
+    basis: Basis
+    prior: Prior | None
+    smoothness: Float[Array, ""] | None
+    albedo_smoothness: Float[Array, ""] | None
+    loss_scale: Float[Array, ""] | None
+    loss: str = eqx.field(static=True)
+    settings: Settings = eqx.field(static=True)
+    mesh: Mesh = eqx.field(static=True)
+    linearised: tuple[Linearised, ...] | None = None
+
+    @property
+    def count(self) -> int:
+        return sum(len(group.places) for group in self.groups)
+
+
+class Asked(NamedTuple):
+    """The caller's arguments that are about the problem; see `fit`."""
+
+    weights: Sequence[Any] | None
+    noise: Any
+    prior: Any
+    prior_std: Any
+    prior_length: float | None
+    prior_exponent: float
+    smoothness: float | None
+    albedo: str
+    albedo_smoothness: float | None
+    exposures: bool
+    offsets: bool
+    loss: str
+    loss_scale: float
+
+
+def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], settings: Settings, asked: Asked) -> tuple[Group, ...]:
+    """Checks scenes and pictures, and gathers those that one program can render."""
+    if len(scenes) == 0:
+        raise ValueError("fit: scenes must hold at least one Scene, it is empty")
+    if len(targets) != len(scenes):
+        raise ValueError(f"fit: targets must hold a picture for each of the {len(scenes)} scenes, they are {len(targets)}")
+    if asked.weights is not None and len(asked.weights) != len(scenes):
+        raise ValueError(f"fit: weights must hold one for each of the {len(scenes)} scenes, they are {len(asked.weights)}")
+    noise = np.asarray(asked.noise, np.float64)
+    if noise.shape not in ((), (len(scenes),)) or not (np.isfinite(noise) & (noise > 0)).all():
+        raise ValueError(f"fit: noise must be positive, one number or one for each scene, it is {asked.noise!r}")
+    noise = np.broadcast_to(noise, (len(scenes),))
+    for k, scene in enumerate(scenes):
+        _require_alike(k, scene, scenes[0])
+    found: dict[Any, list[tuple[int, Any, Any, Any]]] = {}
+    for k, scene in enumerate(scenes):
+        weight = None if asked.weights is None else asked.weights[k]
+        target, weight = _picture(k, scene, targets[k], weight)
+        local = localise(scene)
+        leaves, structure = jax.tree.flatten(local)
+        kind = (structure, settle(settings, scene).samples, tuple(leaf.shape for leaf in leaves), target.shape)
+        found.setdefault(kind, []).append((k, local, target, weight / noise[k]))
+    dtype = scenes[0].heights.dtype
+    return tuple(
+        Group(
+            jax.tree.map(lambda *leaves: jnp.stack(leaves), *(local for _, local, _, _ in members)),
+            jnp.asarray(np.stack([target for *_, target, _ in members]), dtype),
+            jnp.asarray(np.stack([weight for *_, weight in members]), dtype),
+            tuple(k for k, *_ in members),
+        )
+        for members in found.values()
+    )
+
+
+def _require_alike(k: int, scene: Scene, first: Scene) -> None:
+    """All scenes have the same first heightfield, but for the heights."""
+    if not isinstance(scene, Scene):
+        raise ValueError(f"fit: scenes[{k}] must be a Scene, it is a {type(scene).__name__}")
+    if not scene.heightfields:
+        raise ValueError(f"fit: scenes[{k}] must have a heightfield, there is none among its objects")
+    field, other = scene.heightfields[0], first.heightfields[0]
+    for name in ("shape", "dtype"):
+        mine, theirs = getattr(field.heights, name), getattr(other.heights, name)
+        if mine != theirs:
+            raise ValueError(f"fit: scenes[{k}]: the heights must have the {name} of the first scene's, {theirs}; it is {mine}")
+    for name in ("dx", "dy", "x0", "y0"):
+        mine, theirs = getattr(field, name), getattr(other, name)
+        if mine != theirs:
+            raise ValueError(f"fit: scenes[{k}]: {name} must be that of the first scene's heightfield, {theirs}; it is {mine}")
+
+
+def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Target and weight of one picture, shape (h, w, c); what has no weight is zero."""
+    size = (scene.camera.height, scene.camera.width)
+    target = np.asarray(target, np.float64)
+    if target.shape not in (size, (*size, 1), (*size, 3)):
+        raise ValueError(f"fit: targets[{k}] must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}")
+    target = target.reshape(*size, -1)
+    weight = np.ones(size) if weight is None else np.asarray(weight, np.float64)
+    if weight.shape not in (size, target.shape):
+        raise ValueError(f"fit: weights[{k}] must have shape {size}, its shape is {weight.shape}")
+    if not np.isfinite(weight).all() or weight.min() < 0 or weight.max() == 0:
+        raise ValueError(f"fit: weights[{k}] must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}")
+    weight = np.broadcast_to(weight.reshape(*size, -1), target.shape)
+    bad = ~np.isfinite(target) & (weight > 0)
+    if bad.any():
+        y, x, c = np.argwhere(bad)[0]
+        raise ValueError(
+            f"fit: targets[{k}] must be finite where it has a weight; row {y} column {x} channel {c} is {target[y, x, c]}"
+        )
+    return np.where(weight > 0, target, 0), weight
+
+
+def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, exponent: float) -> Prior | None:
+    """The prior of the heights of `field`; `length` and `exponent` are `fit`'s prior_length and prior_exponent."""
+    shape, dtype = field.heights.shape, field.heights.dtype
+    if prior is None:
+        for name, value in (("prior_std", std), ("prior_length", length)):
+            if value is not None:
+                raise ValueError(f"fit: {name} must stand with a prior, there is none")
+        return None
+    if std is None:
+        raise ValueError("fit: prior must stand with prior_std, how far it may be off")
+    std = np.asarray(std, np.float64)
+    if std.shape not in ((), shape) or not (std > 0).all():
+        raise ValueError(f"fit: prior_std must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}")
+    margin = prior_margin(field, length)
+    heights = beyond(make_heights("prior", prior, shape), margin)
+    weight, stiffness = beyond(np.broadcast_to(1 / std, shape), margin), None
+    if length is not None:
+        stiffness = _stiffness(field, heights.shape, length, exponent)
+        rows, columns = (cosines(n) ** 2 for n in heights.shape)
+        weight = weight * np.sqrt(rows.T @ stiffness**-2 @ columns)
+        stiffness = jnp.asarray(stiffness, dtype)
+    return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), stiffness)
+
+
+def prior_margin(field: Heightfield, length: float | None) -> tuple[int, int]:
+    """How many vertices beyond the border take part, so that errors need not be level there as cosines are at their ends.
+
+    A border is mirrored in the new end, at twice the margin. Whatever its exponent, Matérn's correlation has its inflection at
+    0 to 2 lengths, where slopes no longer hang together; so one length is enough for them, and less than the distances
+    at which the errors themselves do not (Lindgren, Rue and Lindström, 2011, A.4), which cost more steps. At most
+    half of the terrain's own size.
+    """
+    if length is None:
+        return 0, 0
+    steps = (field.dy, field.dx)
+    y, x = (min(math.ceil(length / d), n // 2) for n, d in zip(field.heights.shape, steps, strict=True))
+    return y, x
+
+
+def _stiffness(field: Heightfield, shape: tuple[int, ...], length: float, exponent: float) -> Float[np.ndarray, "my mx"]:
+    """(1 - length² · Laplacian)^(exponent / 2) of each cosine, the Laplacian being that of second differences."""
+    steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, (field.dy, field.dx), strict=True)]
+    return (1 + length**2 * (steps[0][:, None] + steps[1][None, :])) ** (exponent / 2)
+
+
+def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:
+    """Heights from a number (flat), from a coarser or finer grid over the same footprint, or as they are."""
+    heights = np.asarray(value, np.float64)
+    if heights.shape == ():
+        heights = np.full(shape, heights)
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise ValueError(f"fit: {name} must be a number or heights of at least 2x2, its shape is {heights.shape}")
+    if not np.isfinite(heights).all():
+        iy, ix = np.argwhere(~np.isfinite(heights))[0]
+        raise ValueError(f"fit: {name} must be finite, row {iy} column {ix} is {heights[iy, ix]}")
+    return heights if heights.shape == shape else resample(heights, shape)
+
+
+def first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, asked: Asked) -> Unknowns:
+    """Those from which a fit starts: no waves, the albedo of the scene, exposure 1 and offset 0."""
+    shape, dtype = scene.heights.shape, scene.heights.dtype
+    if asked.albedo == "known":
+        albedo = None
+    else:
+        material = next(obj.material for obj in scene.objects if obj.shape is scene.heightfields[0])
+        if not isinstance(material, Matte):
+            raise ValueError(
+                f"fit: albedo is asked for, the heightfield's material must be Matte, it is {type(material).__name__}"
+            )
+        if asked.albedo == "map" and isinstance(material.albedo, ImageTexture):
+            texels = material.albedo.texels.shape[:2]
+        else:
+            texels = shape if asked.albedo == "map" else (1, 1)
+        albedo = jnp.ones((*texels, channels), dtype)
+    return Unknowns(
+        jnp.zeros_like(basis.base),
+        albedo,
+        jnp.ones(count, dtype) if asked.exposures else None,
+        jnp.zeros(count, dtype) if asked.offsets else None,
+    )

@@ -1,0 +1,162 @@
+"""How far a terrain is from its pictures and from what is known beforehand, in standard deviations."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..core.devices import on_every_device
+from ..rendering.render import render_each
+from ..scene.material import Matte
+from ..scene.scene import Scene
+from ..scene.texture import ImageTexture
+from .basis import Unknowns
+from .linearise import Linearised, can_be_linearised, linearise_each, picture_each
+from .problem import Group, Problem
+from .robust import soften
+
+
+def residuals(unknowns: Unknowns, problem: Problem) -> tuple[Any, None]:
+    """All residuals, to be squared and added up; the second value is optimistix's auxiliary output.
+
+    Those of the pictures pass through `soften`, so the sum is the robust loss itself, and a solver that accepts steps by
+    it needs to know nothing of reweighting.
+    """
+    parts = [soften(part, problem.loss, problem.loss_scale) for part in picture_residuals(unknowns, problem)]
+    return (parts, known_residuals(unknowns, problem)), None
+
+
+def half_squares(unknowns: Unknowns, problem: Problem) -> tuple[Float[Array, ""], None]:
+    """Half the sum of the squared residuals: what minimisers take."""
+    leaves = jax.tree.leaves(residuals(unknowns, problem)[0])
+    return sum((jnp.sum(leaf * leaf) for leaf in leaves), start=jnp.zeros((), leaves[0].dtype)) / 2, None
+
+
+def picture_residuals(unknowns: Unknowns, problem: Problem) -> list[Float[Array, "n h w c"]]:
+    """(picture - target) / noise, a group at a time."""
+    images = simulate(unknowns, problem)
+    return [group.weights * (image - group.targets) for group, image in zip(problem.groups, images, strict=True)]
+
+
+def simulate(unknowns: Unknowns, problem: Problem) -> list[Float[Array, "n h w c"]]:
+    """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
+    known = [None] * len(problem.groups) if problem.linearised is None else problem.linearised
+    return [_simulate(unknowns, problem, group, linear) for group, linear in zip(problem.groups, known, strict=True)]
+
+
+def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
+    """The problem with its pictures at these unknowns and their derivatives: what compiles from it need not render.
+
+    Where that cannot be, because of mirrors or an unknown albedo, the problem as it is.
+    """
+    if unknowns.albedo is not None:
+        return problem
+    if not all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
+        return problem
+    found = _linearised(*on_every_device((unknowns, problem), problem.mesh))
+    return eqx.tree_at(lambda problem: problem.linearised, problem, found, is_leaf=lambda leaf: leaf is None)
+
+
+@eqx.filter_jit
+def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised, ...]:
+    change = _with_unknowns(unknowns, problem)
+    pictures = tuple(
+        linearise_each(group.scenes, change, problem.settings, problem.mesh, group.targets.shape[-1])
+        for group in problem.groups
+    )
+    return on_every_device(pictures, problem.mesh)
+
+
+def _with_unknowns(unknowns: Unknowns, problem: Problem) -> Callable[[Scene], Scene]:
+    heights = problem.basis.heights(unknowns.waves)
+
+    def changed(scene: Scene) -> Scene:
+        scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights)
+        return scene if unknowns.albedo is None else _painted(scene, unknowns.albedo)
+
+    return changed
+
+
+def _simulate(unknowns: Unknowns, problem: Problem, group: Group, known: Linearised | None) -> Float[Array, "n h w c"]:
+    n, change = len(group.places), _with_unknowns(unknowns, problem)
+    if known is not None:
+        image = picture_each(known, group.scenes, change, problem.settings, problem.mesh)
+    else:
+        image = render_each(group.scenes, change, problem.settings, problem.mesh)
+        if group.targets.shape[-1] == 1:
+            image = jnp.mean(image, axis=-1, keepdims=True)
+    if unknowns.exposures is not None:
+        image = image * jnp.stack([unknowns.exposures[k] for k in group.places]).reshape(n, 1, 1, 1)
+    if unknowns.offsets is not None:
+        image = image + jnp.stack([unknowns.offsets[k] for k in group.places]).reshape(n, 1, 1, 1)
+    return image
+
+
+def _painted(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
+    """The scene with the albedo of its first heightfield multiplied."""
+    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
+    material = scene.objects[k].material
+    assert isinstance(material, Matte)
+    old = material.albedo
+    texels = jnp.asarray(old.texels) if isinstance(old, ImageTexture) else jnp.asarray(old).reshape(1, 1, 3)
+    shape = (*(max(pair) for pair in zip(texels.shape[:2], factor.shape[:2], strict=True)), 3)
+    new = jnp.broadcast_to(texels, shape) * jnp.broadcast_to(factor, shape)
+    albedo = new.reshape(3) if shape[:2] == (1, 1) and not isinstance(old, ImageTexture) else ImageTexture(new)
+    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
+
+
+def known_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
+    """What was known before any picture: the prior, and that terrain is smooth."""
+    surface = problem.basis.surface(unknowns.waves)
+    parts: list[Array] = []
+    if problem.prior is not None:
+        off = problem.prior.weight * (surface - problem.prior.heights)
+        stiffness = problem.prior.stiffness
+        parts.append(off if stiffness is None else stiffness * problem.basis.amplitudes(off))
+    if problem.smoothness is not None:
+        parts.append(problem.smoothness * laplacian(problem.basis.inside(surface)))
+    if problem.albedo_smoothness is not None and unknowns.albedo is not None:
+        parts += [problem.albedo_smoothness * laplacian(unknowns.albedo[..., c]) for c in range(unknowns.albedo.shape[-1])]
+    return parts
+
+
+def unusual(unknowns: Unknowns, problem: Problem) -> Float[Array, "my mx"]:
+    """The waves in units of their usual size."""
+    return unknowns.waves / problem.basis.usual
+
+
+def laplacian(values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
+    """The sum of the differences to the neighbours that a vertex has."""
+    padded = jnp.pad(values, 1, mode="edge")
+    return padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2] - 4 * values
+
+
+def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
+    """The pictures, and how much each height moves a random sum of them; zero, exactly, for one that moves none, (ny, nx).
+
+    The column of J of a vertex without influence is zero, and so is its product with any vector; that of another vertex with
+    a random vector is zero with probability zero.
+    """
+    problem = linearised(unknowns, problem)
+    return _pictures_and_influence(*on_every_device((unknowns, problem), problem.mesh))
+
+
+@eqx.filter_jit
+def _pictures_and_influence(
+    unknowns: Unknowns, problem: Problem
+) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
+    surface = problem.basis.surface(unknowns.waves)
+
+    def pictures(surface: Float[Array, "my mx"]) -> tuple[list[Array], list[Array]]:
+        still = eqx.tree_at(lambda p: (p.basis.scale, p.basis.base), problem, (jnp.zeros_like(surface), surface))
+        images = simulate(unknowns, still)
+        return [group.weights * image for group, image in zip(problem.groups, images, strict=True)], images
+
+    parts, pull_back, images = jax.vjp(pictures, surface, has_aux=True)
+    keys = jax.random.split(jax.random.key(0), len(parts))
+    draws = [jax.random.normal(key, part.shape, part.dtype) for key, part in zip(keys, parts, strict=True)]
+    return images, problem.basis.inside(pull_back(draws)[0])

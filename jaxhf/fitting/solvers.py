@@ -1,0 +1,203 @@
+"""The solvers, all of them optimistix's, behind one step function that is compiled once."""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import lineax as lx
+import optax
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from ..core.devices import on_every_device
+from ..core.types import Flag, Scalar
+from .basis import Unknowns
+from .problem import Problem
+from .residuals import half_squares, linearised, residuals
+
+Solver = Literal["lm", "bfgs", "lbfgs", "adam"]
+
+# BFGS keeps a dense matrix of this many rows at most: 128 MiB in double precision.
+BFGS_UNKNOWNS = 4096
+_FIRST_DAMPING = 1e-2
+_SHORTER = 0.25  # by how much 1 / λ changes at a rejected step, the first in a row
+# Of LSMR, as a share of the matrix's Frobenius norm. That is far above what a height changes that no picture shows: where a
+# prior is to say how high it is, such heights wandered off with 1e-3, and came back over twice as many steps as with 1e-4.
+_INNER_TOLERANCE = 1e-3
+_INNER_TOLERANCE_WITH_PRIOR = 1e-4
+_RATE = 0.02  # of Adam, in units of a wave's usual size
+
+
+class LevenbergMarquardt(optx.AbstractGaussNewton):
+    """Damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963), each solved without a dense matrix.
+
+    optimistix's own class is the same with a dense QR decomposition, and lowers the damping only where a step did at
+    least 99 % of what was predicted, which a picture with shadows hardly ever lets it.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable[..., Any]
+    descent: Any
+    search: Any
+    verbose: Callable[..., None]
+
+    def __init__(self, tolerance: float, inner_steps: int, prior: bool):
+        inner_tolerance = _INNER_TOLERANCE_WITH_PRIOR if prior else _INNER_TOLERANCE
+        self.rtol = self.atol = tolerance
+        self.norm = optx.rms_norm
+        # LSMR (Fong and Saunders 2011) works on J itself; conjugate gradients on JᵀJ, whose condition is squared, went
+        # non-finite in single precision. Its limit on the condition is lifted: the damping bounds it.
+        self.descent = optx.DampedNewtonDescent(lx.LSMR(rtol=inner_tolerance, atol=0.0, max_steps=inner_steps, conlim=1e16))
+        self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=4.0, low_constant=_SHORTER)
+        self.verbose = _silent
+
+
+class BFGS(optx.AbstractBFGS):
+    """Broyden, Fletcher, Goldfarb and Shanno's method, from a multiple of the identity that the first step has measured.
+
+    That is Nocedal and Wright, Numerical optimization (2006), (6.20). optimistix's own class stays with the identity, which
+    is a few thousand times too large here: nearly all of its evaluations were halvings of steps.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable[..., Any]
+    use_inverse: bool
+    descent: Any
+    search: Any
+    verbose: Callable[..., None]
+
+    def __init__(self, tolerance: float):
+        self.rtol = self.atol = tolerance
+        self.norm = optx.rms_norm
+        self.use_inverse = True
+        self.descent = optx.NewtonDescent()
+        self.search = optx.BacktrackingArmijo()
+        self.verbose = _silent
+
+    def init_hessian(self, y: Any, f: Any, grad: Any) -> tuple[Any, Any]:
+        return super().init_hessian(y, f, grad)[0], jnp.asarray(True)
+
+    def update_hessian(self, y: Any, y_eval: Any, f_info: Any, f_eval_info: Any, hessian_update_state: Any) -> tuple[Any, Any]:
+        step, change = (
+            jax.flatten_util.ravel_pytree(after)[0] - jax.flatten_util.ravel_pytree(before)[0]
+            for after, before in ((y_eval, y), (f_eval_info.grad, f_info.grad))
+        )
+        curved = step @ change > jnp.finfo(step.dtype).eps
+        first = hessian_update_state & curved
+        factor = jnp.where(first, step @ change / jnp.where(first, change @ change, 1), 1)
+        scaled = eqx.tree_at(
+            lambda info: info.hessian_inv, f_info, jax.tree.map(lambda leaf: factor * leaf, f_info.hessian_inv)
+        )
+        return super().update_hessian(y, y_eval, scaled, f_eval_info, None)[0], hessian_update_state & ~curved
+
+
+def impatient(solver: Any, rejected: int) -> Any:
+    """The solver for a step after so many rejections in a row: the next one raises λ by twice as much as the last.
+
+    (Nielsen, Damping parameter in Marquardt's method, 1999.) Solvers without a λ stay as they are.
+    """
+    if not isinstance(solver, LevenbergMarquardt):
+        return solver
+    return eqx.tree_at(lambda solver: solver.search.low_constant, solver, jnp.asarray(_SHORTER / 2**rejected))
+
+
+def _silent(**_: Any) -> None:
+    pass
+
+
+class Outcome(NamedTuple):
+    """What one step did: the half sum of squares where it now stands, and whether it stands elsewhere than before."""
+
+    loss: Scalar
+    accepted: Flag
+    converged: Flag
+    damping: Scalar
+    change: Scalar
+    unknowns: Unknowns
+
+
+def make_solver(name: str, tolerance: float, inner_steps: int, prior: bool) -> Any:
+    """The solver of a name; `prior` is whether the problem has one."""
+    if name == "lm":
+        return LevenbergMarquardt(tolerance, inner_steps, prior)
+    if name == "adam":
+        return optx.OptaxMinimiser(optax.adam(_RATE), rtol=tolerance, atol=tolerance, norm=optx.rms_norm)
+    if name == "bfgs":
+        return BFGS(tolerance)
+    return optx.LBFGS(rtol=tolerance, atol=tolerance, norm=optx.rms_norm)
+
+
+def _function(solver: Any) -> Callable[[Unknowns, Problem], Any]:
+    return residuals if isinstance(solver, optx.AbstractLeastSquaresSolver) else half_squares
+
+
+_OPTIONS: dict[str, Any] = {}
+_TAGS: frozenset[object] = frozenset()
+
+
+def begin(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
+    """A solver's state before its first step. Its static parts must be those of the one state that is ever made."""
+    # What enters a compiled step and what leaves it must lie in the same places, or the next step is compiled again for the
+    # other ones: 16 x 16 heights on two devices took 89 s of processor time before the first wave of the last level, not 30.
+    problem = linearised(unknowns, problem)
+    return _begin(solver, *on_every_device((unknowns, problem), problem.mesh))
+
+
+@eqx.filter_jit
+def _begin(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
+    function = _function(solver)
+    shape, _ = eqx.filter_eval_shape(function, unknowns, problem)
+    state = solver.init(function, unknowns, problem, _OPTIONS, shape, None, _TAGS)
+    if isinstance(solver, LevenbergMarquardt):
+        state = _with_step_size(state, jnp.asarray(1 / _FIRST_DAMPING, unknowns.waves.dtype))
+    return on_every_device(state, problem.mesh)
+
+
+def _with_step_size(state: Any, step_size: Float[Array, ""]) -> Any:
+    """A state of Levenberg-Marquardt with another 1 / λ, which optimistix calls the step size."""
+    return eqx.tree_at(lambda state: state.search_state.step_size, state, step_size)
+
+
+def restarted(fresh: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None = None) -> Any:
+    """A state that stands at `unknowns` and knows nothing of its surroundings yet; `fresh` is what `begin` made.
+
+    The next step of Levenberg-Marquardt evaluates and linearises there, and always accepts: the state is then, to the bit,
+    what it was after the step that reached them, if `step_size` is the same. So a checkpoint need not hold linearised pictures.
+    """
+    if hasattr(fresh, "y_eval"):
+        fresh = eqx.tree_at(lambda state: state.y_eval, fresh, unknowns)
+    return fresh if step_size is None else _with_step_size(fresh, step_size)
+
+
+def advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tuple[Unknowns, Any, Outcome]:
+    """One step: a trial of new unknowns, which are accepted or not."""
+    problem = linearised(getattr(state, "y_eval", unknowns), problem)  # where the residuals are going to be asked for
+    return _advance(*on_every_device((solver, unknowns, state, problem), problem.mesh))
+
+
+@eqx.filter_jit
+def _advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tuple[Unknowns, Any, Outcome]:
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes its 32-bit counters with 64-bit numbers
+        new, new_state, _ = solver.step(_function(solver), unknowns, problem, _OPTIONS, state, _TAGS)
+    converged, _ = solver.terminate(_function(solver), new, problem, _OPTIONS, new_state, _TAGS)
+    dtype = unknowns.waves.dtype
+    zero, yes = jnp.zeros((), dtype), jnp.ones((), bool)
+    if isinstance(solver, optx.OptaxMinimiser):  # its loss is that of the unknowns before the step
+        loss, accepted, damping, evaluated = new_state.f, yes, zero, unknowns
+    else:
+        loss, evaluated = new_state.f_info.as_min(), new
+        accepted = new_state.num_accepted_steps > state.num_accepted_steps
+        damping = 1 / new_state.search_state.step_size if isinstance(solver, LevenbergMarquardt) else zero
+    moved = problem.basis.heights(new.waves) - problem.basis.heights(unknowns.waves)
+    change = jnp.sqrt(jnp.mean(moved * moved))
+    outcome = Outcome(loss.astype(dtype), accepted, converged, damping.astype(dtype), change, evaluated)
+    return on_every_device((new, new_state, outcome), problem.mesh)
+
+
+def count_unknowns(unknowns: Unknowns) -> int:
+    return sum(leaf.size for leaf in jax.tree.leaves(unknowns))

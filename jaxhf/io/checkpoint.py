@@ -1,0 +1,46 @@
+"""Where a long fit stands, in a file that is whole or not there, and that says so when it was damaged."""
+
+import hashlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+
+from .files import PathLike, replacing, require_file
+
+_MAGIC = b"jaxhf checkpoint 1\n"
+
+
+def save_checkpoint(path: PathLike, facts: dict[str, Any], arrays: Any) -> None:
+    """Writes facts (what JSON can hold) and a pytree's arrays.
+
+    A kill at any moment leaves the old file or the new one, which takes the old one's place in one step, when it is whole.
+    """
+    stream = io.BytesIO()
+    stream.write(json.dumps(facts).encode() + b"\n")
+    eqx.tree_serialise_leaves(stream, arrays)
+    body = stream.getvalue()
+    with replacing(Path(path)) as temporary:
+        temporary.write_bytes(_MAGIC + hashlib.sha256(body).hexdigest().encode() + b"\n" + body)
+
+
+def load_facts(path: PathLike) -> dict[str, Any]:
+    """The facts of a checkpoint; ValueError where the file is damaged or is something else."""
+    return json.loads(_body(path).partition(b"\n")[0])
+
+
+def load_arrays(path: PathLike, like: Any) -> Any:
+    """The arrays of a checkpoint, in a pytree of the same structure, shapes and dtypes as `like`."""
+    return eqx.tree_deserialise_leaves(io.BytesIO(_body(path).partition(b"\n")[2]), like)
+
+
+def _body(path: PathLike) -> bytes:
+    content = require_file(path).read_bytes()
+    if not content.startswith(_MAGIC):
+        raise ValueError(f"{path}: this is not a checkpoint of jaxhf's, or not of this version")
+    checksum, _, body = content[len(_MAGIC) :].partition(b"\n")
+    if hashlib.sha256(body).hexdigest().encode() != checksum:
+        raise ValueError(f"{path}: the checkpoint is damaged: its checksum does not agree")
+    return body

@@ -1,0 +1,131 @@
+"""What the readers of scenes, heights and images share: which files there are, and how errors name them."""
+
+import contextlib
+import math
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from numpy.typing import DTypeLike
+
+from .errors import nearest
+
+MAX_PIXELS = 2**28  # 16384 x 16384, for images and for grids of heights
+
+PathLike = str | os.PathLike[str]
+Codec = TypeVar("Codec")
+
+
+def by_ending(codecs: Mapping[str, Codec], path: Path, task: str) -> Codec:
+    """What does `task` for the ending of `path`; ValueError where nothing does."""
+    ending = path.suffix.lower()
+    if ending not in codecs:
+        named = f"the ending {path.suffix!r}" if ending else "a name without an ending"
+        raise ValueError(f"{path}: cannot {task} {named}; {nearest(ending, codecs)}")
+    return codecs[ending]
+
+
+def require_file(path: PathLike) -> Path:
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    if not path.is_file():
+        raise ValueError(f"{path}: must be a file, it is a folder or a device")
+    return path
+
+
+@contextlib.contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Puts the file's name in front of whatever goes wrong inside, as one ValueError.
+
+    The decoders raise nearly anything on broken files: OSError, SyntaxError, RuntimeError, EOFError, struct.error.
+    """
+    try:
+        yield
+    except (MemoryError, PermissionError):
+        raise
+    except Exception as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def require_folder(path: Path, what: str) -> None:
+    """Checks that a file can be put where `path` says.
+
+    Raises:
+      FileNotFoundError: the folder does not exist.
+      ValueError: `path` is a folder itself.
+      PermissionError: the folder cannot be written to.
+    """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path}: there is no folder {str(path.parent)!r}")
+    if path.is_dir():
+        raise ValueError(f"{path}: {what} cannot be written here, it is a folder")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: the folder {str(path.parent)!r} cannot be written to")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong."""
+    path = path.resolve()  # what a link points to is replaced, not the link
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def require_writable_text(path: PathLike, ending: str) -> Path:
+    """Checks that `save_text` can write to `path`, and that it has this ending; errors as those of `require_folder`."""
+    path = Path(path)
+    by_ending({ending: None}, path, "write a page with")
+    require_folder(path, "a page")
+    return path
+
+
+def save_text(path: PathLike, text: str) -> None:
+    """Writes a text as UTF-8; the file appears whole or not at all."""
+    with replacing(Path(path)) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def require_precision(dtype: DTypeLike) -> np.dtype:
+    """The type that heights are read in; ValueError where it is not float32 or float64, or JAX would narrow it in silence."""
+    found = np.dtype(dtype)
+    if found not in (np.float32, np.float64):
+        raise ValueError(f"dtype must be float32 or float64, it is {found}")
+    if jax.dtypes.canonicalize_dtype(found) != found:
+        raise ValueError("dtype float64 needs JAX's x64 mode: jax.config.update('jax_enable_x64', True)")
+    return found
+
+
+def require_pixels(height: int, width: int) -> None:
+    if height < 1 or width < 1:
+        raise ValueError(f"its size must be positive, it is {width} x {height}")
+    if height * width > MAX_PIXELS:
+        raise ValueError(f"it must hold at most {MAX_PIXELS} pixels, it declares {width} x {height}")
+
+
+def read_npy(file: Any, size: int) -> np.ndarray:
+    """The array of an open .npy file, or member of an archive, of `size` bytes; ValueError where it is not of real numbers.
+
+    np.load trusts the header and asks for all the memory that it names, so its size is compared with the file's first.
+    """
+    version = np.lib.format.read_magic(file)
+    header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if header is None:
+        raise ValueError(f"its .npy version must be 1.0 or 2.0, it is {version}")
+    shape, _, dtype = header(file)
+    if dtype.kind not in "fiub":
+        raise ValueError(f"its array must hold real numbers, it holds {dtype}")
+    require_pixels(*(*shape, 1, 1)[:2])
+    declared, present = math.prod(shape) * dtype.itemsize, size - file.tell()
+    if declared != present:
+        raise ValueError(f"it is cut off or damaged: its header declares {declared} bytes of data, {present} are there")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)

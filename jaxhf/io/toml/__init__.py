@@ -1,0 +1,1 @@
+"""Scenes, and cases for a fit, in TOML."""

@@ -1,0 +1,97 @@
+"""Checks on the tables of a TOML scene; each of them ends with the line on which things went wrong."""
+
+import difflib
+import re
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..errors import SceneError, nearest
+from .lines import Where
+from .tables import Keys
+
+
+class Part(NamedTuple):
+    """A table of the file `path`, and where in it the table stands."""
+
+    path: Path
+    lines: Mapping[Where, int]
+    where: Where
+    table: dict[str, Any]
+
+    def at(self, *steps: str | int, table: dict[str, Any] | None = None) -> "Part":
+        """What stands in this table under `steps`."""
+        return self._replace(where=(*self.where, *steps), table={} if table is None else table)
+
+    @property
+    def name(self) -> str:
+        """("objects", 0, "dx") as a reader of the file says it: objects[0].dx."""
+        return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in self.where).lstrip(".")
+
+    def error(self, message: str) -> SceneError:
+        """An error on the line of this part, or of the nearest one around it whose line is known."""
+        around = (self.where[:k] for k in range(len(self.where), 0, -1))
+        return SceneError(self.path, next((self.lines[where] for where in around if where in self.lines), None), message)
+
+    def read(self, keys: Keys) -> dict[str, Any]:
+        """The values of all `keys`, by their kinds; SceneError on any other key, and on one that is missing."""
+        self.require_known(keys)
+        values = {}
+        for name, key in keys.items():
+            if name not in self.table:
+                if key.default is ...:
+                    raise self.error(f"{self.name or 'a scene'} must have {name!r}, it is missing")
+                values[name] = key.default
+                continue
+            try:
+                values[name] = key.kind(self.table[name])
+            except (ValueError, OverflowError) as error:
+                shown = repr(self.table[name])
+                shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
+                raise self.at(name).error(f"{self.at(name).name} must be {error}, it is {shown}") from error
+        return values
+
+    def require_known(self, known: Iterable[str]) -> None:
+        for name in self.table:
+            if name not in known:
+                inside = f" in {self.name}" if self.where else ""
+                raise self.at(name).error(f"unknown key {name!r}{inside}; {nearest(name, known)}")
+
+    def choice(self, name: str, options: Iterable[str], default: str | None = None) -> str:
+        """The value of the key `name`: one of `options`. Where it is missing, a key that resembles it is taken for a slip."""
+        value = self.table.get(name, default)
+        if value is None:
+            for meant in difflib.get_close_matches(name, self.table, n=1):
+                self._replace(table={meant: None}).require_known((name,))
+            raise self.error(f"{self.name} must have {name!r}, one of {', '.join(options)}; it is missing")
+        if value not in tuple(options):
+            tail = f"; {nearest(value, options)}" if isinstance(value, str) else ""
+            place = self.at(name)
+            raise place.error(f"{place.name} must be one of {', '.join(options)}; it is {value!r}{tail}")
+        return value
+
+    def one_of(self, names: Iterable[str], others: Iterable[str]) -> str:
+        """Which of `names` the table has: exactly one. Where it has none, a key outside `others` is taken for a slip of it."""
+        present = [name for name in names if name in self.table]
+        if not present:
+            self.require_known({*names, *others})
+        if len(present) != 1:
+            has = f"it has {' and '.join(present)}" if present else "it has none"
+            raise self.at(*present[1:2]).error(f"{self.name} must have exactly one of {', '.join(names)}; {has}")
+        return present[0]
+
+    def made(self, function: Callable[..., Any], *args: Any, **values: Any) -> Any:
+        """function(*args, **values); its ValueError becomes a SceneError, on the line of the key that its message names."""
+        try:
+            return function(*args, **values)
+        except SceneError:
+            raise
+        except (ValueError, FileNotFoundError) as error:
+            message, place = str(error), self
+            named = re.match(r"(?:\w+: )?(\w+) (?=must|may)", message)
+            if named and named[1] in self.table:
+                place = self.at(named[1])
+                message = f"{place.name} {message[named.end() :]}"
+            elif self.where and not message.startswith(self.name):
+                message = f"{self.name}: {message}"
+            raise place.error(message) from error

@@ -1,0 +1,254 @@
+"""Reads what to recover from which pictures: a scene with tables about pictures; `docs/fitting.md` describes the file."""
+
+import dataclasses
+import re
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+from numpy.typing import DTypeLike
+
+from ...core.settings import Settings
+from ...scene.camera import Camera
+from ...scene.heightfield import Heightfield
+from ...scene.light import Light
+from ...scene.scene import Object, Scene
+from ..files import PathLike, by_ending, require_file, require_precision
+from ..images import load_image, load_numbers
+from ..pbrt.reader import load_pbrt
+from ..terrain import jacksboro_file
+from .checks import Part
+from .known import Sought, known_deviations, known_heights, sought_heightfield
+from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene
+from .tables import SCENE, Key, Keys
+from .values import flag, number, number_list, number_or_word, table, tables, whole, whole_or_word, word
+
+# A scene, or where one stands, and what is known about it.
+_CASE: Keys = {
+    "scene": Key(word, None),
+    **SCENE,
+    "camera": Key(table, None),
+    "objects": Key(tables, None),
+    "pictures": Key(tables),
+    "fit": Key(table, {}),
+    "settings": Key(table, {}),
+}
+_PICTURE: Keys = {
+    "image": Key(word),
+    "mask": Key(word, None),
+    "weights": Key(word, None),
+    "noise": Key(number, None),
+    "camera": Key(table, None),
+    "lights": Key(tables, None),
+}
+# Those of `fit` and of `Settings`, whose defaults they have and who check their values.
+_FIT: Keys = {
+    "noise": Key(number, 0.01),
+    **{name: Key(number_or_word, None) for name in ("start", "prior", "prior_std")},
+    **{
+        name: Key(number, None)
+        for name in ("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", "loss_scale", "tolerance")
+    },
+    **{name: Key(word, None) for name in ("albedo", "loss", "solver")},
+    **{name: Key(flag, None) for name in ("exposures", "offsets")},
+    **{name: Key(whole, None) for name in ("max_steps", "inner_steps", "checkpoint_every")},
+    "levels": Key(number_list, None),
+    "uncertainty": Key(whole_or_word, None),
+}
+_SETTINGS: Keys = {
+    **{name: Key(word, None) for name in ("traversal", "shading", "normals")},
+    "shadows": Key(flag, None),
+    **{name: Key(whole, None) for name in ("samples", "max_steps", "max_depth", "edge_samples", "chunk")},
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Case:
+    """What a file asks `fit` for.
+
+    Attributes:
+      scenes, targets, weights, noise, settings: as `fit` takes them; a grey picture has shape (h, w).
+      options: further arguments of `fit`, those that the file gives.
+      names: the pictures' files, as written.
+      like: the GeoTIFF whose place on the map the heights have; None: there is none.
+      part: the file, for errors.
+    """
+
+    scenes: tuple[Scene, ...]
+    targets: tuple[np.ndarray, ...]
+    weights: tuple[np.ndarray | None, ...]
+    noise: tuple[float, ...]
+    settings: Settings
+    options: dict[str, Any]
+    names: tuple[str, ...]
+    like: Path | None
+    part: Part
+
+    def located(self, error: ValueError) -> ValueError:
+        """An error of `fit`'s about its arguments, on the line where they stand; others as they are."""
+        about_picture = re.match(r"fit: (?:targets|weights|scenes)\[(\d+)\]:? (.*)", str(error), re.DOTALL)
+        about_option = re.match(r"fit: (\w+) (.*)", str(error), re.DOTALL)
+        if about_picture:
+            place = self.part.at("pictures", int(about_picture[1]))
+            return place.error(f"{place.name} {about_picture[2]}")
+        if about_option and about_option[1] in _FIT:
+            place = self.part.at("fit", about_option[1])
+            return place.error(f"{place.name} {about_option[2]}")
+        return error
+
+
+class _Base(NamedTuple):
+    """What the pictures have in common; the camera is made for a picture of so many rows and columns."""
+
+    objects: tuple[Object, ...]
+    lights: tuple[Light, ...]
+    samples: int
+    camera: Callable[[tuple[int, ...]], Camera] | None
+    like: Path | None
+    sought: Sought
+
+
+def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
+    """Reads a .toml file with pictures, and the files that it names.
+
+    Args:
+      path: the file; those that it names lie in its folder or below.
+      dtype: of the heights, and thereby the precision of the fit: float32, or float64, which needs JAX's x64 mode.
+
+    Raises:
+      FileNotFoundError: `path` is not there.
+      ValueError: its ending or `dtype` is another, or x64 mode is off for float64.
+      SceneError: something is wrong in the file; the message gives its line.
+    """
+    dtype, path = require_precision(dtype), require_file(path)
+    by_ending({".toml": None}, path, "read what to fit from")
+    part = open_toml(path)
+    values = part.read(_CASE)
+    settings = _given(part.at("settings", table=values["settings"]), _SETTINGS)
+    settings = part.at("settings", table=values["settings"]).made(Settings, **settings)
+    base = _base(part, values, dtype)
+    if not values["pictures"]:
+        raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
+    chosen = part.at("fit", table=values["fit"])
+    options = _given(chosen, _FIT)
+    noise = options.pop("noise", _FIT["noise"].default)
+    for name in ("start", "prior", "prior_std"):
+        if isinstance(options.get(name), str):
+            known = known_deviations if name == "prior_std" else known_heights
+            options[name] = _read(chosen, name, partial(known, base.sought), options[name])
+    scenes, targets, weights, noises, names = [], [], [], [], []
+    for k, picture_table in enumerate(values["pictures"]):
+        picture = part.at("pictures", k, table=picture_table)
+        given = picture.read(_PICTURE)
+        target = _target(picture, given["image"])
+        lights = base.lights if given["lights"] is None else read_lights(picture, given["lights"])
+        camera = _camera(picture, given["camera"], base, target.shape[:2])
+        scenes.append(picture.made(Scene, base.objects, camera, lights, base.samples))
+        targets.append(target)
+        weights.append(_weights(picture, given, target.shape[:2]))
+        noises.append(noise if given["noise"] is None else given["noise"])
+        names.append(given["image"])
+        if not noises[-1] > 0:
+            place = (chosen if given["noise"] is None else picture).at("noise")
+            raise place.error(f"{place.name} must be positive, it is {noises[-1]:g}")
+    return Case(
+        tuple(scenes), tuple(targets), tuple(weights), tuple(noises), settings, options, tuple(names), base.like, part
+    )  # fmt: skip
+
+
+def _given(part: Part, keys: Keys) -> dict[str, Any]:
+    return {name: value for name, value in part.read(keys).items() if name in part.table}
+
+
+def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
+    if values["scene"] is None:
+        if values["objects"] is None:
+            raise part.error("a fit must have 'scene', the name of a scene file, or 'objects', both are missing")
+        return _toml_base(part, values, dtype)
+    for name in SCENE:
+        if name in part.table:
+            raise part.at(name).error(f"{name} must stand without scene, whose file has its own")
+    place = part.at("scene")
+    path = place.made(named_file, part, values["scene"])
+    if place.made(by_ending, {".toml": True, ".pbrt": False}, path, "read a scene from"):
+        other = open_toml(path)
+        return _toml_base(other, read_scene(other), dtype)
+    scene = load_pbrt(path, dtype)
+    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, None, _sought(part, [], scene.objects))
+
+
+def _toml_base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
+    objects = read_objects(part, values, dtype)
+    camera = None if values["camera"] is None else partial(_sized, part.at("camera", table=values["camera"]))
+    lights = read_lights(part, values["lights"])
+    sought = _sought(part, values["objects"], objects)
+    return _Base(tuple(objects), tuple(lights), values["samples"], camera, _like(sought), sought)
+
+
+def _sought(part: Part, tables: list[dict[str, Any]], objects: Sequence[Object]) -> Sought:
+    """The first heightfield; it has a table in TOML only."""
+    shape = next((obj.shape.heights.shape for obj in objects if isinstance(obj.shape, Heightfield)), ())
+    item = next((item for item in tables if item["shape"] == "heightfield"), {})
+    path = named_file(part, item["file"]) if "file" in item else None
+    return sought_heightfield(item, shape, Path(jacksboro_file()) if item.get("source") == "jacksboro" else path)
+
+
+def _like(sought: Sought) -> Path | None:
+    """The GeoTIFF of the first heightfield, unless the scene puts it elsewhere."""
+    on_map = sought.path is not None and sought.path.suffix.lower() in (".tif", ".tiff") and not sought.given
+    return sought.path if on_map else None
+
+
+def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any:
+    """What `reader` makes of the file whose `name` is the value of `key`."""
+    return part.at(key).made(lambda: reader(named_file(part, name)))
+
+
+def _target(picture: Part, name: str) -> np.ndarray:
+    """(h, w, 3), or (h, w) for a grey picture: it is compared with the mean over the channels, once, not three times."""
+    image = _read(picture, "image", load_image, name)
+    grey = all(np.array_equal(image[..., 0], image[..., c], equal_nan=True) for c in (1, 2))
+    return image[..., 0] if grey else image
+
+
+def _weights(picture: Part, given: dict[str, Any], size: tuple[int, ...]) -> Float32[np.ndarray, "h w"] | None:
+    present = [name for name in ("mask", "weights") if given[name] is not None]
+    if not present:
+        return None
+    if len(present) > 1:
+        raise picture.at("weights").error(f"{picture.name} must have mask or weights, it has both")
+    weights = _read(picture, present[0], load_numbers, given[present[0]]).mean(axis=-1)
+    if weights.shape != size:
+        place = picture.at(present[0])
+        raise place.error(f"{place.name} must have the size of the image, {_by(size)}; it is {_by(weights.shape)}")
+    return (weights > 0).astype(np.float32) if present[0] == "mask" else weights
+
+
+def _camera(picture: Part, view: dict[str, Any] | None, base: _Base, size: tuple[int, ...]) -> Camera:
+    if view is not None:
+        camera = _sized(picture.at("camera", table=view), size)
+    elif base.camera is not None:
+        camera = base.camera(size)
+    else:
+        raise picture.error(f"{picture.name} must have a camera: there is none for all pictures")
+    height, width = size
+    if height != round(width * camera.height / camera.width) and width != round(height * camera.width / camera.height):
+        stated = _by((camera.height, camera.width))
+        raise picture.at("image").error(
+            f"{picture.name}.image must have the proportions of its camera, {stated}; it is {_by(size)}"
+        )
+    return dataclasses.replace(camera, width=width, height=height)
+
+
+def _sized(view: Part, size: tuple[int, ...]) -> Camera:
+    """A camera that has the size of its picture where its table states none."""
+    if "width" in view.table or "height" in view.table:
+        return read_camera(view)
+    return read_camera(view._replace(table={**view.table, "height": size[0], "width": size[1]}))
+
+
+def _by(size: tuple[int, ...]) -> str:
+    return f"{size[1]} x {size[0]} pixels"

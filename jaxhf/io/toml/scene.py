@@ -1,0 +1,174 @@
+"""Reads scenes in TOML; `docs/scene-files.md` describes them, `scenes/` holds examples.
+
+Which keys there are stands in `_toml_tables.py`; any other key, a value of another type and a file outside the scene's folder
+are errors.
+"""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from ...core.affine import require_invertible
+from ...scene.camera import Camera
+from ...scene.cylinder import Cylinder
+from ...scene.heightfield import Heightfield
+from ...scene.light import Light
+from ...scene.scene import Object, Scene
+from ...scene.texture import ImageTexture
+from .. import procedural
+from ..errors import SceneError, nearest, resolve_inside
+from ..images import load_image
+from ..terrain import jacksboro_file, load_heights
+from .checks import Part
+from .lines import line_numbers
+from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, ORIGINS, PLACE, SCENE, TEXTURES, Key, Keys
+from .values import word
+
+
+def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
+    """Reads a scene.
+
+    Args:
+      path: a .toml file; the files that it names lie in its folder or below.
+      dtype: of the heights, and thereby the precision of the picture.
+
+    Raises:
+      SceneError: anything is wrong in it; with its line.
+    """
+    part = open_toml(path)
+    values = read_scene(part)
+    parts = {
+        "camera": read_camera(part.at("camera", table=values["camera"])),
+        "lights": read_lights(part, values["lights"]),
+        "objects": read_objects(part, values, np.dtype(dtype)),
+    }
+    return part.made(Scene, samples=values["samples"], **parts)
+
+
+def open_toml(path: Path) -> Part:
+    """The outermost table of a file; SceneError where it is not TOML."""
+    text = ""
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        message, _, place = str(error).partition(" (at ")
+        at = re.match(r"line (\d+)", place)
+        raise SceneError(path, int(at[1]) if at else len(text.splitlines()), f"this is not TOML: {message}") from error
+    except (UnicodeDecodeError, RecursionError) as error:
+        raise SceneError(path, None, f"this is not TOML: {error}") from error
+    return Part(path, line_numbers(text), (), content)
+
+
+def read_scene(part: Part) -> dict[str, Any]:
+    """The values of a scene's outermost table."""
+    for name in ("pictures", "fit"):
+        if name in part.table:
+            raise part.at(name).error(f"{name!r} makes this a fit file, for `jaxhf fit`; a scene has no such table")
+    return part.read(SCENE)
+
+
+def read_camera(part: Part) -> Camera:
+    return _variant(part, "type", CAMERAS)
+
+
+def read_lights(part: Part, tables: list[dict[str, Any]]) -> list[Light]:
+    """The lights in the list `lights` of `part`."""
+    return [_variant(part.at("lights", k, table=table), "type", LIGHTS) for k, table in enumerate(tables)]
+
+
+def read_objects(part: Part, values: dict[str, Any], dtype: np.dtype) -> list[Object]:
+    """The objects of a scene, with its textures."""
+    textures = {name: _texture(part.at("textures", name, table=table)) for name, table in values["textures"].items()}
+    return [_object(part.at("objects", k, table=table), textures, dtype) for k, table in enumerate(values["objects"])]
+
+
+def _variant(part: Part, key: str, variants: Any) -> Any:
+    """What the function makes that the value of `key` chooses from `variants`."""
+    function, keys = variants[part.choice(key, variants)]
+    values = part.read({key: Key(word), **keys})
+    del values[key]
+    return part.made(function, **values)
+
+
+def _texture(part: Part) -> ImageTexture:
+    if part.one_of(("image", "source"), {key for _, keys in TEXTURES.values() for key in keys}) == "source":
+        return ImageTexture(_variant(part, "source", TEXTURES))
+    name = part.read({"image": Key(word)})["image"]
+    # An image starts at its top, a texture at v = 0: so it lies on a map with the north up.
+    return part.at("image").made(lambda: ImageTexture(load_image(named_file(part, name))[::-1]))
+
+
+def named_file(part: Part, name: str) -> Path:
+    return resolve_inside(part.path.parent, part.path.parent, name)
+
+
+def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> Object:
+    is_field = part.choice("shape", ("heightfield", "cylinder")) == "heightfield"
+    make_material, material_keys = MATERIALS[part.choice("material", MATERIALS, "matte")]
+    common: Keys = {**PLACE, **material_keys}
+    shape_keys = _field_keys(part, common) if is_field else CYLINDER
+    values = part.read({**common, **shape_keys})
+    world = _world_from_object(part, values)
+    material = part.made(make_material, **{name: _painted(part.at(name), values[name], textures) for name in material_keys})
+    shape_values = {name: values[name] for name in shape_keys}
+    shape = part.made(_heightfield, part, shape_values, dtype) if is_field else part.made(Cylinder, **shape_values)
+    return Object(shape, material, world)
+
+
+def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
+    given = [name for name in ("transform", "matrix") if values[name] is not None]
+    if not given:
+        return None
+    if len(given) > 1:
+        raise part.at("matrix").error(f"{part.name} must have transform or matrix, it has both")
+    place = part.at(given[0])
+    place.made(require_invertible, place.name, values[given[0]])
+    return values[given[0]]
+
+
+def _painted(part: Part, value: Any, textures: dict[str, ImageTexture]) -> Any:
+    """A colour, or the texture whose name stands in its place."""
+    if isinstance(value, str) and value not in textures:
+        tail = nearest(value, textures) if textures else "the scene has none"
+        raise part.error(f"{part.name}: there is no texture {value!r}; {tail}")
+    return textures[value] if isinstance(value, str) else value
+
+
+def _field_keys(part: Part, common: Keys) -> Keys:
+    """The keys of this heightfield, beside the `common` ones: they depend on where it comes from."""
+    origin = part.one_of(ORIGINS, {*common, *GRID, "nodata"}.union(*HEIGHTS.values()))
+    source = HEIGHTS[part.choice("source", HEIGHTS)] if origin == "source" else {}
+    return {**ORIGINS[origin], **GRID, **source}
+
+
+def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> Heightfield:
+    source = values.get("source")
+    if "file" in values or source == "jacksboro":
+        return _loaded(part.at("source" if source else "file"), values, dtype)
+    if values["z_scale"] == 0:
+        raise ValueError("z_scale must not be zero, it is 0")
+    heights = procedural.HEIGHTS[source](**{name: values[name] for name in HEIGHTS[source]}) if source else values["heights"]
+    place = {name: values[name] for name in ("dx", "dy", "x0", "y0") if values[name] is not None}
+    return Heightfield(_fitted(heights * values["z_scale"], dtype), **place)
+
+
+def _loaded(part: Part, values: dict[str, Any], dtype: np.dtype) -> Heightfield:
+    def load():
+        path = named_file(part, values["file"]) if "file" in values else jacksboro_file()
+        return load_heights(path, nodata=values.get("nodata"), **{name: values[name] for name in GRID})
+
+    terrain = part.made(load)
+    return Heightfield(_fitted(terrain.heights, dtype), terrain.dx, terrain.dy, terrain.x0, terrain.y0)
+
+
+def _fitted(heights: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    with np.errstate(over="ignore"):
+        fitted = heights.astype(dtype)
+    if np.isinf(fitted).any():  # it would count as a hole
+        raise ValueError(f"heights must fit into {dtype}, the largest is {np.nanmax(np.abs(heights)):.3g}")
+    return fitted

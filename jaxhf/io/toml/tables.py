@@ -1,0 +1,119 @@
+"""Which keys the tables of a TOML scene take, and what is made of them. `docs/scene-files.md` explains them all."""
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from ...scene.camera import Camera, Orthographic, Perspective
+from ...scene.light import Directional, Light, Point, Sky
+from ...scene.material import Material, Matte, Mirror
+from .. import procedural
+from .values import (
+    colour,
+    colour_or_name,
+    grid,
+    matrix,
+    number,
+    numbers,
+    size,
+    steps,
+    table,
+    table_of_tables,
+    tables,
+    whole,
+    word,
+)
+
+
+class Key(NamedTuple):
+    """What a key takes. Without a `default` it must be there; where that is None, the reader decides."""
+
+    kind: Callable[[Any], Any]
+    default: Any = ...
+
+
+Keys = Mapping[str, Key]
+
+
+def _directional(towards, azimuth, altitude, radiance) -> Directional:
+    if towards is None:
+        return Directional.from_angles(315.0 if azimuth is None else azimuth, 45.0 if altitude is None else altitude, radiance)
+    if azimuth is not None or altitude is not None:
+        raise ValueError("towards must stand without azimuth and altitude, it says the same")
+    return Directional(towards, radiance)
+
+
+def _point(position, intensity) -> Point:
+    return Point(position, intensity)
+
+
+SCENE: Keys = {
+    "samples": Key(whole, 1),
+    "camera": Key(table),
+    "lights": Key(tables, []),
+    "textures": Key(table_of_tables, {}),
+    "objects": Key(tables),
+}
+_VIEW: Keys = {
+    "eye": Key(numbers(3)),
+    "target": Key(numbers(3)),
+    "up": Key(numbers(3), [0.0, 0.0, 1.0]),
+    "width": Key(whole, 512),
+    "height": Key(whole, 512),
+}
+CAMERAS: dict[str, tuple[Callable[..., Camera], Keys]] = {
+    "perspective": (Perspective.look_at, {**_VIEW, "fov": Key(number, 45.0)}),
+    "orthographic": (Orthographic.look_at, {**_VIEW, "extent": Key(number)}),
+}
+LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
+    "directional": (
+        _directional,
+        {
+            "towards": Key(numbers(3), None),
+            "azimuth": Key(number, None),
+            "altitude": Key(number, None),
+            "radiance": Key(colour, math.pi),
+        },
+    ),
+    "point": (_point, {"position": Key(numbers(3)), "intensity": Key(colour)}),
+    "sky": (Sky, {"radiance": Key(colour)}),
+}
+MATERIALS: dict[str, tuple[Callable[..., Material], Keys]] = {
+    "matte": (Matte, {"albedo": Key(colour_or_name, 0.7)}),
+    "mirror": (Mirror, {"reflectance": Key(colour, 0.9)}),
+}
+
+# The parameters of procedural heights and textures, by their names in `procedural.py`.
+_PARAMETERS: dict[str, Callable[[Any], Any]] = {
+    "size": size,
+    **{name: whole for name in ("seed", "count", "lines", "squares")},
+    **{name: number for name in ("exponent", "level", "direction", "spread", "radius", "sun_radius", "clouds")},
+    **{name: numbers(2) for name in ("range", "lengths", "sun")},
+    **{name: colour for name in ("zenith", "horizon", "sun_radiance", "first", "second")},
+}
+
+
+def _parameters(function: Callable[..., Any]) -> Keys:
+    given = inspect.signature(function).parameters.values()
+    return {p.name: Key(_PARAMETERS[p.name], ... if p.default is p.empty else p.default) for p in given}
+
+
+TEXTURES = {name: (function, _parameters(function)) for name, function in procedural.TEXTURES.items()}
+HEIGHTS: dict[str, Keys] = {
+    "jacksboro": {},
+    **{name: _parameters(function) for name, function in procedural.HEIGHTS.items()},
+}
+ORIGINS: dict[str, Keys] = {  # where a heightfield comes from
+    "heights": {"heights": Key(grid)},
+    "file": {"file": Key(word), "nodata": Key(number, None)},
+    "source": {"source": Key(word)},
+}
+GRID: Keys = {**{name: Key(number, None) for name in ("dx", "dy", "x0", "y0")}, "z_scale": Key(number, 1.0)}
+CYLINDER: Keys = {"radius": Key(number, 1.0), "z_min": Key(number, -1.0), "z_max": Key(number, 1.0)}
+PLACE: Keys = {
+    "shape": Key(word),
+    "material": Key(word, "matte"),
+    "transform": Key(steps, None),
+    "matrix": Key(matrix, None),
+}

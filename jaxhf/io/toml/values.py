@@ -1,0 +1,168 @@
+"""What a value in a TOML scene may be: for each kind a function that returns it, or raises ValueError with what it must be."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ...core.affine import rotate, scale, translate
+from ..errors import nearest
+
+
+def number(value: Any) -> float:
+    if not _is_number(value):
+        raise ValueError("a finite number")
+    return float(value)
+
+
+def whole(value: Any) -> int:
+    if not _is_whole(value):
+        raise ValueError("a whole number")
+    return value
+
+
+def word(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("a string")
+    return value
+
+
+def flag(value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError("true or false")
+    return value
+
+
+def number_or_word(value: Any) -> float | str:
+    if isinstance(value, str):
+        return value
+    try:
+        return number(value)
+    except ValueError:
+        raise ValueError("a finite number or a string") from None
+
+
+def whole_or_word(value: Any) -> int | str:
+    if not (_is_whole(value) or isinstance(value, str)):
+        raise ValueError("a whole number or a string")
+    return value
+
+
+def number_list(value: Any) -> list[float]:
+    if not isinstance(value, list) or not all(map(_is_number, value)):
+        raise ValueError("a list of finite numbers")
+    return [float(item) for item in value]
+
+
+def numbers(count: int) -> Callable[[Any], list[float]]:
+    def kind(value: Any) -> list[float]:
+        if not _is_list(value, count, _is_number):
+            raise ValueError(f"a list of {count} finite numbers")
+        return [float(item) for item in value]
+
+    return kind
+
+
+def size(value: Any) -> list[int]:
+    if not _is_list(value, 2, _is_whole):
+        raise ValueError("a list of 2 whole numbers, rows and columns")
+    return value
+
+
+def factors(value: Any) -> list[float]:
+    """Three numbers, or one that stands for all of them."""
+    if _is_number(value):
+        return [float(value)] * 3
+    if not _is_list(value, 3, _is_number):
+        raise ValueError("a finite number or a list of 3")
+    return [float(item) for item in value]
+
+
+def colour(value: Any) -> list[float]:
+    found = factors(value)
+    if min(found) < 0:
+        raise ValueError("0 or more")
+    return found
+
+
+def colour_or_name(value: Any) -> list[float] | str:
+    if isinstance(value, str):
+        return value
+    try:
+        return colour(value)
+    except ValueError as error:
+        raise ValueError(f"{error}, or the name of a texture") from None
+
+
+def grid(value: Any) -> Float[np.ndarray, "ny nx"]:
+    if not isinstance(value, list) or not value or not all(isinstance(row, list) and row for row in value):
+        raise ValueError("a list of rows of numbers, the southernmost first")
+    if len({len(row) for row in value}) > 1:
+        raise ValueError(f"a list of rows of one length, theirs are {sorted({len(row) for row in value})}")
+    for iy, row in enumerate(value):
+        for ix, height in enumerate(row):
+            if not _is_number(height):
+                raise ValueError(f"made of finite numbers, row {iy} column {ix} is {height!r}")
+    return np.array(value, np.float64)
+
+
+def steps(value: Any) -> Float[np.ndarray, "4 4"]:
+    """The product of a list of transforms: as in pbrt, the last of them acts first on a point."""
+    if not isinstance(value, list) or not value:
+        raise ValueError("a list such as [{translate = [0, 0, 1]}, {rotate = [90, 0, 0, 1]}, {scale = 2}]")
+    product = np.eye(4)
+    for k, step in enumerate(value):
+        if not isinstance(step, dict) or len(step) != 1:
+            raise ValueError(f"a list of tables with one key each, step {k} is {step!r}")
+        ((verb, amount),) = step.items()
+        if verb not in STEPS:
+            raise ValueError(f"made of {', '.join(STEPS)}, step {k} is {verb!r}; {nearest(verb, STEPS)}")
+        kind, function = STEPS[verb]
+        try:
+            product = product @ function(*kind(amount))
+        except ValueError as error:
+            raise ValueError(f"valid in step {k}: {verb} must be {error}, it is {amount!r}") from error
+    return product
+
+
+STEPS: dict[str, tuple[Callable[[Any], list[float]], Callable[..., np.ndarray]]] = {
+    "translate": (numbers(3), translate),
+    "rotate": (numbers(4), rotate),
+    "scale": (factors, scale),
+}
+
+
+def matrix(value: Any) -> Float[np.ndarray, "4 4"]:
+    if not isinstance(value, list) or len(value) != 4:
+        raise ValueError("a list of 4 rows of 4 numbers")
+    return np.array([numbers(4)(row) for row in value])
+
+
+def table(value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ValueError("a table")
+    return value
+
+
+def tables(value: Any) -> list[dict[str, Any]]:
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise ValueError("a list of tables")
+    return value
+
+
+def table_of_tables(value: Any) -> dict[str, dict[str, Any]]:
+    return {name: table(item) for name, item in table(value).items()}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_whole(value: Any) -> bool:
+    return type(value) is int  # exactly: True is an int
+
+
+def _is_list(value: Any, count: int, of: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and len(value) == count and all(map(of, value))

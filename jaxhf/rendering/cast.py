@@ -1,0 +1,117 @@
+"""Rays of the caller's own, on one heightfield or through a camera."""
+
+import functools
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float
+
+from ..core.ray import Ray
+from ..core.settings import Settings
+from ..core.types import float_leaf
+from ..scene.heightfield import Heightfield
+from ..scene.localise import localise
+from ..scene.scene import Scene
+from ..trace.grid import Grid
+from ..trace.hit import Hit
+from ..trace.intersect import intersect, leave
+from ..trace.world import Vertex, first_vertex, make_surface, make_world
+
+
+def cast_camera(
+    scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings = Settings()
+) -> Vertex:
+    """The first hits of the camera's rays through the points (x, y) of the picture, in pixels from its top left corner.
+
+    Returns:
+      A `Vertex` whose leaves have a leading axis n: the hits, with `p` relative to the terrain's corner, and the number of
+      the object that each is on, -1 for none.
+    """
+    local = localise(scene)
+    dtype = local.camera.world_from_camera.dtype
+    return _cast_camera(local, jnp.asarray(x, dtype), jnp.asarray(y, dtype), settings)
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -> Vertex:
+    world = make_world(scene, settings)
+
+    def one(x: jax.Array, y: jax.Array) -> Vertex:
+        return first_vertex(world, scene.camera.ray(x, y), settings)
+
+    return jax.vmap(one)(x, y)
+
+
+def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings(), *, leaving: Hit | None = None) -> Hit:
+    """Where rays meet a heightfield; differentiable in the heights, in `o`, in `d` and in `leaving`.
+
+    Args:
+      heightfield: the surface, in the frame of the rays.
+      o, d: origins and directions, shape (..., 3) each, broadcast against each other; a direction need not be unit. NumPy
+        and Python numbers keep double precision until the grid's x0 and y0 have been subtracted.
+      settings: max_steps, shading, normals and chunk count here.
+      leaving: for rays that start on the surface: hits of an earlier `cast` on the same heightfield, whose leading axes are
+        broadcast against those of `d`; `o` must then be None. A ray leaves on the side of its triangle to which `d` points
+        and cannot meet that triangle again, so that no offset by an epsilon is needed.
+
+    Returns:
+      A `Hit` with the same leading axes. A ray that is zero or not finite, or that leaves what is no hit, has the status
+      INVALID.
+
+    Raises:
+      ValueError: `o` or `d` does not end in an axis of length 3, or not exactly one of `o` and `leaving` is None.
+    """
+    dtype = heightfield.heights.dtype
+    corner = np.array([heightfield.x0, heightfield.y0, 0.0])
+    if (o is None) == (leaving is None):
+        raise ValueError("cast: rays start at o or at the hits that they are leaving, and one of the two must be None")
+    for name, value in (("o", o), ("d", d)):
+        if value is not None and np.shape(value)[-1:] != (3,):
+            raise ValueError(f"cast: {name} must have shape (..., 3), its shape is {np.shape(value)}")
+    if leaving is not None:
+        start, axes = leaving, leaving.t.ndim
+    elif isinstance(o, jax.Array):
+        o = float_leaf(o)
+        start, axes = jnp.asarray(o - jnp.broadcast_to(jnp.asarray(corner, o.dtype), o.shape), dtype), o.ndim - 1
+    else:
+        start, axes = jnp.asarray(np.asarray(o, np.float64) - corner, dtype), np.ndim(o) - 1
+    d = jnp.asarray(d, dtype)
+    batch = np.broadcast_shapes(jax.tree.leaves(start)[0].shape[:axes], d.shape[:-1])
+
+    def in_a_row(leaf: jax.Array, tail: tuple[int, ...]) -> jax.Array:
+        return jnp.broadcast_to(leaf, (*batch, *tail)).reshape(-1, *tail)
+
+    starts = jax.tree.map(lambda leaf: in_a_row(leaf, leaf.shape[axes:]), start)
+    field = Heightfield(heightfield.heights, heightfield.dx, heightfield.dy)
+    hit = _cast(field, starts, in_a_row(d, (3,)), settings)
+    offset = jnp.asarray(corner, dtype)
+    hit = eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(offset, hit.p.shape))
+    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), hit)
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
+    """Rays from points (n, 3), or from hits with a leading axis n; chunk after chunk of one fixed size."""
+    surface = make_surface(heightfield, None, settings)
+    assert isinstance(surface, Grid)
+
+    def one(rays: tuple[jax.Array | Hit, jax.Array]) -> Hit:
+        start, d = rays
+        ray, origin = leave(surface, start, d) if isinstance(start, Hit) else (Ray(start, d), None)
+        return intersect(surface, ray, settings, origin)
+
+    chunk = settings.chunk
+    rays = d.shape[0]
+    count = math.ceil(rays / chunk)
+
+    def chunked(leaf: jax.Array) -> jax.Array:
+        tail = leaf.shape[1:]
+        return jnp.pad(leaf, ((0, count * chunk - rays), *((0, 0) for _ in tail))).reshape(count, chunk, *tail)
+
+    hits = lax.map(jax.vmap(one), jax.tree.map(chunked, (start, d)))
+    return jax.tree.map(lambda leaf: leaf.reshape(count * chunk, *leaf.shape[2:])[:rays], hits)

@@ -1,0 +1,228 @@
+"""From a scene to a picture: the only place where rays are batched."""
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh
+from jaxtyping import Float, Int
+
+from ..boundary.guiding import sources
+from ..boundary.term import moving_boundaries
+from ..core.autodiff import with_tangent
+from ..core.devices import local_mesh, map_over, on_every_device
+from ..core.materialise import stored
+from ..core.sampling import sample_offset
+from ..core.settings import Settings
+from ..scene.camera import Camera
+from ..scene.localise import localise, localise_camera
+from ..scene.scene import Scene
+from ..shade.radiance import radiance
+from ..trace.world import World, make_world, settle
+from .aovs import AOVS, _observe
+from .tiles import Tiling
+
+
+class Prepared(eqx.Module):
+    """A scene of which all is done that does not depend on the camera; `prepare` makes it, `render` takes it.
+
+    Attributes:
+      scene: as it was given, with the camera that is to see it.
+      settings: those for which it was prepared.
+      mesh: the devices on which it lies.
+    """
+
+    scene: Scene
+    settings: Settings = eqx.field(static=True)
+    mesh: Mesh = eqx.field(static=True)
+    _world: World
+
+    def with_camera(self, camera: Camera) -> "Prepared":
+        """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, camera=camera))
+
+
+def prepare(scene: Scene, settings: Settings = Settings(), *, mesh: Mesh | None = None) -> Prepared:
+    """Takes the normals and the bounds of the heights once, for many pictures of the same terrain in the same light.
+
+    The arguments are those of `render`.
+    """
+    settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
+    return Prepared(scene, settings, mesh, _make_world(on_every_device(localise(scene), mesh), settings=settings))
+
+
+def render(
+    scene: Scene | Prepared,
+    settings: Settings = Settings(),
+    *,
+    aovs: Sequence[str] = (),
+    progress: Callable[[int, int], None] | None = None,
+    key: jax.Array | None = None,
+    mesh: Mesh | None = None,
+) -> Any:
+    """Renders a picture.
+
+    Its tiles are dealt out to many devices, each of which holds a copy of the scene; the picture has the same bits on any
+    number of CPU devices. JAX takes the cores of a CPU for one device, unless
+    `jax.config.update("jax_num_cpu_devices", n)` says otherwise before it is first used.
+
+    Args:
+      scene: what to see. Values that are NumPy or Python numbers keep double precision until the origin has been moved to
+        the terrain; the rest is computed in the precision of the (first) heightfield's heights.
+      settings: the knobs; those of a `Prepared` scene stay what they are.
+      aovs: names out of `AOVS`.
+      progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
+      key: of JAX's random numbers, for what is sampled: the points on edges, if the settings ask for them. The same key
+        gives the same derivative; None stands for a fixed one.
+      mesh: the devices that share the work, whatever its axes; None: all of this process. Where it spans several processes
+        (`jax.distributed`), each must call with the same values, and gets the whole picture.
+
+    Returns:
+      Linear radiance, shape (h, w, 3), top row first; with `aovs` that and a dict of them.
+
+    Raises:
+      ValueError: an unknown AOV, or settings or a mesh for a scene that was prepared with others.
+    """
+    aovs = tuple(aovs)
+    for name in aovs:
+        if name not in AOVS:
+            raise ValueError(f"render: aovs must be among {', '.join(AOVS)}; one is {name!r}")
+    if not isinstance(scene, Prepared) and progress is not None:
+        scene, settings = prepare(scene, settings, mesh=mesh), Settings()
+    if isinstance(scene, Prepared):
+        if mesh is not None and mesh != scene.mesh:
+            raise ValueError(f"render: the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
+        if settings != Settings() and settle(settings, scene.scene) != scene.settings:
+            raise ValueError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
+        settings, world, mesh = scene.settings, scene._world, scene.mesh
+        camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
+        if progress is None:
+            outputs = _trace_prepared(world, camera, settings, aovs, mesh, settled_key(key, settings, mesh))
+        else:
+            outputs = _trace_in_parts(world, camera, settings, aovs, mesh, progress)
+    else:
+        settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
+        local = on_every_device(localise(scene), mesh)
+        outputs = _trace_all(local, settings, aovs, mesh, settled_key(key, settings, mesh))
+    image = outputs.pop("image")
+    return (image, {name: outputs[name] for name in aovs}) if aovs else image
+
+
+def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh) -> Float[jax.Array, "n h w 3"]:
+    """Pictures of scenes that differ in numbers only, one after the other, in one program; for tracing.
+
+    Args:
+      scenes: one `localise`d scene, whose leaves have a leading axis of n scenes.
+      change: what is done to each before it is rendered.
+      settings: the knobs.
+      mesh: the devices that share the work.
+    """
+
+    def one(scene: Scene) -> jax.Array:
+        scene = change(scene)
+        settled = settle(settings, scene)
+        return _trace_all(on_every_device(scene, mesh), settled, (), mesh, settled_key(None, settled, mesh))["image"]
+
+    return lax.map(one, scenes)
+
+
+def settled_key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
+    if not settings.edge_samples:
+        return None
+    return on_every_device(jax.random.key(0) if key is None else key, mesh)
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "aovs", "mesh"))
+def _trace_all(
+    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+) -> dict[str, jax.Array]:
+    return _trace_world(make_world(scene, settings), scene.camera, settings, aovs, mesh, key)
+
+
+def _trace_world(
+    world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+) -> dict[str, jax.Array]:
+    tiling = Tiling(camera, settings)
+    tiles = _trace_each(mesh, world, camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
+    outputs = jax.tree.map(tiling.assemble, tiles)
+    if key is not None and sources(world, settings):
+        image = outputs["image"]
+        outputs["image"] = with_tangent(image, moving_boundaries(world, camera, settings, key, mesh, image))
+    return outputs
+
+
+_trace_prepared = jax.jit(_trace_world, static_argnames=("settings", "aovs", "mesh"))
+
+
+def _trace_each(
+    mesh: Mesh, world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]
+):
+    """Tiles one after the other, (n, side * side, ...) of each output."""
+    return map_over(mesh, lambda seen, tile: _trace_tile(seen[0], seen[1], settings, aovs, tile), (world, camera), tiles)
+
+
+_trace_tiles = jax.jit(_trace_each, static_argnames=("mesh", "settings", "aovs"))
+
+
+_make_world = jax.jit(make_world, static_argnames=("settings",))
+
+
+def _trace_in_parts(
+    world: World,
+    camera: Camera,
+    settings: Settings,
+    aovs: tuple[str, ...],
+    mesh: Mesh,
+    progress: Callable[[int, int], None],
+):
+    """As `_trace_all`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
+    tiling = Tiling(camera, settings)
+    size = math.ceil(tiling.count / 64)
+    pixels = tiling.width * tiling.height
+    parts = []
+    for first in range(0, tiling.count, size):
+        tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
+        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, settings, aovs, np.asarray(tiles, np.int32))))
+        progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
+    return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)
+
+
+def _trace_tile(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tile: jax.Array):
+    dtype = camera.world_from_camera.dtype
+
+    def one(x: jax.Array, y: jax.Array):
+        image, exhausted = _pixel(world, camera, settings, x, y)
+        outputs = {"image": image}
+        if aovs:
+            outputs |= _observe(world, camera.ray(x + 0.5, y + 0.5), settings, aovs)
+        if "exhausted" in aovs:
+            outputs["exhausted"] = exhausted
+        return outputs
+
+    columns, rows = Tiling(camera, settings).pixels(tile)
+    return jax.vmap(one)(columns.astype(dtype), rows.astype(dtype))
+
+
+def _pixel(world: World, camera: Camera, settings: Settings, x: jax.Array, y: jax.Array):
+    """The mean over the pixel's samples, and how many walks ran out of steps."""
+    assert settings.samples is not None
+    side = math.isqrt(settings.samples)
+
+    def sample(k, sums):
+        dx, dy = sample_offset(k, side, x.dtype)
+        ray = stored(camera.ray(x + dx, y + dy), world.surfaces[0].sure)
+        light, exhausted = radiance(world, ray, settings)
+        return sums[0] + light, sums[1] + exhausted
+
+    sums = (jnp.zeros(3, x.dtype), jnp.zeros((), jnp.int32))
+    if side == 1:
+        return sample(jnp.zeros((), jnp.int32), sums)
+    total, exhausted = lax.fori_loop(0, side * side, sample, sums)
+    return total / (side * side), exhausted

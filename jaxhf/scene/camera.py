@@ -1,0 +1,187 @@
+"""From a place in the picture to a ray in the world."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..core.affine import Affine, affine, require_invertible
+from ..core.ray import Ray
+from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
+from ..core.vector import unit
+
+
+class Projection(eqx.Module):
+    """p -> linear @ p + offset, four numbers (X, Y, W, depth): the point is seen at (X / W, Y / W), if its depth is positive.
+
+    Homogeneous coordinates (Riesenfeld, IEEE CG&A 1981): what is linear in p can be cut at the picture's border before
+    the division.
+    """
+
+    linear: Float[jax.Array, "4 3"]
+    offset: Float[jax.Array, "4"]
+
+    def __call__(self, p: Vector) -> Float[jax.Array, "4"]:
+        return self.linear[:, 0] * p[0] + self.linear[:, 1] * p[1] + self.linear[:, 2] * p[2] + self.offset
+
+    def of(self, world: Affine) -> "Projection":
+        """The same for points in another frame, from which `world` leads to the world's."""
+        columns = [
+            self.linear[:, 0] * world.linear[0, k]
+            + self.linear[:, 1] * world.linear[1, k]
+            + self.linear[:, 2] * world.linear[2, k]
+            for k in range(3)
+        ]
+        return Projection(jnp.stack(columns, axis=1), self(world.offset))
+
+
+class Perspective(eqx.Module):
+    """A pinhole.
+
+    Attributes:
+      world_from_camera: 4x4; camera space is +x right, +y up, +z forward (the handedness of pbrt).
+      fov: full angle of view across the shorter side of the picture, degrees.
+      width, height: of the picture, pixels.
+    """
+
+    world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf)
+    fov: ScalarLeaf = eqx.field(converter=float_leaf, default=45.0)
+    width: int = eqx.field(static=True, default=512, kw_only=True)
+    height: int = eqx.field(static=True, default=512, kw_only=True)
+
+    def __check_init__(self):
+        _check_camera(self)
+        require_number("Perspective: fov", self.fov)
+        if isinstance(self.fov, np.ndarray) and not 0 < self.fov < 180:
+            raise ValueError(f"Perspective: fov must lie between 0 and 180 degrees, it is {self.fov}")
+
+    @classmethod
+    def look_at(
+        cls, eye: Any, target: Any, up: Any = (0, 0, 1), fov: Any = 45.0, *, width: int = 512, height: int = 512
+    ) -> "Perspective":
+        """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
+        return cls(_look_at(eye, target, up), fov, width=width, height=height)
+
+    def ray(self, x: Scalar, y: Scalar) -> Ray:
+        """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""
+        world = affine(jnp.asarray(self.world_from_camera))
+        sx, sy = _screen(self, x, y)
+        half = jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2)
+        return Ray(world.offset, unit(world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))))
+
+    def film_from_world(self) -> Projection:
+        """The inverse of `ray`: where in the picture a point is seen."""
+        camera = affine(jnp.asarray(self.world_from_camera)).inverse()
+        return _film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
+
+    def viewpoint(self) -> tuple[Vector, bool]:
+        """The eye, and that it is at a place."""
+        return affine(jnp.asarray(self.world_from_camera)).offset, True
+
+
+class Orthographic(eqx.Module):
+    """Parallel rays.
+
+    Attributes:
+      world_from_camera: as for `Perspective`; rays start in the camera's plane z = 0.
+      extent: what the shorter side of the picture spans, world units.
+      width, height: of the picture, pixels.
+    """
+
+    world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf)
+    extent: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
+    width: int = eqx.field(static=True, default=512, kw_only=True)
+    height: int = eqx.field(static=True, default=512, kw_only=True)
+
+    def __check_init__(self):
+        _check_camera(self)
+        require_number("Orthographic: extent", self.extent)
+        if isinstance(self.extent, np.ndarray) and not 0 < self.extent < np.inf:
+            raise ValueError(f"Orthographic: extent must be positive and finite, it is {self.extent}")
+
+    @classmethod
+    def look_at(
+        cls, eye: Any, target: Any, up: Any = (0, 0, 1), extent: Any = 1.0, *, width: int = 512, height: int = 512
+    ) -> "Orthographic":
+        """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
+        return cls(_look_at(eye, target, up), extent, width=width, height=height)
+
+    def ray(self, x: Scalar, y: Scalar) -> Ray:
+        """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""
+        world = affine(jnp.asarray(self.world_from_camera))
+        sx, sy = _screen(self, x, y)
+        half = jnp.asarray(self.extent) / 2
+        origin = world.point(jnp.stack([sx * half, sy * half, jnp.zeros_like(half)]))
+        return Ray(origin, unit(world.linear[:, 2]))
+
+    def film_from_world(self) -> Projection:
+        """The inverse of `ray`: where in the picture a point is seen."""
+        camera = affine(jnp.asarray(self.world_from_camera)).inverse()
+        half = jnp.asarray(self.extent) / 2
+        return _film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
+
+    def viewpoint(self) -> tuple[Vector, bool]:
+        """The direction towards the eye, and that it is infinitely far away."""
+        return -affine(jnp.asarray(self.world_from_camera)).linear[:, 2], False
+
+
+Camera = Perspective | Orthographic
+
+
+def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
+    """Pixels to the screen on which the shorter side runs from -1 to 1, x right, y up."""
+    short = min(camera.width, camera.height)
+    return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
+
+
+def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
+    """`_screen` undone: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
+    scale = min(camera.width, camera.height) / (2 * half)
+    linear, offset = camera_from_world.linear, camera_from_world.offset
+    return Projection(
+        jnp.stack([linear[0] * scale + w * (camera.width / 2), -linear[1] * scale + w * (camera.height / 2), w, linear[2]]),
+        jnp.stack(
+            [
+                offset[0] * scale + w_offset * (camera.width / 2),
+                -offset[1] * scale + w_offset * (camera.height / 2),
+                w_offset,
+                offset[2],
+            ]
+        ),
+    )
+
+
+def _look_at(eye: Any, target: Any, up: Any) -> Any:
+    eye, target, up = float_leaf(eye), float_leaf(target), float_leaf(up)
+    leaves = {"eye": eye, "target": target, "up": up}
+    for name, leaf in leaves.items():
+        if leaf.shape != (3,):
+            raise ValueError(f"look_at: {name} must hold three numbers, its shape is {leaf.shape}")
+        require_finite(f"look_at: {name}", leaf)
+    host = all(isinstance(leaf, np.ndarray) for leaf in leaves.values())
+    xp = np if host else jnp
+
+    def direction(v):
+        return v / xp.sqrt((v * v).sum())
+
+    if host and not (target - eye).any():
+        raise ValueError(f"look_at: target must differ from eye, both are {eye.tolist()}")
+    forward = direction(target - eye)
+    right = xp.cross(forward, up)
+    if host and not np.linalg.norm(right) > 1e-9 * np.linalg.norm(up):
+        raise ValueError(f"look_at: up must not point along the view, it is {up.tolist()} for the view {forward.tolist()}")
+    right = direction(right)
+    columns = xp.stack([right, xp.cross(right, forward), forward, eye], axis=1)
+    return xp.concatenate([columns, xp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=columns.dtype)])
+
+
+def _check_camera(camera: Camera) -> None:
+    kind = type(camera).__name__
+    require_invertible(f"{kind}: world_from_camera", camera.world_from_camera)
+    for side in ("width", "height"):
+        value = getattr(camera, side)
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"{kind}: {side} must be a whole number of pixels from 1 on, it is {value!r}")

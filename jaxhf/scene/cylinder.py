@@ -1,0 +1,30 @@
+"""An open cylinder, such as carries the sky of the seed scenes."""
+
+import equinox as eqx
+import numpy as np
+
+from ..core.types import ScalarLeaf, float_leaf, require_finite, require_number
+
+
+class Cylinder(eqx.Module):
+    """A full circle about the z axis of its frame, without caps; seen from both sides.
+
+    (u, v): u = phi / 2 pi with phi = atan2(y, x) in [0, 2 pi), v runs from z_min to z_max (pbrt-v2, `Shape "cylinder"`).
+
+    Attributes:
+      radius, z_min, z_max: object units.
+    """
+
+    radius: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
+    z_min: ScalarLeaf = eqx.field(converter=float_leaf, default=-1.0)
+    z_max: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
+
+    def __check_init__(self):
+        for name in ("radius", "z_min", "z_max"):
+            require_number(f"Cylinder: {name}", getattr(self, name))
+        if isinstance(self.radius, np.ndarray) and not 0 < self.radius < np.inf:
+            raise ValueError(f"Cylinder: radius must be positive, it is {self.radius}")
+        if isinstance(self.z_min, np.ndarray) and isinstance(self.z_max, np.ndarray) and not self.z_min < self.z_max:
+            raise ValueError(f"Cylinder: z_min must lie below z_max, they are {self.z_min} and {self.z_max}")
+        require_finite("Cylinder: z_min", self.z_min)
+        require_finite("Cylinder: z_max", self.z_max)

@@ -1,0 +1,72 @@
+"""Heights on a regular grid."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from ..core.types import AnyArray
+
+# So that a walk's state fits into 32 bits; each side of the grid counts as the next power of two.
+MOST_CELLS = 2**28
+
+
+def _heights(value: Any) -> jax.Array:
+    try:
+        heights = jnp.asarray(value)
+    except TypeError as error:
+        whole = ": take its .heights, .dx, .dy, .x0 and .y0" if hasattr(value, "heights") else ""
+        raise ValueError(
+            f"Heightfield: heights must be an array of numbers, they are a {type(value).__name__}{whole}"
+        ) from error
+    if jnp.issubdtype(heights.dtype, jnp.integer):
+        return heights.astype(jnp.float32)
+    if heights.dtype not in (jnp.float32, jnp.float64):
+        raise ValueError(f"Heightfield: heights must be float32, float64 or whole numbers, they are {heights.dtype}")
+    return heights
+
+
+class Heightfield(eqx.Module):
+    """A surface z = heights over a regular grid, two triangles to a cell, split along (ix, iy)-(ix+1, iy+1).
+
+    Attributes:
+      heights: shape (ny, nx), at least 2x2, object units; vertex (ix, iy) stands at x = x0 + ix dx, y = y0 + iy dy. A
+        vertex that is nan or infinite is a hole: the cells around it are not there. Their dtype, float32 or float64, is
+        the precision of everything that is rendered from them; whole numbers become float32. There are at most 2^28
+        cells, where the cells along each side count as the next power of two.
+      dx, dy: cell size, object units; one alone counts for both. With neither given the grid spans pbrt's unit square.
+      x0, y0: where vertex (0, 0) stands. They are metadata in double precision and never enter single-precision
+        arithmetic: an offset of 5e6 costs no accuracy.
+    """
+
+    heights: Float[AnyArray, "ny nx"]
+    dx: float = eqx.field(static=True)
+    dy: float = eqx.field(static=True)
+    x0: float = eqx.field(static=True)
+    y0: float = eqx.field(static=True)
+
+    def __init__(self, heights: Any, dx: float | None = None, dy: float | None = None, x0: float = 0.0, y0: float = 0.0):
+        self.heights = _heights(heights)
+        shape = self.heights.shape
+        if len(shape) != 2 or min(shape) < 2:
+            raise ValueError(f"Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is {shape}")
+        padded = [1 << max(1, (n - 2).bit_length()) for n in shape]
+        if math.prod(padded) > MOST_CELLS:
+            raise ValueError(
+                f"Heightfield: heights must have at most 2**28 cells, each side rounded up to a power of two; "
+                f"shape {shape} makes {padded[0]} x {padded[1]}"
+            )
+        square = dx if dy is None else dy  # one of the two alone counts for both
+        self.dx = float(1 / (shape[1] - 1) if square is None else square if dx is None else dx)
+        self.dy = float(1 / (shape[0] - 1) if square is None else square if dy is None else dy)
+        self.x0, self.y0 = float(x0), float(y0)
+        for name in ("dx", "dy"):
+            value = getattr(self, name)
+            if not 0 < value < math.inf:
+                raise ValueError(f"Heightfield: {name} must be positive and finite, it is {value}")
+        for name in ("x0", "y0"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"Heightfield: {name} must be finite, it is {getattr(self, name)}")

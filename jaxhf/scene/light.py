@@ -1,0 +1,84 @@
+"""Where the light comes from."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ..core.types import VectorLeaf, float_leaf, require_finite, rgb_leaf
+
+
+class Directional(eqx.Module):
+    """Parallel light from infinitely far away.
+
+    Attributes:
+      towards: the vector from the scene towards the light, world frame; its length does not matter.
+      radiance: the irradiance on a surface that faces the light, one number or (r, g, b): with pi, a white matte
+        surface that faces the light has radiance 1.
+    """
+
+    towards: VectorLeaf = eqx.field(converter=float_leaf)
+    radiance: VectorLeaf = eqx.field(converter=rgb_leaf, default=np.pi)
+
+    def __check_init__(self):
+        _require_vector("Directional: towards", self.towards)
+        _require_vector("Directional: radiance", self.radiance)
+        if isinstance(self.towards, np.ndarray) and not self.towards.any():
+            raise ValueError("Directional: towards must not be zero, it is [0, 0, 0]")
+
+    @classmethod
+    def from_angles(cls, azimuth: Any = 315.0, altitude: Any = 45.0, radiance: Any = np.pi) -> "Directional":
+        """Light as cartographers give it: x is east, y north, z up.
+
+        Args:
+          azimuth: where the light stands, degrees clockwise from north.
+          altitude: its height above the horizon, degrees.
+          radiance: as the attribute.
+        """
+        azimuth, altitude = float_leaf(azimuth), float_leaf(altitude)
+        xp = np if isinstance(azimuth, np.ndarray) and isinstance(altitude, np.ndarray) else jnp
+        a, h = xp.deg2rad(azimuth), xp.deg2rad(altitude)
+        return cls(xp.stack([xp.sin(a) * xp.cos(h), xp.cos(a) * xp.cos(h), xp.sin(h)]), radiance)
+
+
+class Point(eqx.Module):
+    """A point that shines equally in every direction.
+
+    Attributes:
+      p: its position, world frame.
+      intensity: power per solid angle, one number or (r, g, b); the irradiance at distance r is intensity / r².
+    """
+
+    p: VectorLeaf = eqx.field(converter=float_leaf)
+    intensity: VectorLeaf = eqx.field(converter=rgb_leaf, default=1.0)
+
+    def __check_init__(self):
+        _require_vector("Point: p", self.p)
+        _require_vector("Point: intensity", self.intensity)
+
+
+class Sky(eqx.Module):
+    """A sky of one colour: the background of the picture, and diffuse light from the upper half space.
+
+    A surface tilted by beta against the horizontal sees the share (1 + cos beta) / 2 of the sky, the isotropic sky of
+    Liu and Jordan (The interrelationship and characteristic distribution of direct, diffuse and total solar radiation,
+    Solar Energy 4(3), 1960). Terrain in front of the sky is not taken into account: that would have to be sampled.
+
+    Attributes:
+      radiance: one number or (r, g, b).
+    """
+
+    radiance: VectorLeaf = eqx.field(converter=rgb_leaf)
+
+    def __check_init__(self):
+        _require_vector("Sky: radiance", self.radiance)
+
+
+Light = Directional | Point | Sky
+
+
+def _require_vector(place: str, leaf: VectorLeaf) -> None:
+    if leaf.shape != (3,):
+        raise ValueError(f"{place} must hold three numbers, its shape is {leaf.shape}")
+    require_finite(place, leaf)

@@ -1,0 +1,47 @@
+"""What a surface does with light."""
+
+from typing import Any
+
+import equinox as eqx
+from jaxtyping import Float
+
+from ..core.types import AnyArray, require_finite, rgb_leaf
+from .texture import ImageTexture
+
+
+def _albedo(value: Any) -> Any:
+    return value if isinstance(value, ImageTexture) else rgb_leaf(value)
+
+
+class Matte(eqx.Module):
+    """A Lambertian surface with two sides.
+
+    Attributes:
+      albedo: the reflected share of the light: a number, three numbers (r, g, b), or an `ImageTexture` over the shape's uv.
+    """
+
+    albedo: Float[AnyArray, "3"] | ImageTexture = eqx.field(converter=_albedo)
+
+    def __check_init__(self):
+        if not isinstance(self.albedo, ImageTexture):
+            if self.albedo.shape != (3,):
+                raise ValueError(f"Matte: albedo must be one number or three, its shape is {self.albedo.shape}")
+            require_finite("Matte: albedo", self.albedo)
+
+
+class Mirror(eqx.Module):
+    """A perfect mirror with two sides.
+
+    Attributes:
+      reflectance: the reflected share: a number or three; pbrt's default is 0.9.
+    """
+
+    reflectance: Float[AnyArray, "3"] = eqx.field(converter=rgb_leaf, default=0.9)
+
+    def __check_init__(self):
+        if self.reflectance.shape != (3,):
+            raise ValueError(f"Mirror: reflectance must be one number or three, its shape is {self.reflectance.shape}")
+        require_finite("Mirror: reflectance", self.reflectance)
+
+
+Material = Matte | Mirror

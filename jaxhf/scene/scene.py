@@ -1,0 +1,94 @@
+"""What is in the picture."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from ..core.affine import require_invertible
+from ..core.types import AnyArray, MatrixLeaf, float_leaf
+from .camera import Camera
+from .cylinder import Cylinder
+from .heightfield import Heightfield
+from .light import Light, Sky
+from .material import Material, Matte
+
+Shape = Heightfield | Cylinder
+
+
+class Object(eqx.Module):
+    """A shape, what it is made of, and where it stands.
+
+    Attributes:
+      shape: a `Heightfield` or a `Cylinder`.
+      material: `Matte` or `Mirror`.
+      world_from_object: 4x4, affine and invertible; None: the object's frame is the world's.
+    """
+
+    shape: Shape
+    material: Material = eqx.field(default_factory=lambda: Matte(0.7))
+    world_from_object: MatrixLeaf | None = None
+
+    def __init__(self, shape: Shape, material: Material | None = None, world_from_object: Any = None):
+        self.shape = shape
+        self.material = Matte(0.7) if material is None else material
+        self.world_from_object = None if world_from_object is None else float_leaf(world_from_object)
+        if not isinstance(shape, Shape):
+            raise ValueError(f"Object: shape must be a Heightfield or a Cylinder, it is {type(shape).__name__}")
+        if not isinstance(self.material, Material):
+            raise ValueError(f"Object: material must be Matte or Mirror, it is {type(self.material).__name__}")
+        if self.world_from_object is not None:
+            require_invertible("Object: world_from_object", self.world_from_object)
+
+
+class Scene(eqx.Module):
+    """Objects, seen by a camera, in light.
+
+    Attributes:
+      objects: at least one `Object`.
+      camera: a `Perspective` or an `Orthographic`.
+      lights: any number of `Directional`, `Point` and at most one `Sky`.
+      samples: rays a pixel that the scene asks for; `Settings.samples` overrules it.
+    """
+
+    objects: tuple[Object, ...] = eqx.field(converter=tuple)
+    camera: Camera
+    lights: tuple[Light, ...] = eqx.field(converter=tuple, default=())
+    samples: int = eqx.field(static=True, default=1)
+
+    def __check_init__(self):
+        if not self.objects:
+            raise ValueError("Scene: objects must hold at least one Object, it is empty")
+        for place, values, kinds in (
+            ("objects", self.objects, Object),
+            ("camera", (self.camera,), Camera),
+            ("lights", self.lights, Light),
+        ):
+            for value in values:
+                if not isinstance(value, kinds):
+                    raise ValueError(f"Scene: {place} does not take a {type(value).__name__}")
+        if sum(isinstance(light, Sky) for light in self.lights) > 1:
+            raise ValueError("Scene: lights may hold one Sky, they hold more")
+        if not isinstance(self.samples, int) or self.samples < 1:
+            raise ValueError(f"Scene: samples must be a whole number from 1 on, it is {self.samples!r}")
+
+    @property
+    def heightfields(self) -> tuple[Heightfield, ...]:
+        """The shapes that are heightfields, in the order of `objects`."""
+        return tuple(obj.shape for obj in self.objects if isinstance(obj.shape, Heightfield))
+
+    @property
+    def heights(self) -> Float[AnyArray, "ny nx"]:
+        """The heights of the first heightfield, shape (ny, nx); ValueError where the scene has none."""
+        if not self.heightfields:
+            raise ValueError("Scene: there is no heightfield among its objects")
+        return self.heightfields[0].heights
+
+    def with_heights(self, heights: Any) -> "Scene":
+        """The same scene over other heights of the same shape and precision; nothing is compiled again."""
+        old = self.heights
+        new = jnp.asarray(heights, old.dtype)
+        if new.shape != old.shape:
+            raise ValueError(f"with_heights: heights must keep their shape {old.shape}, theirs is {new.shape}")
+        return eqx.tree_at(lambda scene: scene.heightfields[0].heights, self, new)

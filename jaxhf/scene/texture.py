@@ -1,0 +1,37 @@
+"""Images as colours on a surface."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..core.types import AnyArray, Point2, Vector, float_leaf
+
+
+class ImageTexture(eqx.Module):
+    """An image spread over (u, v) in 0..1 and repeated beyond, looked up bilinearly.
+
+    Attributes:
+      texels: linear colours, shape (h, w, 3): row 0 is v = 0, u runs along a row, texel centres lie at half steps.
+    """
+
+    texels: Float[AnyArray, "h w 3"] = eqx.field(converter=float_leaf)
+
+    def __check_init__(self):
+        if len(self.texels.shape) != 3 or self.texels.shape[2] != 3 or 0 in self.texels.shape:
+            raise ValueError(f"ImageTexture: texels must have shape (h, w, 3), theirs is {self.texels.shape}")
+        if isinstance(self.texels, np.ndarray) and not np.isfinite(self.texels).all():
+            iy, ix, _ = np.argwhere(~np.isfinite(self.texels))[0]
+            raise ValueError(f"ImageTexture: texels must be finite, row {iy} column {ix} is {self.texels[iy, ix].tolist()}")
+
+    def __call__(self, uv: Point2) -> Vector:
+        texels = jnp.asarray(self.texels)
+        h, w, _ = texels.shape
+        x, y = uv[0] * w - 0.5, uv[1] * h - 0.5
+        column, row = jnp.floor(x), jnp.floor(y)
+        fx, fy = x - column, y - row
+        ix, iy = column.astype(jnp.int32), row.astype(jnp.int32)
+        left, right, low, high = ix % w, (ix + 1) % w, iy % h, (iy + 1) % h
+        return (1 - fy) * ((1 - fx) * texels[low, left] + fx * texels[low, right]) + fy * (
+            (1 - fx) * texels[high, left] + fx * texels[high, right]
+        )

@@ -1,0 +1,45 @@
+"""Cameras made for a terrain, and pictures of another size."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from .camera import Orthographic
+from .heightfield import Heightfield
+from .scene import Scene
+
+
+def from_above(field: Heightfield, width: int | None, height: int | None) -> Orthographic:
+    """A camera that sees all of a heightfield from straight above, north up, and what is beside it in other proportions.
+
+    Args:
+      width, height: pixels; one of the two may be None, and then keeps them square: it is rounded up, so that less than
+        half a pixel on either side is beside the field.
+    """
+    ny, nx = field.heights.shape
+    across, up = (nx - 1) * field.dx, (ny - 1) * field.dy
+    if width is None:
+        assert height is not None
+        width = _pixels(height * across / up)
+    if height is None:
+        height = _pixels(width * up / across)
+    finite = np.asarray(field.heights)[np.isfinite(field.heights)]
+    x, y, z = field.x0 + across / 2, field.y0 + up / 2, float(finite.max()) + max(across, up)
+    extent = max(across / width, up / height) * min(width, height)
+    return Orthographic.look_at((x, y, z), (x, y, z - 1), up=(0, 1, 0), extent=extent, width=width, height=height)
+
+
+def _pixels(exact: float) -> int:
+    return math.ceil(exact - 1e-9)  # of a product that is whole but for rounding
+
+
+def resized(scene: Scene, width: int, height: int) -> Scene:
+    return dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, width=width, height=height))
+
+
+def shrunk(scene: Scene, pixels: int) -> Scene:
+    """The same view in a picture whose longer side has at most so many pixels."""
+    width, height = scene.camera.width, scene.camera.height
+    scale = min(1.0, pixels / max(width, height))
+    return resized(scene, max(1, round(scale * width)), max(1, round(scale * height)))

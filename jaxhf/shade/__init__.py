@@ -1,0 +1,1 @@
+"""From a hit to the radiance along the ray."""

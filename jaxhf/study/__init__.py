@@ -1,0 +1,1 @@
+"""What each setting costs and gains, measured."""

@@ -1,0 +1,107 @@
+"""Where a ray meets a cylinder."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+
+from ..core.affine import Affine
+from ..core.ray import Ray
+from ..core.types import Flag, Scalar
+from ..core.vector import dot, largest_component, unit
+from ..scene.cylinder import Cylinder
+from .hit import Hit, _orthogonal
+from .status import Status
+from .walk_start import Origin
+
+
+class Tube(eqx.Module):
+    """A cylinder made ready for tracing."""
+
+    radius: Scalar
+    z_min: Scalar
+    z_max: Scalar
+    world_from_object: Affine
+    object_from_world: Affine
+
+    @property
+    def sure(self) -> Flag:
+        """True, but not to the compiler: see `stored`."""
+        return lax.stop_gradient(self.radius) >= 0
+
+
+def make_tube(cylinder: Cylinder, world_from_object: Affine | None) -> Tube:
+    dtype = jnp.asarray(cylinder.radius).dtype
+    world = Affine(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)) if world_from_object is None else world_from_object
+    return Tube(jnp.asarray(cylinder.radius), jnp.asarray(cylinder.z_min), jnp.asarray(cylinder.z_max), world, world.inverse())
+
+
+def tube_distance(tube: Tube, ray: Ray, left: Flag | None) -> tuple[Scalar, Flag]:
+    """The smallest t > 0 at which a world-frame ray meets the cylinder, and whether it does; differentiable.
+
+    The roots are taken without cancellation (Press et al., Numerical Recipes, section 5.6). A ray that leaves the
+    cylinder itself has one root at zero, which is taken out of the equation instead of skipped by an epsilon.
+
+    Args:
+      tube: the surface.
+      ray: world frame.
+      left: whether it starts on this very cylinder; None for rays that start in free space.
+    """
+    local = tube.object_from_world.ray(ray)
+    o, d = local.o, local.d
+    a = d[0] * d[0] + d[1] * d[1]
+    half = o[0] * d[0] + o[1] * d[1]
+    c = o[0] * o[0] + o[1] * o[1] - tube.radius * tube.radius
+    if left is not None:
+        c = jnp.where(left, 0, c)
+    square = half * half - a * c
+    real = (square > 0) & (a > 0)
+    root = jnp.sqrt(jnp.where(real, square, 1))
+    q = -(half + jnp.where(half < 0, -root, root))
+    one, two = q / jnp.where(real, a, 1), c / jnp.where(q == 0, 1, q)
+
+    def reached(t):
+        z = o[2] + t * d[2]
+        return real & (t > 0) & jnp.isfinite(t) & (z >= tube.z_min) & (z <= tube.z_max)
+
+    one_reached, two_reached = reached(one), reached(two)
+    t = jnp.minimum(jnp.where(one_reached, one, jnp.inf), jnp.where(two_reached, two, jnp.inf))
+    found = one_reached | two_reached
+    return jnp.where(found, t, 0), found
+
+
+def _tube_interaction(tube: Tube, ray: Ray, origin: Origin | None, active: Flag | None, count_steps: bool) -> Hit:
+    t, found = tube_distance(tube, ray, None if origin is None else origin.here)
+    found = found if active is None else found & active
+    valid = largest_component(ray.d) > 0
+    t = jnp.where(found, t, 0)
+    p = ray(t)
+    local = tube.object_from_world.point(p)
+    x, y = jnp.where(found, local[0], 1), jnp.where(found, local[1], 0)
+    turn = 2 * jnp.pi
+    phi = jnp.atan2(y, x)
+    phi = jnp.where(phi < 0, phi + turn, phi)
+    zero, height = jnp.zeros_like(x), tube.z_max - tube.z_min
+    n = unit(tube.object_from_world.covector(jnp.stack([x, y, zero])))
+    dp_du = tube.world_from_object.vector(jnp.stack([-y, x, zero])) * turn
+    dp_dv = tube.world_from_object.vector(jnp.stack([zero, zero, height]))
+    dp_du, dp_dv = _orthogonal(dp_du, dp_dv, n)
+    bend = tube.object_from_world.covector(jnp.stack([-y, x, zero])) * turn
+    scale = dot(n, tube.object_from_world.covector(jnp.stack([x, y, zero])))
+    none = jnp.zeros((), jnp.int32)
+    met = found & valid
+    return Hit(
+        status=jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID)).astype(jnp.int32),
+        t=jnp.where(met, t, jnp.inf),
+        p=p,
+        n=n,
+        ns=n,
+        uv=jnp.stack([phi / turn, (local[2] - tube.z_min) / height]),
+        dp_du=dp_du,
+        dp_dv=dp_dv,
+        dn_du=(bend - n * dot(n, bend)) / scale,
+        dn_dv=jnp.zeros_like(n),
+        cell=jnp.zeros(2, jnp.int32),
+        triangle=none,
+        side=jnp.where(dot(n, ray.d) < 0, 1, -1).astype(jnp.int32),
+        steps=none if count_steps else None,
+    )

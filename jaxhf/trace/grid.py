@@ -1,0 +1,106 @@
+"""A heightfield made ready for tracing."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Float
+
+from ..core.affine import Affine
+from ..core.settings import NormalScheme
+from ..core.types import Flag, Index, Scalar
+from ..core.vector import power_of_two
+from ..scene.heightfield import Heightfield
+from .normals import vertex_normals
+from .pyramid import Pyramid, make_pyramid
+from .triangle import Corners, plane_through, triangle_corners
+
+
+class Grid(eqx.Module):
+    """A heightfield made ready for tracing, in a frame of its own: cells by cells by heights.
+
+    In the grid's frame vertex (ix, iy) stands at x = ix, y = iy, and heights are relative to the lowest and divided by a
+    power of two, so that the walk sees the same bits whatever the offset, and neither over- nor underflows. Where the
+    frame lies (lowest height, scale) is held constant under differentiation, as any choice of it gives the same surface.
+
+    What rays look up lies in rows one after the other, as it is looked up: XLA adds a tile's derivatives to such an array in
+    place, and to one that is reshaped on the way by way of a whole array of them for every tile.
+
+    Attributes:
+      rows: heights; a hole is nan.
+      z_top: the largest of them.
+      pyramid: bounds over blocks of cells.
+      normals: at the vertices, object frame; None where shading is flat.
+      shape: (ny, nx).
+      perturbation: what is added at the vertices of the triangle that a ray meets, for derivatives of one ray in those
+        numbers alone; None: nothing.
+    """
+
+    rows: Float[jax.Array, " vertices"]
+    z_top: Scalar
+    pyramid: Pyramid
+    normals: Float[jax.Array, "vertices 3"] | None
+    world_from_grid: Affine
+    grid_from_world: Affine
+    object_from_world: Affine | None
+    shape: tuple[int, int] = eqx.field(static=True)
+    perturbation: Corners | None = None
+
+    @property
+    def z(self) -> Float[jax.Array, "ny nx"]:
+        """The heights as an array of two axes."""
+        return self.rows.reshape(self.shape)
+
+    @property
+    def sure(self) -> Flag:
+        """True, but not to the compiler: see `stored`."""
+        return lax.stop_gradient(self.z_top) >= 0
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """Cells along x and along y."""
+        ny, nx = self.shape
+        return nx - 1, ny - 1
+
+
+def make_grid(
+    field: Heightfield, world_from_object: Affine | None, normals: NormalScheme | None, levels: int | None = None
+) -> Grid:
+    """Prepares `field` for tracing: dense array arithmetic, differentiable in the heights and in the transform.
+
+    Args:
+      field: its x0 and y0 must be 0, see `localise`.
+      world_from_object: None for the identity.
+      normals: the scheme at the vertices; None for none.
+      levels: of the pyramid, above its finest; None for all.
+    """
+    heights = jnp.asarray(field.heights)
+    (ny, nx), dtype = heights.shape, heights.dtype
+    finite = jnp.isfinite(heights)
+    known = lax.stop_gradient(jnp.where(finite, heights, 0))
+    largest = jnp.max(jnp.abs(known))
+    unit_height = power_of_two(jnp.where(largest > 0, largest, 1))
+    lowest = jnp.min(jnp.where(finite, known, jnp.inf), initial=jnp.inf)
+    lowest = jnp.where(finite.any(), lowest, 0)
+    z = jnp.where(finite, heights / unit_height - lowest / unit_height, jnp.nan)
+    z_top = jnp.max(lax.stop_gradient(jnp.where(finite, z, 0)))
+
+    cell = jnp.stack([jnp.full((), field.dx, dtype), jnp.full((), field.dy, dtype), unit_height])
+    ground = jnp.stack([jnp.zeros((), dtype), jnp.zeros((), dtype), lowest])
+    if world_from_object is None:
+        world_from_grid = Affine(jnp.diag(cell), ground)
+        grid_from_world = Affine(jnp.diag(1 / cell), -ground / cell)
+        object_from_world = None
+    else:
+        object_from_world = world_from_object.inverse()
+        world_from_grid = Affine(world_from_object.linear * cell[None, :], world_from_object.point(ground))
+        grid_from_world = Affine(object_from_world.linear / cell[:, None], (object_from_world.offset - ground) / cell)
+    at_vertices = None if normals is None else vertex_normals(heights, field.dx, field.dy, normals)
+    pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels)
+    normal_rows = None if at_vertices is None else at_vertices.reshape(-1, 3)
+    return Grid(z.reshape(-1), z_top, pyramid, normal_rows, world_from_grid, grid_from_world, object_from_world, (ny, nx))
+
+
+def triangle_plane(grid: Grid, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
+    """(a, b, c) of the triangle's plane c + a u + b v, with u and v from the cell's vertex 00; finite in a hole too."""
+    return plane_through(triangle_corners(grid.rows, grid.shape[1], ix, iy, upper), upper)

@@ -1,0 +1,50 @@
+"""Where a ray met a surface."""
+
+import equinox as eqx
+import jax
+from jaxtyping import Int
+
+from ..core.types import Index, Point2, Scalar, Vector
+from ..core.vector import dot, unit
+
+
+class Hit(eqx.Module):
+    """Where a ray met a surface, in world units unless said.
+
+    Unless `status` is HIT the rest is finite (t excepted) but means nothing.
+
+    Attributes:
+      status: see `Status`.
+      t: the ray's parameter at the hit; infinite where there is none.
+      p: the point, on the surface rather than on the ray.
+      n: unit normal of the triangle, on the surface's +z side (a cylinder: outwards).
+      ns: unit shading normal, interpolated between the vertices; `n` with flat shading.
+      uv: place in the footprint, 0..1 over the whole grid.
+      dp_du, dp_dv: tangents, orthogonal to `ns` and to each other (Gram-Schmidt in this order).
+      dn_du, dn_dv: derivatives of `ns`.
+      cell: (ix, iy).
+      triangle: 0 for (00, 10, 11), 1 for (00, 11, 01).
+      side: 1 where the ray came from the side that `n` points to, else -1.
+      steps: taken by the search; None unless counted.
+    """
+
+    status: Index
+    t: Scalar
+    p: Vector
+    n: Vector
+    ns: Vector
+    uv: Point2
+    dp_du: Vector
+    dp_dv: Vector
+    dn_du: Vector
+    dn_dv: Vector
+    cell: Int[jax.Array, "2"]
+    triangle: Index
+    side: Index
+    steps: Index | None = None
+
+
+def _orthogonal(per_u: Vector, per_v: Vector, ns: Vector) -> tuple[Vector, Vector]:
+    dp_du = per_u - ns * dot(ns, per_u)
+    along = unit(dp_du)
+    return dp_du, per_v - ns * dot(ns, per_v) - along * dot(along, per_v)

@@ -1,0 +1,76 @@
+"""Bounds of the heights over square blocks of cells, at every size: a min-max quadtree, stored as a mip chain."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Float
+
+from ..core.types import Flag, Index, Scalar
+
+
+class Pyramid(eqx.Module):
+    """For each block of 2^level x 2^level cells, the highest its surface reaches, and the lowest.
+
+    After Tevs, Ihrke and Seidel (Maximum mipmaps for fast, accurate, and scalable dynamic height field rendering, I3D
+    2008), with both bounds. Which of the two can stop a ray depends on its side of the surface, so each is stored in a
+    form in which a ray is clear of the block where it stays above the bound: the highest as it is, the lowest negated.
+
+    Blocks are rounded outwards by 32 units in the last place of the largest height, more than a height on the ray or on
+    an edge can be off: a ray that is clear of a block has no change of sign in it that the test of a cell could report. A
+    block with a hole is unbounded.
+
+    Attributes:
+      bounds: level after level, each row padded to the finest's width; first for rays above, then for rays below.
+      width, height: of the finest level, cells, rounded up to powers of two.
+      levels: how many levels stand above the finest.
+    """
+
+    bounds: Float[jax.Array, " n"]
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+    levels: int = eqx.field(static=True)
+
+    def bound(self, above: Flag, level: Index, ix: Index, iy: Index) -> Scalar:
+        """That of the block of `level` which holds the cell (ix, iy), for a ray above or below the surface."""
+        first_row = 2 * self.height - lax.shift_right_logical(jnp.full_like(level, 2 * self.height), level)
+        row = first_row + lax.shift_right_logical(iy, level)
+        place = row * self.width + lax.shift_right_logical(ix, level)
+        place = place + jnp.where(above, 0, self.bounds.shape[0] // 2)
+        return self.bounds.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def power_of_two(count: int) -> int:
+    """The least power of two that is at least 2 and `count`."""
+    return 1 << max(1, (count - 1).bit_length())
+
+
+def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None) -> Pyramid:
+    """Builds the bounds by dense reductions: no loop on the host, and none over the cells.
+
+    Args:
+      z: heights, 0 to `z_top`; nan in holes.
+      z_top: the largest.
+      levels: how many above the finest; None: until a block spans the shorter side.
+    """
+    ny, nx = z.shape
+    width, height = power_of_two(nx - 1), power_of_two(ny - 1)
+    most = min(width, height).bit_length() - 1
+    levels = most if levels is None else min(levels, most)
+    outwards = 32 * jnp.finfo(z.dtype).eps * z_top
+    hole = jnp.isnan(z)
+
+    def chain(values: jax.Array) -> jax.Array:
+        values = jnp.where(hole, jnp.inf, values)
+        block = jnp.maximum(jnp.maximum(values[:-1, :-1], values[1:, :-1]), jnp.maximum(values[:-1, 1:], values[1:, 1:]))
+        beyond = ((0, height - (ny - 1)), (0, width - (nx - 1)))
+        block = jnp.pad(block + outwards, beyond, constant_values=-jnp.inf)
+        rows = [block]
+        for _ in range(levels):
+            block = jnp.maximum(
+                jnp.maximum(block[0::2, 0::2], block[1::2, 0::2]), jnp.maximum(block[0::2, 1::2], block[1::2, 1::2])
+            )
+            rows.append(jnp.pad(block, ((0, 0), (0, width - block.shape[1])), constant_values=-jnp.inf))
+        return jnp.concatenate(rows).reshape(-1)
+
+    return Pyramid(jnp.concatenate([chain(z), chain(-z)]), width, height, levels)

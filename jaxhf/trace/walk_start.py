@@ -1,0 +1,172 @@
+"""Where a ray's walk over a grid begins."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..core.ray import Ray
+from ..core.types import Flag, Index, Scalar
+from ..core.vector import finite, lesser
+from .grid import Grid, triangle_plane
+from .hit import Hit
+from .walk import FAR, LEAVING, MISS, WALKING, Walk, reciprocal
+
+
+class Departure(eqx.Module):
+    """The place on a surface that a ray leaves, so that it cannot meet the same triangle again.
+
+    Attributes:
+      active: False for a ray that starts anywhere else.
+      ix, iy, upper: the triangle.
+      x, y: the point in grid coordinates.
+      side: 1 where the ray leaves on the +z side, else -1.
+    """
+
+    active: Flag
+    ix: Index
+    iy: Index
+    upper: Flag
+    x: Scalar
+    y: Scalar
+    side: Index
+
+
+class Origin(eqx.Module):
+    """The hit that a ray starts from, and on which surface that hit lies.
+
+    A ray that leaves a triangle cannot meet it again, and lies on a known side of it; knowing this replaces the usual
+    offset by an epsilon.
+    """
+
+    hit: Hit
+    here: Flag
+
+    def departure(self, grid: Grid) -> Departure:
+        """As the walk over `grid` takes it; in range also where the hit lies on another surface."""
+        cells_x, cells_y = grid.cells
+        cell = jnp.clip(self.hit.cell, 0, jnp.array([cells_x - 1, cells_y - 1], self.hit.cell.dtype))
+        return Departure(
+            active=self.here,
+            ix=cell[0],
+            iy=cell[1],
+            upper=self.hit.triangle == 1,
+            x=self.hit.uv[0] * cells_x,
+            y=self.hit.uv[1] * cells_y,
+            side=self.hit.side,
+        )
+
+
+def begin(
+    grid: Grid,
+    ray: Ray,
+    departure: Departure | None,
+    t_max: Scalar | None,
+    active: Flag | None,
+) -> tuple[Walk, jax.Array, Flag]:
+    """A walk, the state in which it begins, and whether the ray is finite and has a direction.
+
+    Args:
+      grid: the surface.
+      ray: in the grid's frame.
+      departure: for rays that leave this surface.
+      t_max: where to give up.
+      active: False: the walk does not begin at all.
+    """
+    width, height = grid.pyramid.width, grid.pyramid.height
+    assert 3 + width.bit_length() + (height - 1).bit_length() <= 32, "Heightfield checks that a walk's state fits"
+    valid = finite(ray.o) & finite(ray.d) & ((ray.d[0] != 0) | (ray.d[1] != 0) | (ray.d[2] != 0))
+    dx, dy, dz = ray.d[0], ray.d[1], ray.d[2]
+    inverse = inv_x, inv_y, inv_z = reciprocal(dx), reciprocal(dy), reciprocal(dz)
+    t_start, enters, through_end = _enter(grid, ray, inverse, valid)
+    cells_x, cells_y = grid.cells
+    # An ulp inside the far border, so that a ray which stands still on it is in the last cell.
+    inside = 1 - jnp.finfo(dx.dtype).epsneg
+    x = jnp.clip(ray.o[0] + t_start * dx, 0, cells_x * inside)
+    y = jnp.clip(ray.o[1] + t_start * dy, 0, cells_y * inside)
+    z_ray = jnp.clip(ray.o[2] + t_start * dz, 0, grid.z_top)
+    if departure is not None:
+        away, at = departure.active, departure
+        a, b, c = triangle_plane(grid, at.ix, at.iy, at.upper)
+        on_triangle = c + a * (at.x - at.ix.astype(x.dtype)) + b * (at.y - at.iy.astype(y.dtype))
+        enters, t_start = enters | away, jnp.where(away, 0, t_start)
+        x, y, z_ray = jnp.where(away, at.x, x), jnp.where(away, at.y, y), jnp.where(away, on_triangle, z_ray)
+
+    # From the grid's frame to the walk's.
+    back_x, back_y = inv_x < 0, inv_y < 0
+    end_x, end_y = jnp.where(back_x, width, cells_x), jnp.where(back_y, height, cells_y)
+    x, y = jnp.where(back_x, width - x, x), jnp.where(back_y, height - y, y)
+    turned = back_x != back_y
+    rate = jnp.where(turned, jnp.abs(dx) + jnp.abs(dy), jnp.abs(dx) - jnp.abs(dy))
+    begins_upper = (rate > 0) != back_x
+    walk = Walk(
+        rows=grid.rows,
+        nx=grid.shape[1],
+        pyramid=grid.pyramid,
+        x=x,
+        y=y,
+        z_ray=z_ray,
+        dx=jnp.abs(dx),
+        dy=jnp.abs(dy),
+        dz=dz,
+        inv_x=jnp.abs(inv_x),
+        inv_y=jnp.abs(inv_y),
+        back_x=back_x,
+        back_y=back_y,
+        along_diagonals=jnp.where(turned, x + y, x - y),
+        rate=rate,
+        inv_rate=reciprocal(rate),
+        t_start=t_start,
+        t_end=jnp.where(inv_z > 0, grid.z_top - z_ray, -z_ray) * inv_z,
+        t_stop=jnp.full_like(x, jnp.inf),
+        ahead=None if departure is None else (departure.upper == begins_upper) & (rate != 0),
+        noise=None if departure is None else jnp.where(departure.active, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
+    )
+    t_stop = lesser(lesser(walk.distance_x(end_x), walk.distance_y(end_y)), walk.t_end)
+    walk = eqx.tree_at(lambda walk: walk.t_stop, walk, t_stop if t_max is None else lesser(t_stop, t_max - t_start))
+
+    # Planes in x count as crossed at their own distance and planes in y just behind it, so that at a vertex x is
+    # crossed first.
+    ix = jnp.clip(jnp.floor(x).astype(jnp.int32), end_x - cells_x, end_x - 1)
+    iy = jnp.clip(jnp.ceil(y).astype(jnp.int32) - 1, end_y - cells_y, end_y - 1)
+    flip_x, flip_y = walk.flip
+    u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
+    u, v = jnp.where(back_x, 1 - u, u), jnp.where(back_y, 1 - v, v)
+    a, b, c = triangle_plane(grid, ix ^ flip_x, iy ^ flip_y, v > u)
+    gap = z_ray - (c + a * u + b * v)
+    gap = jnp.where(gap == 0, dz - a * dx - b * dy, gap)  # on the surface: where it goes
+    above = jnp.where(through_end, dz < 0, gap >= 0)
+    going = enters if active is None else enters & active
+    status = jnp.where(going, WALKING, MISS)
+    if departure is not None:
+        away, at = departure.active, departure
+        ix, iy = jnp.where(away, at.ix ^ flip_x, ix), jnp.where(away, at.iy ^ flip_y, iy)
+        above = jnp.where(away, at.side > 0, above)
+        status = jnp.where(going & away, LEAVING, status)
+    return walk, walk.pack(status, above, 2 * ix + 1, iy), valid
+
+
+def _enter(grid: Grid, ray: Ray, inverse: tuple[Scalar, Scalar, Scalar], valid: Flag) -> tuple[Scalar, Flag, Flag]:
+    """Where the ray enters the surface's box, whether it does, and whether it comes through the floor or the ceiling.
+
+    In the last case its side of the surface is known, whatever the rounding of the height there. The far distances are
+    widened by the rounding of the operations behind them, so that no ray along a face is lost (Ize, Robust BVH ray
+    traversal, JCGT 2(2), 2013).
+    """
+    cells_x, cells_y = grid.cells
+    near_x, far_x = _slab(ray.o[0], inverse[0], cells_x)
+    near_y, far_y = _slab(ray.o[1], inverse[1], cells_y)
+    near_z, far_z = _slab(ray.o[2], inverse[2], grid.z_top)
+    start = jnp.maximum(jnp.maximum(near_x, near_y), jnp.maximum(near_z, 0))
+    wide = 1 + 8 * jnp.finfo(start.dtype).eps
+    enters = valid & (start <= jnp.minimum(jnp.minimum(far_x, far_y), far_z) * wide)
+    start = jnp.where(enters, start, 0)
+    return start, enters, ((ray.o[2] < 0) | (ray.o[2] > grid.z_top)) & (start == near_z)
+
+
+def _slab(o: Scalar, inverse: Scalar, high: Scalar | int) -> tuple[Scalar, Scalar]:
+    """Distances between which a ray is in 0 <= coordinate <= high; (inf, -inf) where it never is."""
+    a, b = -o * inverse, (high - o) * inverse
+    still, inside = inverse == FAR, (o >= 0) & (o <= high)
+    near = jnp.where(still, jnp.where(inside, -jnp.inf, jnp.inf), jnp.minimum(a, b))
+    far = jnp.where(still, jnp.where(inside, jnp.inf, -jnp.inf), jnp.maximum(a, b))
+    return near, far

@@ -1,0 +1,353 @@
+"""What moving boundaries add to the derivative: silhouettes, terminators and shadows, each where nothing else changes.
+
+Boundaries whose speed is known in closed form; then whole pictures, against central differences of pictures with 24 x 24
+samples a pixel. Those are compared after weighting with a smooth function of the place in the picture: pixel by pixel the
+differences are noisy, as few of a pixel's samples change sides.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.boundary import guiding as _lottery
+
+EDGES = jaxhf.Settings(samples=16, edge_samples=2000)
+INTERIOR = jaxhf.Settings(samples=16)
+SIZE = 16  # pixels
+# A plateau of this height on x < 0.25 slopes down to the ground at x = 0.375. Light comes from -x, TAN up for one along.
+HEIGHT, EDGE, TAN = 0.1, 0.25, 0.4
+SHADOW = EDGE + HEIGHT / TAN
+PLATEAU = np.zeros((9, 9))
+PLATEAU[:, :3] = 1
+WIDE = 0.1  # of the picture, world units
+PIXEL = WIDE / SIZE
+
+
+def from_above(x: float) -> jaxhf.Orthographic:
+    """A small square around (x, 0.5), with x to the right and y up."""
+    frame = np.array([[1.0, 0, 0, x], [0, 1, 0, 0.5], [0, 0, -1, 2], [0, 0, 0, 1]])
+    return jaxhf.Orthographic(frame, WIDE, width=SIZE, height=SIZE)
+
+
+def small_scene(heights: Any, camera: jaxhf.Orthographic, light: Any) -> jaxhf.Scene:
+    """All of one structure, so that they share their compiled programs; as traced leaves, which keep their derivatives."""
+    field = jaxhf.Object(jaxhf.Heightfield(jnp.asarray(heights)), jaxhf.Matte(0.7), np.eye(4))
+    light = light if isinstance(light, jaxhf.Point) else jaxhf.Directional(light)
+    return jax.tree.map(jnp.asarray, jaxhf.Scene([field], camera, [light]))
+
+
+def moved(leaf: Callable[[Any], Any], change: Any) -> Callable[[jaxhf.Scene], jaxhf.Scene]:
+    """The direction in which one leaf changes and all others stand."""
+
+    def direction(scene: jaxhf.Scene) -> jaxhf.Scene:
+        still = jax.tree.map(jnp.zeros_like, scene)
+        return eqx.tree_at(leaf, still, jnp.broadcast_to(jnp.asarray(change, float), leaf(scene).shape))
+
+    return direction
+
+
+def shift(x: float, y: float, z: float) -> np.ndarray:
+    matrix = np.zeros((4, 4))
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def heights_of(scene: jaxhf.Scene) -> Any:
+    return scene.heightfields[0].heights
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def changes(scene: jaxhf.Scene, direction: jaxhf.Scene, settings: jaxhf.Settings = EDGES) -> tuple[jax.Array, jax.Array]:
+    """The interior part of the derivative, from as many samples as are taken at boundaries, and what these add."""
+
+    def along(settings: jaxhf.Settings) -> jax.Array:
+        return jax.jvp(lambda scene: jaxhf.render(scene, settings)[..., 0], (scene,), (direction,))[1]
+
+    interior = along(dataclasses.replace(settings, samples=64, edge_samples=0))
+    return interior, along(settings) - interior
+
+
+def assert_column(change: Any, rate: float, elsewhere: float = 1e-9) -> None:
+    """All of the change is in the column of the boundary, and the same in each row."""
+    # 0.05: one row has some 40 of the points, drawn one a stratum.
+    change = np.asarray(change)
+    column = int(np.argmax(np.abs(change).sum(0)))
+    np.testing.assert_allclose(change[:, column], rate, rtol=0.05)
+    np.testing.assert_allclose(change.sum(), rate * SIZE, rtol=0.02)
+    assert np.abs(np.delete(change, column, 1)).max() < elsewhere * abs(rate)
+
+
+LIT = 0.7 * TAN / np.hypot(1, TAN)  # radiance of the ground
+
+
+def shadow_scene(light: Any = (-1.0, 0.0, TAN), at: float = SHADOW) -> jaxhf.Scene:
+    """The picture shows flat ground, half of it in the shadow of a plateau outside of the picture."""
+    return small_scene(HEIGHT * PLATEAU, from_above(at + 0.01), light)
+
+
+def world_of(scene: jaxhf.Scene) -> Any:
+    return scene.objects[0].world_from_object
+
+
+def camera_of(scene: jaxhf.Scene) -> Any:
+    return scene.camera.world_from_camera
+
+
+def extent_of(scene: jaxhf.Scene) -> Any:
+    assert isinstance(scene.camera, jaxhf.Orthographic)
+    return scene.camera.extent
+
+
+def stretch(x: float, y: float, z: float) -> np.ndarray:
+    return np.diag([x, y, z, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("leaf", "change", "speed"),
+    [
+        (heights_of, PLATEAU, 1 / TAN),
+        (world_of, stretch(0, 0, 1), HEIGHT / TAN),
+        (world_of, shift(1, 0, 0), 1),
+        (camera_of, shift(1, 0, 0), -1),
+        (extent_of, 1, 0.01 / WIDE),  # the shadow ends this far left of the middle
+    ],
+    ids=["heights", "stretched", "shifted", "camera", "extent"],
+)
+def test_cast_shadow_alone_moves(leaf, change, speed):
+    """Raising the occluder by dh, by itself or by its transform, moves its shadow by dh / TAN over lit ground."""
+    scene = shadow_scene()
+    interior, boundary = changes(scene, moved(leaf, change)(scene))
+    assert np.abs(interior).max() < 1e-12
+    assert_column(boundary, -LIT * speed / PIXEL)
+
+
+def test_cast_shadow_moves_with_the_light():
+    """The shadow's end is at EDGE + HEIGHT / tan; the ground's radiance changes too, in proportion to the lit part."""
+    scene = shadow_scene()
+    _, boundary = changes(scene, moved(lambda scene: scene.lights[0].towards, (0, 0, 1))(scene))
+    assert_column(boundary, LIT * HEIGHT / TAN**2 / PIXEL)
+
+
+@pytest.mark.slow  # another program
+def test_cast_shadow_moves_with_a_point_light():
+    """Light at (x, z) casts the plateau's edge to EDGE + (EDGE - x) HEIGHT / (z - HEIGHT)."""
+    x, z = -0.5, 0.4
+    shadow = EDGE + (EDGE - x) * HEIGHT / (z - HEIGHT)
+    scene = shadow_scene(jaxhf.Point((x, 0.5, z), 1.0), shadow)
+    _, boundary = changes(scene, moved(lambda scene: scene.lights[0].p, (1, 0, 0))(scene))
+    square = (shadow - x) ** 2 + z**2 + (WIDE / 2 * np.linspace(-1, 1, SIZE)) ** 2
+    lit = 0.7 / np.pi * z / square**1.5
+    np.testing.assert_allclose(np.asarray(boundary).sum(1), lit * HEIGHT / (z - HEIGHT) / PIXEL, rtol=0.05)
+
+
+def test_silhouette_alone_moves_with_heights():
+    """A flat sheet seen 30 degrees from above the horizon, its far border in the picture: raising it by dh moves that
+    border up by cos 30 dh."""
+    up = np.array([0, -np.sin(np.pi / 6), np.cos(np.pi / 6)])
+    target = np.array([0.5, 1.0, 0.01])
+    eye = target + 2 * np.array([0, -np.cos(np.pi / 6), np.sin(np.pi / 6)])
+    camera = jaxhf.Orthographic.look_at(eye, target, up, WIDE, width=SIZE, height=SIZE)
+    scene = small_scene(np.zeros((9, 9)), camera, (0.0, 0.0, 1.0))
+    interior, boundary = changes(scene, moved(heights_of, 1)(scene))
+    assert np.abs(interior).max() < 1e-12
+    assert_column(np.asarray(boundary).T, 0.7 * np.cos(np.pi / 6) / PIXEL)
+
+
+def test_crest_alone_moves_with_heights():
+    """A ridge before the black background, seen 10 degrees from above and lit on both sides: a silhouette for the eye only."""
+    ridge = 0.5 - np.abs(np.linspace(-0.5, 0.5, 9))[None].repeat(9, axis=0)
+    tilt, target = np.pi / 18, np.array([0.5, 0.5, 0.51])
+    eye = target + 2 * np.array([-np.cos(tilt), 0, np.sin(tilt)])
+    camera = jaxhf.Orthographic.look_at(eye, target, (0, 0, 1), WIDE, width=SIZE, height=SIZE)
+    scene = small_scene(ridge, camera, (0.0, 0.0, 1.0))
+    _, boundary = changes(scene, moved(heights_of, 1)(scene))
+    # The smooth normal at the crest points straight up. Elsewhere 4 x 4 samples and 8 x 8 have not quite the same mean.
+    assert_column(np.asarray(boundary).T, 0.7 * np.cos(tilt) / PIXEL, elsewhere=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("leaf", "change", "speed"),
+    [
+        (world_of, shift(1, 0, 0), 1),
+        (world_of, stretch(1, 0, 0), 1),
+        (camera_of, shift(1, 0, 0), -1),
+        (extent_of, 1, 0.01 / WIDE),
+    ],
+    ids=["shifted", "stretched", "camera", "extent"],
+)
+def test_silhouette_alone_moves(leaf, change, speed):
+    """The border of a flat sheet, x = 1, seen from above."""
+    scene = small_scene(np.zeros((9, 9)), from_above(1.01), (0.0, 0.0, 1.0))
+    interior, boundary = changes(scene, moved(leaf, change)(scene))
+    assert np.abs(interior).max() < 1e-12
+    assert_column(boundary, 0.7 * speed / PIXEL)
+
+
+def test_terminator_moves_with_the_camera():
+    """A ridge, seen from above with one side dark: its crest moves against the camera. Nobody's silhouette but the light's."""
+    ridge = 0.5 - np.abs(np.linspace(-0.5, 0.5, 9))[None].repeat(9, axis=0)
+    scene = small_scene(ridge, from_above(0.49), (-1.0, 0.0, 0.2))
+    _, boundary = changes(scene, moved(camera_of, shift(1, 0, 0))(scene))
+    # The lit side's radiance just beside the crest: the smooth normal there points straight up.
+    assert_column(boundary, -0.7 * 0.2 / np.hypot(1, 0.2) / PIXEL, elsewhere=1e-3)
+
+
+def test_edges_of_facets_move():
+    """With flat shading radiance jumps at every edge: here at the crest of a low ridge, seen and lit on both sides."""
+    ridge = 0.1 * (0.5 - np.abs(np.linspace(-0.5, 0.5, 9))[None].repeat(9, axis=0))
+    scene = small_scene(ridge, from_above(0.49), (-1.0, 0.0, 1.0))
+    settings = dataclasses.replace(EDGES, shading="flat", shadows=False)
+    _, boundary = changes(scene, moved(camera_of, shift(1, 0, 0))(scene), settings)
+    assert_column(boundary, -0.7 * (1.1 - 0.9) / np.hypot(1, 0.1) / np.sqrt(2) / PIXEL)
+
+
+def test_boundary_pixels_are_looked_at_again():
+    """Radiance is in proportion to albedo: where the shadow ends, 8 x 8 samples say how much of a pixel is lit."""
+    scene = shadow_scene()
+    finer, difference = changes(scene, moved(lambda scene: scene.objects[0].material.albedo, 1)(scene))
+    assert np.abs(difference).max() < 1e-12
+    assert np.abs(finer - jaxhf.render(scene, INTERIOR)[..., 0] / 0.7).max() > 0.1 * LIT
+
+
+def test_forward_and_reverse_agree():
+    scene = shadow_scene()
+    rng = np.random.default_rng(0)
+    direction = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape)), scene)
+    weights = rng.normal(size=(SIZE, SIZE))
+    forward = np.vdot(weights, sum(changes(scene, direction)))
+
+    @jax.jit
+    def gradient(scene):
+        return jax.grad(lambda scene: jnp.vdot(jnp.asarray(weights), jaxhf.render(scene, EDGES)[..., 0]))(scene)
+
+    dots = jax.tree.leaves(jax.tree.map(np.vdot, gradient(scene), direction))
+    np.testing.assert_allclose(sum(dots), forward, rtol=1e-10)
+    assert abs(forward) > 1
+
+
+def test_picture_keeps_its_bits():
+    scene = shadow_scene()
+    np.testing.assert_array_equal(jaxhf.render(scene, EDGES), jaxhf.render(scene, INTERIOR))
+
+
+def test_key_decides():
+    scene = shadow_scene()
+    direction = moved(heights_of, PLATEAU)(scene)
+
+    @jax.jit
+    def change(key):
+        return jax.jvp(lambda scene: jaxhf.render(scene, EDGES, key=key)[..., 0], (scene,), (direction,))[1]
+
+    first, again, other = (np.asarray(change(jax.random.key(k))) for k in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+# A whole scene: bumps under a tilted sheet that shadows them, a sun and a lamp. Each leaf moves boundaries.
+SHEET = 0.2 * np.random.default_rng(3).uniform(size=(4, 4))
+X, Y = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9))
+BUMPS = 0.12 * np.exp(-((X - 0.4) ** 2 + (Y - 0.6) ** 2) / 0.02) + 0.15 * np.exp(-((X - 0.75) ** 2 + (Y - 0.3) ** 2) / 0.015)
+TILT = np.array([[0.3, 0.05, 0, 0.1], [-0.05, 0.3, 0, 0.15], [0.06, 0.03, 0.2, 0.25], [0, 0, 0, 1]])
+EYES = {
+    "perspective": jaxhf.Perspective.look_at((0.6, -0.7, 0.7), (0.5, 0.5, 0.05), fov=50.0, width=24, height=16),
+    "orthographic": jaxhf.Orthographic.look_at((0.6, -0.7, 0.7), (0.5, 0.5, 0.05), extent=1.1, width=24, height=16),
+}
+
+
+def whole_scene(kind: str) -> jaxhf.Scene:
+    scene = jaxhf.Scene(
+        [
+            jaxhf.Object(jaxhf.Heightfield(BUMPS), jaxhf.Matte(0.7), np.eye(4)),
+            jaxhf.Object(jaxhf.Heightfield(SHEET), jaxhf.Matte(0.4), TILT),
+        ],
+        EYES[kind],
+        [jaxhf.Directional((-0.8, 0.2, 0.45), 2.0), jaxhf.Point((0.9, -0.2, 0.8), 0.7)],
+    )
+    return jax.tree.map(jnp.asarray, scene)
+
+
+# Turns about a generic axis.
+TURN = np.array([[0, -0.3, 0.2, 0], [0.3, 0, -0.1, 0], [-0.2, 0.1, 0, 0], [0, 0, 0, 0]])
+
+
+def zoom_of(scene: jaxhf.Scene) -> Any:
+    return scene.camera.fov if isinstance(scene.camera, jaxhf.Perspective) else scene.camera.extent
+
+
+def sheet_of(scene: jaxhf.Scene) -> Any:
+    return scene.objects[1].world_from_object
+
+
+# Every kind of leaf that moves boundaries.
+DIRECTIONS = {
+    "heights": moved(heights_of, 0.3 * BUMPS),
+    "heights of the sheet": moved(lambda scene: scene.objects[1].shape.heights, X[:4, :4] + 0.3),
+    "place of the sheet": moved(sheet_of, shift(0.05, 0.02, 0.05)),
+    "turn of the sheet": lambda scene: moved(sheet_of, TURN @ np.asarray(sheet_of(scene)))(scene),
+    "stretch of the ground": moved(world_of, stretch(0.1, 0.05, 0.5)),
+    "sun": moved(lambda scene: scene.lights[0].towards, (0.1, 0.1, 0.1)),
+    "lamp": moved(lambda scene: scene.lights[1].p, (0.2, 0.1, -0.2)),
+    "place of the camera": moved(camera_of, shift(0.1, -0.05, 0.05)),
+    "turn of the camera": lambda scene: moved(camera_of, TURN @ np.asarray(camera_of(scene)))(scene),
+    "zoom": lambda scene: moved(zoom_of, 0.25 * np.asarray(zoom_of(scene)))(scene),
+}
+WIDTH, ROWS, STEP = 24, 16, 0.05
+PLACE = np.arange(WIDTH)[None] / WIDTH * 2 + np.arange(ROWS)[:, None] / ROWS * 3
+WEIGHTS = np.stack([np.cos(PLACE), np.sin(2 * PLACE), np.ones_like(PLACE)])[..., None]
+
+
+def weighted(image: Any) -> Any:
+    return jnp.sum(WEIGHTS * image[None], axis=(1, 2, 3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", EYES)
+def test_whole_picture_against_central_differences(kind):
+    """Every leaf that moves boundaries; the interior part alone is far off."""
+    scene = whole_scene(kind)
+    interior, edges = (jaxhf.Settings(samples=16, edge_samples=n) for n in (0, 40_000))
+    fine = jaxhf.Settings(samples=48 * 48)
+
+    @jax.jit
+    def change(scene: jaxhf.Scene, direction: jaxhf.Scene) -> list[jax.Array]:
+        def along(settings: jaxhf.Settings) -> jax.Array:
+            return jax.jvp(lambda scene: weighted(jaxhf.render(scene, settings)), (scene,), (direction,))[1]
+
+        return [along(interior), along(edges)]
+
+    errors = {}
+    for name, direction in DIRECTIONS.items():
+        d = direction(scene)
+        ahead, behind = (jax.tree.map(lambda a, b, step=step: a + step * b, scene, d) for step in (STEP, -STEP))
+        numeric = (weighted(jaxhf.render(ahead, fine)) - weighted(jaxhf.render(behind, fine))) / (2 * STEP)
+        without, whole = change(scene, d)
+        size = np.linalg.norm(numeric)
+        print(kind, name, np.linalg.norm(whole - numeric) / size, np.linalg.norm(without - numeric) / size)
+        errors[name] = np.linalg.norm(whole - numeric) / size
+        assert np.linalg.norm(without - numeric) > 0.1 * size, name
+    assert max(errors.values()) < 0.12, errors  # 0.088 for the heights of the sheet, 0.067 for the sun, else 0.033
+
+
+def test_lottery_is_exact_in_single_precision():
+    """A million weights of which a few are large: a running sum in single precision would lose the small ones."""
+    weights = np.full(2**20, 1e-9, np.float32)
+    weights[::65536] = 1
+    lottery = _lottery.make_lottery(jnp.asarray(weights), jnp.asarray(1000, jnp.int32))
+    tickets = np.diff(np.asarray(lottery.cumulative, np.int64), prepend=0)
+    assert tickets.min() == 1
+    np.testing.assert_allclose(tickets[::65536], 2**30 / 16, rtol=2e-3)
+    assert 1000 * int(lottery.stratum) >= tickets.sum()
+    assert tickets.sum() < 2**31
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match="edge_samples must be a whole number from 0 on"):
+        jaxhf.Settings(edge_samples=-1)

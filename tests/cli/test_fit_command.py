@@ -1,0 +1,245 @@
+"""`jaxhf fit`: a terrain on the map, 9 x 9 heights, from one picture.
+
+All that surrounds the fit is tested with one that is pretended: a real one takes seconds to compile.
+"""
+
+import base64
+import io
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import jaxhf
+from jaxhf.cli import fit as _fit_command, main as command
+from jaxhf.io.toml.fit import load_case
+
+CASE = """
+[camera]
+type = "perspective"
+eye = [500120, 4100120, 720]
+target = [500120, 4100120, 0]
+up = [0, 1, 0]
+fov = 18
+
+[[lights]]
+type = "directional"
+towards = [1, 2, 3]
+
+[[objects]]
+shape = "heightfield"
+file = "flat.tif"
+
+[[pictures]]
+image = "seen.npy"
+
+[fit]
+albedo = "constant"
+albedo_smoothness = 1
+prior = 0
+prior_std = 30
+tolerance = 1e-9
+max_steps = 9
+uncertainty = 2
+checkpoint_every = 2
+
+[settings]
+shadows = false
+samples = 1
+chunk = 256
+"""
+SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
+TRUTH = 20 * np.sin(4 * np.linspace(0, 1, 9)[None, :] + np.linspace(0, 1, 9)[:, None])
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    tifffile = pytest.importorskip("tifffile")
+    folder = tmp_path_factory.mktemp("fit")
+    (folder / "case.toml").write_text(CASE)
+    # The north-western corner of the raster, whose pixels are areas: vertex (0, 0) stands at (500000, 4100000).
+    tags = [
+        (33550, "d", 3, (30.0, 30.0, 0.0), True),
+        (33922, "d", 6, (0.0, 0.0, 0.0, 499985.0, 4100255.0, 0.0), True),
+        (34735, "H", 16, (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, 32616), True),
+    ]
+    tifffile.imwrite(folder / "flat.tif", np.zeros((9, 9), np.float32), photometric="minisblack", extratags=tags)
+    np.save(folder / "seen.npy", np.linspace(0, 1, 144).reshape(12, 12))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def in_this_process(monkeypatch):
+    """JAX is set up already, with double precision."""
+    monkeypatch.setattr(command, "_set_up_jax", lambda precision, devices: None)
+
+
+def run(folder, name, *more) -> int:
+    return command.main(["fit", str(folder / "case.toml"), "-o", str(folder / name), "--precision", "float64", *more])
+
+
+def pretended(options: dict, ends: bool = True):
+    """What stands for `fit`: it notes its arguments, leaves a checkpoint, and finds the truth or is interrupted."""
+
+    def fit(scenes, targets, *, checkpoint, progress, **more) -> jaxhf.Fit:
+        options.update(more, scenes=scenes, targets=targets)
+        steps = tuple(jaxhf.Step(k, 9, 10.0**-k, k != 2, 0.1, 0.2, 0.5 * k) for k in (1, 2, 3))
+        for step in steps:
+            progress(step)
+        checkpoint.write_text("state")
+        if not ends:
+            raise KeyboardInterrupt
+        image = np.asarray(targets[0])
+        return jaxhf.Fit(
+            heights=jnp.asarray(TRUTH), result=jaxhf.Stop.CONVERGED, std=np.where(TRUTH > 15, np.inf, 1.5), seen=TRUTH <= 15,
+            albedo=jnp.linspace(0, 1, 6).reshape(3, 2, 1), exposures=jnp.array([1.25]), offsets=None,
+            images=(image,), residuals=(0 * image,), history=steps,
+            stats={"steps": 3, "accepted": 2, "seconds": 1.5, "loss": 0.001, "chi2": 0.99},
+        )  # fmt: skip
+
+    return fit
+
+
+@pytest.fixture
+def found(folder, monkeypatch, capsys) -> tuple[str, dict]:
+    """What is printed, and what `fit` was given."""
+    options = {}
+    monkeypatch.setattr(_fit_command, "fit", pretended(options))
+    assert run(folder, "out.tif", "--report", str(folder / "out.html")) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    return out, options
+
+
+def test_what_the_file_says_reaches_fit(found):
+    _, options = found
+    (scene,), (target,) = options["scenes"], options["targets"]
+    assert scene.heights.dtype == np.float64
+    assert target.shape == (12, 12)
+    assert options["settings"] == SETTINGS
+    assert (options["noise"], options["weights"], options["resume"]) == ((0.01,), (None,), False)
+    assert (options["prior_std"], options["max_steps"], options["uncertainty"]) == (30, 9, 2)
+
+
+def test_the_case_that_comes_along_can_be_read():
+    case = load_case(Path(__file__).parents[2] / "scenes" / "recover" / "case.toml", np.dtype("float32"))
+    assert [np.shape(target) for target in case.targets] == 3 * [(128, 128)]  # grey
+    assert all(0.1 < np.mean(target) < 0.4 for target in case.targets)
+    assert case.scenes[0].heights.shape == (41, 41)
+
+
+def test_results_lie_where_the_terrain_lies(folder, found):
+    tifffile = pytest.importorskip("tifffile")
+
+    assert found[0] == (
+        f"exposures: 1.25\n{folder}/out.tif: 9 x 9 heights from 1 picture, {jaxhf.Stop.CONVERGED.value}; "
+        "3 steps, 1.5 s, loss 0.001, chi2 0.99\n"
+    )
+    heights, deviations = jaxhf.load_heights(folder / "out.tif"), jaxhf.load_heights(folder / "out_std.tif")
+    for terrain in (heights, deviations):
+        assert (terrain.dx, terrain.dy, terrain.x0, terrain.y0) == (30, 30, 5e5, 4.1e6)
+    with tifffile.TiffFile(folder / "out.tif") as file:
+        tags: Any = file.pages[0].geotiff_tags
+    assert (tags["GTRasterTypeGeoKey"], tags["ProjectedCSTypeGeoKey"]) == (1, 32616)  # pixels are areas, in UTM zone 16
+    np.testing.assert_array_equal(heights.heights, TRUTH)
+    np.testing.assert_array_equal(deviations.heights, np.where(TRUTH > 15, np.nan, 1.5))
+    np.testing.assert_array_equal(np.load(folder / "out_albedo.npy"), np.linspace(0, 1, 6).reshape(3, 2)[::-1])
+    assert not (folder / "out.tif.checkpoint").exists()
+
+
+def test_the_report_shows_heights_pictures_and_convergence(folder, found):
+    page = (folder / "out.html").read_text()
+    assert "<th>steps</th><td>3, 2 of them accepted</td>" in page
+    assert "<th>exposures</th><td>1.25</td>" in page
+    assert re.findall(r"<h2>(\w+)</h2>", page) == ["Heights", "Pictures", "Convergence"]
+    assert "http" not in page  # it needs no other file
+    for encoded in re.findall(r'src="data:image/png;base64,([^"]+)"', page):
+        image = np.asarray(Image.open(io.BytesIO(base64.b64decode(encoded))).convert("L"), float)
+        assert min(image.shape) > 200
+        assert image.std() > 20
+
+
+def test_after_ctrl_c_it_says_how_to_go_on(folder, monkeypatch, capsys):
+    options, checkpoint = {}, folder / "part.tif.checkpoint"
+    monkeypatch.setattr(_fit_command, "fit", pretended(options, ends=False))
+    assert run(folder, "part.tif") == 130
+    said = f"interrupted; the same command with --resume goes on from {checkpoint}"
+    assert capsys.readouterr().err == f"\njaxhf: {said}\n"
+    assert not (folder / "part.tif").exists()
+
+    assert run(folder, "part.tif") == 2
+    assert capsys.readouterr().err.startswith(f"jaxhf: error: {checkpoint}: an interrupted fit left this checkpoint; --resume")
+
+    monkeypatch.setattr(_fit_command, "fit", pretended(options))
+    assert run(folder, "part.tif", "--resume") == 0
+    assert options["resume"]
+    assert not checkpoint.exists()
+
+
+def test_killed_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch):
+    (scene,) = load_case(folder / "case.toml", np.float64).scenes
+    np.save(folder / "seen.npy", np.asarray(jaxhf.render(scene.with_heights(TRUTH), SETTINGS)))
+    script = (
+        "import os, signal, sys\nfrom jaxhf.cli import fit, main\n"
+        "def progress(self, step):\n    if step.step == 6: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "fit._Progress.__call__ = progress\nmain.main(sys.argv[1:])"
+    )
+    arguments = ["fit", folder / "case.toml", "-o", folder / "killed.tif", "--precision", "float64", "--devices", "1"]
+    killed = subprocess.run([sys.executable, "-c", script, *map(str, arguments)], cwd=Path(__file__).parents[2])
+    assert killed.returncode == -signal.SIGKILL
+    assert not (folder / "killed.tif").exists()
+    steps = []
+    monkeypatch.setattr(_fit_command._Progress, "__call__", lambda self, step: steps.append(step.step))
+    assert run(folder, "killed.tif", "--resume") == 0
+    assert steps[0] == 5  # kept after 4
+    steps.clear()
+    assert run(folder, "whole.tif") == 0
+    assert steps[0] == 1
+    for ending in ("", "_std"):
+        assert (folder / f"killed{ending}.tif").read_bytes() == (folder / f"whole{ending}.tif").read_bytes()
+
+
+BAD = {
+    "no such case": (["fit", "none.toml", "-o", "out.npy"], r"none\.toml: there is no such file"),
+    "a case of another kind": (["fit", "flat.tif", "-o", "out.npy"], r"flat\.tif: cannot read what to fit from"),
+    "a bad option": (["fit", "bad.toml", "-o", "out.npy"], r"bad\.toml:\d+: fit\.max_steps must be a whole .* it is 0"),
+    "no such folder": (["fit", "case.toml", "-o", "none/out.npy"], r"none/out\.npy: there is no folder"),
+    "another ending": (["fit", "case.toml", "-o", "out.png"], r"out\.png: cannot write heights with the ending '\.png'"),
+    "another page": (["fit", "case.toml", "-o", "out.npy", "--report", "out.pdf"], r"out\.pdf: cannot write a page with"),
+    "no place for a page": (
+        ["fit", "case.toml", "-o", "x.npy", "--report", "none/x.html"],
+        r"none/x\.html: there is no folder",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_gets_one_line(folder, name, monkeypatch, capsys):
+    arguments, message = BAD[name]
+    monkeypatch.chdir(folder)
+    (folder / "bad.toml").write_text(CASE.replace("max_steps = 9", "max_steps = 0"))
+    before = sorted(folder.iterdir())
+    assert command.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.fullmatch(rf"jaxhf: error: {message}.*\n", err)
+    assert sorted(folder.iterdir()) == before
+
+
+def test_steps_are_shown_on_a_terminal_only(monkeypatch, capsys):
+    step = jaxhf.Step(3, 16, 12.5, True, 0.1, 0.2, 4.0)
+    with _fit_command._Progress() as progress:
+        progress(step)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with _fit_command._Progress() as progress:
+        progress(step)
+    shown = capsys.readouterr().err.split("\r")
+    assert [part.rstrip() for part in shown] == ["", "compiling", "step 3: 16 waves, loss 12.5, 4.0 s", "", ""]

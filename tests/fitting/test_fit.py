@@ -1,0 +1,411 @@
+"""Recovering heights from pictures: small terrains, no shadows, so that the derivative is that of the picture."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.fft
+import scipy.special
+
+import jaxhf
+from jaxhf.core.devices import local_mesh
+from jaxhf.fitting import loop as _descent
+from jaxhf.fitting.basis import Unknowns, make_basis, resample
+from jaxhf.fitting.loop import make_stages
+from jaxhf.fitting.problem import Prior, Problem, make_prior
+from jaxhf.fitting.residuals import known_residuals
+from jaxhf.fitting.robust import robust_weight, soften
+from jaxhf.fitting.solvers import Outcome
+from jaxhf.io.procedural import fractal
+
+SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024)
+LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6))
+SIZE = 24
+# Its frame ends inside the terrain: a border that moves in the picture is what the derivative does not know.
+CAMERA = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.6, width=SIZE, height=SIZE)
+HALF = jaxhf.Orthographic.look_at((0.25, 0.5, 3), (0.25, 0.5, 0), up=(0, 1, 0), extent=0.4, width=SIZE, height=SIZE)
+TRUTH = fractal([12, 12], seed=3, exponent=3.0, range=(0.0, 0.1))
+
+
+def scenes(heights=None, albedo=0.7, camera: jaxhf.Perspective | jaxhf.Orthographic = CAMERA) -> list[jaxhf.Scene]:
+    heights = np.full_like(TRUTH, 0.05) if heights is None else heights
+    field = jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(albedo))
+    return [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]
+
+
+def pictures(**options) -> list[np.ndarray]:
+    return [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in scenes(TRUTH, **options)]
+
+
+@pytest.fixture(scope="module")
+def targets() -> list[np.ndarray]:
+    return pictures()
+
+
+def rms(values) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_heights_come_back_from_a_flat_start(targets):
+    """To the bound of the issue. One picture has a hole, where its target means nothing."""
+    weights = [np.ones((SIZE, SIZE)), None, None]
+    weights[0][4:7, 5:9] = 0
+    spoilt = [np.where(weights[0] > 0, targets[0], np.nan), *targets[1:]]
+    lines = []
+    found = jaxhf.fit(scenes(), spoilt, settings=SETTINGS, weights=weights, tolerance=1e-8, progress=lines.append)
+    assert found.result is jaxhf.Stop.CONVERGED
+    assert rms(np.asarray(found.heights) - TRUTH) < 1e-6 * np.ptp(TRUTH)
+    assert found.heights.dtype == np.float64
+    assert found.seen.all()
+    assert found.std is None
+    assert lines == list(found.history)
+    assert found.stats["steps"] == len(lines) == lines[-1].step
+    assert lines[-1].loss == found.stats["loss"] < 1e-6 * lines[0].loss
+    for image, residual, target in zip(found.images, found.residuals, targets, strict=True):
+        assert image.shape == residual.shape == (SIZE, SIZE)
+        np.testing.assert_allclose(image, target, atol=1e-6)
+    assert np.all(found.residuals[0][4:7, 5:9] == 0)
+
+
+@pytest.mark.slow
+def test_single_precision_finds_the_heights_to_its_own():
+    """In a process in which double precision is off, as it is unless a user asks for it."""
+    script = (
+        "import numpy as np, jaxhf, test_fit\n"
+        "heights = test_fit.TRUTH.astype(np.float32)\n"
+        "targets = [np.asarray(jaxhf.render(scene, test_fit.SETTINGS))[..., 0] for scene in test_fit.scenes(heights)]\n"
+        "found = jaxhf.fit(test_fit.scenes(np.full_like(heights, 0.05)), targets, settings=test_fit.SETTINGS)\n"
+        "assert found.heights.dtype == np.float32\n"
+        "print(found.result.name, test_fit.rms(np.asarray(found.heights) - heights) / np.ptp(heights))"
+    )
+    here = Path(__file__).parent
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(here.parents[1]), str(here))), "JAX_ENABLE_X64": "0"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    result, error = done.stdout.split()
+    assert result == "CONVERGED"
+    assert float(error) < 1e-3
+
+
+def test_exposures_and_albedo_come_back_in_spite_of_outliers():
+    """Exposures and the albedo are not those of the scenes, and a twentieth of the pixels is wild."""
+    rng = np.random.default_rng(1)
+    truth = np.array([1.0, 1.2, 0.9])
+    measured = [picture * exposure * 0.8 for picture, exposure in zip(pictures(), truth, strict=True)]
+    for picture in measured:
+        picture += 0.001 * rng.standard_normal(picture.shape)
+        picture[rng.uniform(size=picture.shape) < 0.05] = 1.0
+    options = {"settings": SETTINGS, "noise": 0.001, "albedo": "constant", "exposures": True, "max_steps": 60}
+    found = jaxhf.fit(scenes(), measured, loss="geman", **options)
+    assert found.albedo is not None
+    product = np.asarray(found.exposures) * float(found.albedo[0, 0, 0])
+    np.testing.assert_allclose(product, 0.8 * truth, rtol=0.01)
+    assert found.albedo.shape == (1, 1, 1)
+    shape = np.asarray(found.heights) - np.mean(found.heights) - (TRUTH - TRUTH.mean())
+    assert rms(shape) < 0.02 * np.ptp(TRUTH)
+
+
+def test_what_is_known_beforehand_counts_in_standard_deviations():
+    """The prior at each height, and smoothness as the sum of differences to the neighbours: none on a slope but at its ends."""
+    x = np.arange(6.0)[None, :] + np.zeros((5, 1))
+    basis = make_basis(jaxhf.Heightfield(x), x)
+    prior = Prior(jnp.asarray(x - 1), jnp.asarray(np.full((5, 6), 1 / 4)))
+    problem = Problem((), basis, prior, jnp.asarray(1 / 2), jnp.asarray(1 / 8), None, "squares", SETTINGS, local_mesh())
+    factors = jnp.asarray(np.stack([x * x, x], axis=-1))
+    off, rough, rough_paint, _ = known_residuals(Unknowns(jnp.zeros((5, 6)), factors), problem)
+    np.testing.assert_allclose(off, 1 / 4)
+    np.testing.assert_allclose(rough, [[1 / 2, 0, 0, 0, 0, -1 / 2]] * 5)
+    np.testing.assert_allclose(rough_paint[:, 1:-1], 2 / 8)
+
+
+def test_errors_of_a_prior_hang_together_as_whittle_said():
+    """Its covariance as a matrix: prior_std at every vertex, and between two of them by the distance in world units."""
+    ny, nx, std = 25, 31, np.linspace(1, 3, 25 * 31).reshape(25, 31)
+    field = jaxhf.Heightfield(np.zeros((ny, nx)), dx=0.5, dy=1.0)
+    prior = make_prior(field, 0.0, std, 3.0, 2.0)
+    assert prior is not None
+    still = jnp.zeros(prior.heights.shape)
+    basis = make_basis(field, np.asarray(still))
+    problem = Problem((), basis, prior, None, None, None, "squares", SETTINGS, local_mesh())
+    rows = jax.jacfwd(lambda waves: known_residuals(Unknowns(waves), problem)[0])(still).reshape(still.size, -1)
+    heights = jax.jacfwd(basis.heights)(still).reshape(ny * nx, -1)
+    root = np.asarray(heights) @ np.linalg.inv(rows)
+    covariance = root @ root.T
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std.ravel(), rtol=1e-10)
+    correlation = (covariance / np.outer(std, std)).reshape(ny, nx, ny, nx)[12, 15]
+    y, x = np.mgrid[:ny, :nx] - np.array([12, 15]).reshape(2, 1, 1)
+    r = np.hypot(y, x / 2) / 3
+    r[12, 15] = 1e-9
+    # The kernel is that of a plane without cells.
+    np.testing.assert_allclose(correlation, r * scipy.special.k1(r), atol=0.04)
+    # The border is a place like any other: mirrored there, errors would be level.
+    across = covariance.reshape(ny, nx, ny, nx) / (std[:, :, None, None] * std)
+    slope = [across[y, 15, y, 15] + across[y + 1, 15, y + 1, 15] - 2 * across[y, 15, y + 1, 15] for y in (0, 12, 23)]
+    np.testing.assert_allclose(slope, slope[1], rtol=0.15)
+
+
+def noisy_fit(targets, rng, **options) -> jaxhf.Fit:
+    """A draw of the truth from the prior, as well as of the noise."""
+    noisy = [target + 0.01 * rng.standard_normal(target.shape) for target in targets]
+    prior = TRUTH + 0.004 * rng.standard_normal(TRUTH.shape)
+    return jaxhf.fit(
+        scenes(prior), noisy, settings=SETTINGS, noise=0.01, prior=prior, prior_std=0.004, levels=[1.0], **options
+    )  # fmt: skip
+
+
+def test_as_many_heights_lie_within_their_deviations_as_should(targets):
+    """10 fits of 144 heights: 68.3 % and 95.4 % to 5 points (the heights of one fit hang together a little)."""
+    rng = np.random.default_rng(2)
+    ratio, std = [], None
+    for k in range(10):
+        found = noisy_fit(targets, rng, uncertainty="exact" if k == 0 else None)
+        std = found.std if k == 0 else std  # all fits are at nearly the same place
+        ratio.append((np.asarray(found.heights) - TRUTH) / std)
+    assert std is not None
+    assert std.max() < 0.004
+    assert std.min() < 0.003
+    assert abs(np.mean(np.abs(ratio) < 1) - 0.683) < 0.05
+    assert abs(np.mean(np.abs(ratio) < 2) - 0.954) < 0.05
+
+
+def test_sampled_deviations_are_the_exact_ones():
+    """In the half that pictures show, and in the other, which only the prior knows."""
+    measured = pictures(camera=HALF)
+    known = {"prior": TRUTH, "prior_std": 0.05, "prior_length": 0.1, "noise": 0.001}
+    exact, sampled = (
+        jaxhf.fit(
+            scenes(TRUTH, camera=HALF), measured, settings=SETTINGS, levels=[1.0], max_steps=1, uncertainty=samples, **known
+        ).std
+        for samples in ("exact", 200)
+    )
+    assert exact is not None
+    assert sampled is not None
+    assert exact[4:8, 1:5].max() < 0.5 * exact[:, 9:].min()
+    for half in np.s_[:, :7], np.s_[:, 9:]:
+        assert rms((sampled / exact - 1)[half]) < 2 / np.sqrt(2 * 200)  # each has a spread of 1 / sqrt(400)
+
+
+def test_what_no_picture_shows_is_marked():
+    measured = pictures(camera=HALF)
+    found = jaxhf.fit(scenes(camera=HALF), measured, settings=SETTINGS, max_steps=5, uncertainty="exact")
+    assert found.result is jaxhf.Stop.MAX_STEPS
+    unseen = ~found.seen
+    assert found.std is not None
+    assert unseen[:, 8:].all()  # 0.45 of the side is in sight, and normals reach a cell farther
+    assert found.seen[4:8, 1:5].all()
+    assert np.isinf(found.std[unseen]).all()
+    assert np.isfinite(found.std[found.seen]).all()
+
+
+@pytest.mark.parametrize("solver", ["bfgs", "lbfgs", "adam"])
+def test_other_solvers_come_near(targets, solver):
+    found = jaxhf.fit(scenes(), targets, settings=SETTINGS, solver=solver, max_steps=80)
+    assert found.stats["loss"] < 0.02 * found.history[0].loss
+    shape = np.asarray(found.heights) - np.mean(found.heights) - (TRUTH - TRUTH.mean())
+    assert rms(shape) < 0.3 * TRUTH.std()
+
+
+def test_a_map_of_the_albedo_comes_back():
+    """Three pictures say for each place its slopes and its albedo: no prior is needed."""
+    y, x = np.mgrid[0:1:12j, 0:1:12j]
+    factor = 1 + 0.3 * np.sin(5 * x + 3 * y)
+    painted = pictures(albedo=jaxhf.ImageTexture(0.7 * factor[..., None].repeat(3, axis=-1)))
+    found = jaxhf.fit(scenes(), painted, settings=SETTINGS, albedo="map", max_steps=40, tolerance=1e-6)
+    assert found.albedo is not None
+    assert found.albedo.shape == (12, 12, 1)
+    inner = np.s_[1:-1, 1:-1]  # of the border the pictures show little
+    np.testing.assert_allclose(np.asarray(found.albedo)[..., 0][inner], factor[inner], rtol=0.02)
+    assert rms(np.asarray(found.heights) - np.mean(found.heights) - TRUTH + TRUTH.mean()) < 0.02 * np.ptp(TRUTH)
+
+
+def test_exposures_and_offsets_come_back_apart():
+    exposures, offsets = np.array([1.0, 1.2, 0.9]), np.array([0.02, -0.01, 0.05])
+    measured = [e * picture + o for picture, e, o in zip(pictures(), exposures, offsets, strict=True)]
+    found = jaxhf.fit(scenes(), measured, settings=SETTINGS, exposures=True, offsets=True, max_steps=40, tolerance=1e-6)
+    assert found.exposures is not None
+    assert found.offsets is not None
+    # They trade against each other where slopes are small: after 40 steps they are off by 0.8 % and 0.0046.
+    np.testing.assert_allclose(found.exposures, exposures, rtol=0.015)
+    np.testing.assert_allclose(found.offsets, offsets, atol=0.008)
+
+
+def test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption(tmp_path):
+    """Twice as much as the one before. Where it starts there is nothing left to gain."""
+    targets = [np.asarray(jaxhf.render(scene, SETTINGS)) for scene in scenes()]
+    options: dict[str, Any] = {"settings": SETTINGS, "levels": [1.0], "tolerance": 1e-30}
+    whole = jaxhf.fit(scenes(), targets, **options)
+    assert whole.result is jaxhf.Stop.STALLED
+    assert [step.accepted for step in whole.history[-6:]] == [True] + 5 * [False]
+    damping = np.array([step.damping for step in whole.history[-6:]])
+    np.testing.assert_allclose(damping[1:] / damping[:-1], [4, 8, 16, 32, 64], rtol=1e-12)
+
+    def interrupt(step):
+        if step.step == len(whole.history) - 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        jaxhf.fit(scenes(), targets, checkpoint=tmp_path / "kept", progress=interrupt, **options)
+    resumed = jaxhf.fit(scenes(), targets, checkpoint=tmp_path / "kept", resume=True, **options)
+    assert [step[:-1] for step in resumed.history] == [step[:-1] for step in whole.history]
+    np.testing.assert_array_equal(resumed.heights, whole.heights)
+
+
+def test_a_fit_that_stalls_says_so_and_keeps_the_best(targets, monkeypatch):
+    """Steps as a solver may make them: to a better place, to a worse one, then nowhere any more."""
+    losses = iter([7.0, 5.0, 6.0])
+
+    def advance(solver, unknowns, state, problem):
+        loss = next(losses, None)
+        if loss is not None:
+            unknowns = eqx.tree_at(lambda u: u.waves, unknowns, unknowns.waves.at[1, 2].add(0.01))
+        number = jnp.asarray(loss or 6.0)
+        return unknowns, state, Outcome(number, jnp.asarray(loss is not None), jnp.asarray(False), number, number, unknowns)
+
+    monkeypatch.setattr(_descent, "advance", advance)
+    found = jaxhf.fit(scenes(), targets, settings=SETTINGS)
+    assert found.result is jaxhf.Stop.STALLED
+    assert found.stats["steps"] == 3 + 5
+    assert found.stats["loss"] == 5
+    basis = make_basis(scenes()[0].heightfields[0], np.full((12, 12), 0.05))
+    expected = basis.heights(jnp.zeros((12, 12)).at[1, 2].set(0.02))
+    np.testing.assert_allclose(found.heights, expected, atol=1e-12)
+    assert np.ptp(expected) > 1e-3
+
+
+def test_a_loss_that_is_not_finite_stops_the_fit(targets):
+    wild = [targets[0].copy(), *targets[1:]]
+    wild[0][3, 3] = 1e200
+    found = jaxhf.fit(scenes(), wild, settings=SETTINGS)
+    assert found.result is jaxhf.Stop.NON_FINITE
+    np.testing.assert_array_equal(found.heights, 0.05)
+
+
+def test_terrain_with_a_hole_is_found_from_a_start_without(targets):
+    """Whatever stood in the scene's heights counts no more: the same bits as from a scene that was filled in."""
+    hole = np.arange(144).reshape(12, 12) == 27
+    filled = np.full((12, 12), 0.05)
+    options: dict[str, Any] = {"settings": SETTINGS, "max_steps": 3}
+    found = jaxhf.fit(scenes(np.where(hole, np.nan, filled)), targets, start=filled, **options)
+    np.testing.assert_array_equal(found.heights, jaxhf.fit(scenes(filled), targets, **options).heights)
+    assert np.ptp(found.heights) > 0.01
+
+
+BAD = {
+    "scenes must hold at least one": ({"scenes": []}, {}),
+    r"targets must hold a picture for each of the 3 scenes, they are 1": ({"targets": 1}, {}),
+    r"targets\[1\] must have shape \(24, 24\)": ({"shape": (24, 23)}, {}),
+    r"targets\[2\] must be finite.*row 1 column 2 channel 0 is nan": ({"nan": True}, {}),
+    r"weights must hold one for each of the 3": ({}, {"weights": [None]}),
+    r"weights\[0\] must have shape": ({}, {"weights": [np.ones(3), None, None]}),
+    r"weights\[0\] must be finite, from 0 on": ({}, {"weights": [np.zeros((24, 24)), None, None]}),
+    r"noise must be positive": ({}, {"noise": 0}),
+    r"scenes\[1\]: the heights must have the shape of the first scene's, \(12, 12\); it is \(5, 5\)": ({"other": True}, {}),
+    r"prior must stand with prior_std": ({}, {"prior": 0.0}),
+    r"prior_std must stand with a prior": ({}, {"prior_std": 1.0}),
+    r"prior_length must stand with a prior": ({}, {"prior_length": 1.0}),
+    r"prior_length must be positive and finite, it is 0": ({}, {"prior": 0.0, "prior_std": 1.0, "prior_length": 0}),
+    r"start must be finite, row 0 column 1": ({}, {"start": [[0.0, np.inf], [0.0, 0.0]]}),
+    r"scenes\[0\]: the heights must have no holes where there is no start, row 2 column 3 is nan": ({"hole": True}, {}),
+    r"start must be finite, row 1 column 0 is nan": ({"hole": True}, {"start": [[0.0, 0.0], [np.nan, 0.0]]}),
+    r"solver must be one of lm, bfgs, lbfgs, adam; it is 'sgd'": ({}, {"solver": "sgd"}),
+    r"levels must be shares above 0, the last of them 1": ({}, {"levels": [0.5]}),
+    r"resume must come with a checkpoint": ({}, {"resume": True}),
+    r"uncertainty must be None, 'exact' or a number": ({}, {"uncertainty": "some"}),
+    r"uncertainty 'exact' takes at most 16777216 residuals times": (
+        {"fine": True},
+        {"uncertainty": "exact"},
+    ),
+    r"scenes must have float64 heights where JAX's x64 mode is on, theirs are float32": ({"single": True}, {}),
+    r"max_steps must be a whole number from 1 on, it is 0": ({}, {"max_steps": 0}),
+    r"smoothness must be positive and finite, it is -1": ({}, {"smoothness": -1}),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_input_is_refused(message):
+    changes, options = BAD[message]
+    given, measured = scenes(), [np.zeros((SIZE, SIZE)) for _ in LIGHTS]
+    if "scenes" in changes:
+        given = []
+    if "targets" in changes:
+        measured = measured[:1]
+    if "shape" in changes:
+        measured[1] = np.zeros(changes["shape"])
+    if "nan" in changes:
+        measured[2][1, 2] = np.nan
+    if "single" in changes:
+        given = scenes(np.zeros((12, 12), np.float32))
+    if "hole" in changes:
+        given = scenes(np.where(np.arange(144).reshape(12, 12) == 27, np.nan, 0.05))
+    if "fine" in changes:
+        given = scenes(np.zeros((64, 64)))
+    if "other" in changes:
+        given[1] = scenes(np.zeros((5, 5)))[1]
+    with pytest.raises(ValueError, match=f"^fit: {message}"):
+        jaxhf.fit(given, measured, **options)
+
+
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman"])
+def test_softened_residuals_square_to_the_robust_loss(loss):
+    """Its derivative is ρ'(r) = weight(r) r, by a central difference; and a small residual is left as it is."""
+    scale = jnp.asarray(2.0)
+    r = jnp.array([-30.0, -2.5, -1.3, 1e-5, 0.7, 2.001, 9.0])
+
+    def rho(r):
+        return soften(r, loss, scale) ** 2 / 2
+
+    numeric = (rho(r + 1e-5) - rho(r - 1e-5)) / 2e-5
+    np.testing.assert_allclose(numeric, robust_weight(r, loss, scale) * r, rtol=1e-6, atol=1e-10)
+    _, slope = jax.jvp(rho, (r,), (jnp.ones_like(r),))
+    np.testing.assert_allclose(slope, numeric, rtol=1e-6, atol=1e-10)
+    np.testing.assert_allclose(soften(r[3], loss, scale), r[3], rtol=1e-9)
+    assert abs(float(soften(r[0], loss, scale))) < 15
+
+
+def test_the_basis_is_the_cosine_transform():
+    field = jaxhf.Heightfield(np.zeros((5, 8)), dx=2.0, dy=1.0)
+    basis = make_basis(field, np.ones((5, 8)))
+    waves = np.random.default_rng(0).standard_normal((5, 8))
+    expected = 1 + np.asarray(scipy.fft.idctn(np.asarray(basis.scale) * waves, norm="ortho"))
+    np.testing.assert_allclose(basis.heights(jnp.asarray(waves)), expected, rtol=1e-12)
+    half = make_basis(field, np.ones((5, 8)), 0.5)
+    assert np.count_nonzero(half.scale) == 3 * 4 - 1  # not the constant one, before all others are there
+
+
+def test_resampling_keeps_a_plane():
+    y, x = np.mgrid[0:1:4j, 0:1:6j]
+    fine_y, fine_x = np.mgrid[0:1:9j, 0:1:5j]
+    np.testing.assert_allclose(resample(2 * x - y, (9, 5)), 2 * fine_x - fine_y, atol=1e-12)
+
+
+@pytest.mark.parametrize(("spread", "stage", "scale"), [(2.0, 1, 6.0), (1.05, 4, 3.0), (0.5, 4, 3.0)])
+def test_a_robust_loss_that_is_sharp_already_goes_to_its_last_stage(monkeypatch, spread, stage, scale):
+    monkeypatch.setattr(_descent, "pictures_and_influence", lambda unknowns, problem: ([], np.zeros((5, 6))))
+    monkeypatch.setattr(_descent, "_spread", lambda pictures, problem: spread)
+    monkeypatch.setattr(_descent.Descent, "_lift", lambda *_: 1.0)
+    field = jaxhf.Heightfield(np.zeros((5, 6)))
+    problem = Problem(
+        (), make_basis(field, np.zeros((5, 6))), None, None, None, jnp.asarray(3.0), "geman", SETTINGS, local_mesh()
+    )
+    stages = [0.5, 1.0, 1.0, 1.0, 1.0]
+    run = _descent.Descent(problem, Unknowns(jnp.zeros((5, 6))), None, stages, 1e-4, 10, None, None, 10, "")
+    run.fresh = None
+    run._next_stage(field)
+    assert run.stage == 0  # there are still waves to come
+    run.best = (1.0, run.unknowns)
+    run._next_stage(field)
+    assert run.stage == stage
+    assert run.problem.loss_scale == scale
+
+
+def test_levels_double_from_eight_waves():
+    assert make_stages((64, 40), "lm", None, "squares") == [0.125, 0.25, 0.5, 1.0]
+    assert make_stages((12, 12), "lm", None, "huber") == [1.0, 1.0, 1.0, 1.0]
+    assert make_stages((64, 64), "adam", None, "squares") == [1.0]

@@ -1,0 +1,203 @@
+"""A fit that is cut short goes on from its checkpoint, to the same bits."""
+
+import contextlib
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.fitting import fit as _fit, loop as _descent
+
+SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
+OPTIONS = {"settings": SETTINGS, "checkpoint_every": 2, "max_steps": 12, "tolerance": 1e-9}
+# Two levels, of which steps 1 to 8 and 9 to 21 make the most; then the loss becomes as sharp as it is to be.
+LEVELS = {**OPTIONS, "levels": [0.5, 1.0], "loss": "geman", "noise": 0.001, "max_steps": 24}
+
+
+def problem() -> tuple[list[jaxhf.Scene], list[np.ndarray]]:
+    camera = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.0, width=12, height=12)
+
+    def scene(heights):
+        return jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera, [jaxhf.Directional((1, 2, 3))])
+
+    y, x = np.mgrid[0:1:9j, 0:1:9j]
+    return [scene(np.zeros((9, 9)))], [np.asarray(jaxhf.render(scene(0.1 * np.sin(4 * x + y)), SETTINGS))]
+
+
+@pytest.fixture(scope="module")
+def whole() -> jaxhf.Fit:
+    return jaxhf.fit(*problem(), **OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def whole_in_levels() -> jaxhf.Fit:
+    return jaxhf.fit(*problem(), **LEVELS)
+
+
+def agree(found: jaxhf.Fit, whole: jaxhf.Fit) -> None:
+    np.testing.assert_array_equal(found.heights, whole.heights)
+    assert found.result is whole.result
+    assert [step._replace(seconds=0.0) for step in found.history] == [step._replace(seconds=0.0) for step in whole.history]
+
+
+@pytest.mark.parametrize("last", [1, 4, 7])
+def test_after_ctrl_c_it_goes_on_to_the_same_bits(tmp_path, whole, last):
+    def interrupt(step: jaxhf.Step) -> None:
+        if step.step == last:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "fit.checkpoint"
+    with pytest.raises(KeyboardInterrupt):
+        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, progress=interrupt)
+    again = []
+    agree(jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True, progress=again.append), whole)
+    assert again[0].step == last + 1
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+class Slow:
+    """A number that is still being computed when Ctrl-C comes."""
+
+    def __float__(self) -> float:
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
+    """Ctrl-C as `_descent` has called the function of this name for so many times: in it, or where its loss is waited for."""
+    original, calls = getattr(_descent, name), []
+
+    def interrupted(*arguments):
+        calls.append(arguments)
+        found = original(*arguments)
+        if len(calls) != call:
+            return found
+        if not waiting:
+            raise KeyboardInterrupt
+        unknowns, state, outcome = found
+        return unknowns, state, outcome._replace(loss=Slow())
+
+    with monkeypatch.context() as patched:
+        patched.setattr(_descent, name, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            yield
+
+
+@pytest.mark.parametrize(
+    ("name", "call", "waiting", "kept"),
+    [
+        ("begin", 1, False, False),
+        ("pictures_and_influence", 1, False, False),  # before the first level
+        ("advance", 1, False, True),
+        ("advance", 1, True, True),
+        ("save_checkpoint", 1, False, True),
+    ],
+)
+def test_ctrl_c_about_the_first_step_leaves_nothing_half_made(tmp_path, monkeypatch, whole, name, call, waiting, kept):
+    path = tmp_path / "fit.checkpoint"
+    with ctrl_c(monkeypatch, name, call, waiting):
+        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path)
+    assert [file.name for file in tmp_path.iterdir()] == ([path.name] if kept else [])
+    again = []
+    agree(jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True, progress=again.append), whole)
+    assert again[0].step == (3 if name == "save_checkpoint" else 1)
+
+
+# The first accepted step of a line search is the 18th.
+@pytest.mark.parametrize(("solver", "step"), [("lm", 2), ("lm", 5), ("bfgs", 21), ("lbfgs", 21), ("adam", 5)])
+def test_ctrl_c_while_a_step_is_computed_keeps_the_one_before(tmp_path, monkeypatch, solver, step):
+    path, options = tmp_path / "fit.checkpoint", {**OPTIONS, "solver": solver, "max_steps": 24}
+    whole = jaxhf.fit(*problem(), **options)
+    with ctrl_c(monkeypatch, "advance", step, waiting=True):
+        jaxhf.fit(*problem(), **options, checkpoint=path)
+    again = []
+    agree(jaxhf.fit(*problem(), **options, checkpoint=path, resume=True, progress=again.append), whole)
+    assert again[0].step == step
+
+
+@pytest.mark.parametrize(
+    ("name", "call", "step"),
+    [
+        ("pictures_and_influence", 2, 9),
+        ("pictures_and_influence", 3, 9),  # those by which the constant wave is lifted
+        ("restarted", 2, 9),
+        ("pictures_and_influence", 4, 22),
+        ("restarted", 3, 22),
+    ],
+)
+def test_ctrl_c_while_a_stage_changes_keeps_the_end_of_the_one_before(tmp_path, monkeypatch, whole_in_levels, name, call, step):
+    path = tmp_path / "fit.checkpoint"
+    with ctrl_c(monkeypatch, name, call):
+        jaxhf.fit(*problem(), **LEVELS, checkpoint=path)
+    again = []
+    agree(jaxhf.fit(*problem(), **LEVELS, checkpoint=path, resume=True, progress=again.append), whole_in_levels)
+    assert again[0].step == step
+
+
+def test_ctrl_c_after_the_last_step_keeps_them_all(tmp_path, monkeypatch, whole):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    path, options = tmp_path / "fit.checkpoint", {**OPTIONS, "checkpoint_every": 100}
+    with monkeypatch.context() as patched:
+        patched.setattr(_fit, "standard_deviations", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            jaxhf.fit(*problem(), **options, uncertainty="exact", checkpoint=path)
+    again = []
+    agree(jaxhf.fit(*problem(), **options, checkpoint=path, resume=True, progress=again.append), whole)
+    assert again == []
+
+
+def test_a_checkpoint_that_cannot_be_kept_is_refused_first(tmp_path, monkeypatch):
+    monkeypatch.setattr(_fit, "Descent", None)  # nothing begins
+    path = tmp_path / "fit.checkpoint"
+    with pytest.raises(FileNotFoundError, match=r"none/fit\.checkpoint: there is no folder"):
+        jaxhf.fit(*problem(), **OPTIONS, checkpoint=tmp_path / "none" / "fit.checkpoint", resume=True)
+    with pytest.raises(ValueError, match=r"a checkpoint cannot be written here, it is a folder"):
+        jaxhf.fit(*problem(), **OPTIONS, checkpoint=tmp_path, resume=True)
+    path.write_bytes(b"hours of work")
+    with pytest.raises(ValueError, match=r"fit\.checkpoint: this checkpoint is there already; resume=True goes on from it"):
+        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path)
+    assert path.read_bytes() == b"hours of work"
+
+
+def test_a_killed_process_loses_at_most_one_interval(tmp_path, whole):
+    path = tmp_path / "fit.checkpoint"
+    script = (
+        "import sys, jax; jax.config.update('jax_enable_x64', True); sys.path[:0] = sys.argv[1:3]\n"
+        "import jaxhf, time; from test_fit_checkpoint import OPTIONS, problem\n"
+        "def progress(step):\n    print(step.step, flush=True)\n    time.sleep(0.2)\n"
+        "jaxhf.fit(*problem(), **OPTIONS, checkpoint=sys.argv[3], progress=progress)"
+    )
+    here = Path(__file__).parent
+    command = [sys.executable, "-c", script, str(here.parents[1]), str(here), str(path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if int(line) == 5:
+                process.send_signal(signal.SIGKILL)
+                break
+    assert process.returncode == -signal.SIGKILL
+    again = []
+    agree(jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True, progress=again.append), whole)
+    assert 4 <= again[0].step <= 6  # kept after 4, or a step later than it was told
+
+
+def test_a_damaged_checkpoint_and_that_of_another_fit_are_refused(tmp_path):
+    path = tmp_path / "fit.checkpoint"
+    scenes, targets = problem()
+    jaxhf.fit(scenes, targets, **{**OPTIONS, "max_steps": 2}, checkpoint=path)
+    with pytest.raises(ValueError, match=r"fit\.checkpoint: this is the checkpoint of another fit"):
+        jaxhf.fit(scenes, [targets[0] + 1], **OPTIONS, checkpoint=path, resume=True)
+    content = bytearray(path.read_bytes())
+    content[-100] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"fit\.checkpoint: the checkpoint is damaged"):
+        jaxhf.fit(scenes, targets, **OPTIONS, checkpoint=path, resume=True)
+    path.write_bytes(b"heights")
+    with pytest.raises(ValueError, match=r"fit\.checkpoint: this is not a checkpoint"):
+        jaxhf.fit(scenes, targets, **OPTIONS, checkpoint=path, resume=True)

@@ -1,0 +1,123 @@
+"""The derivative of a picture as a sparse matrix against that of `render`, which other tests hold against differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.boundary.sample import EdgePoint, deciding_vertices, picture_point
+from jaxhf.core.devices import local_mesh
+from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each
+from jaxhf.scene.localise import localise
+from jaxhf.trace.grid import Grid
+from jaxhf.trace.world import make_world
+
+PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])
+
+
+def waves(ny: int, nx: int, height: float) -> np.ndarray:
+    y, x = np.mgrid[0:ny, 0:nx] / max(ny, nx)
+    return height * (np.sin(5 * x + 2 * y) + np.cos(3 * x - 6 * y + 1))
+
+
+def terrains(which: str, material: jaxhf.Matte | jaxhf.Mirror = jaxhf.Matte((0.3, 0.5, 0.7))) -> jaxhf.Scene:
+    """A turned heightfield with a hole; with "all", after a cylinder and another heightfield."""
+    texels = np.random.default_rng(1).uniform(0.2, 0.9, (3, 4, 3))
+    painted = jaxhf.Matte(jaxhf.ImageTexture(texels))
+    holed = waves(9, 8, 0.05)
+    holed[4, 3] = np.nan
+    objects = [jaxhf.Object(jaxhf.Heightfield(holed, dx=0.09), material, PLACE)]
+    if which == "all":
+        tube = jaxhf.Cylinder(radius=0.15, z_min=-0.3, z_max=0.3)
+        objects = [jaxhf.Object(tube, painted), jaxhf.Object(jaxhf.Heightfield(waves(12, 10, 0.08)), painted), *objects]
+    camera = jaxhf.Perspective.look_at((0.6, -0.8, 0.9), (0.5, 0.5, 0.1), fov=50.0, width=37, height=22)
+    return jaxhf.Scene(objects, camera, [jaxhf.Point((0.1, 0.3, 0.9), (0.9, 0.8, 0.7))])
+
+
+def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
+    """Functions of all heights: the picture by its matrix, and by `render`."""
+    scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], localise(scene))
+
+    def change(heights):
+        def changed(scene):
+            for k, new in enumerate(heights):
+                scene = eqx.tree_at(lambda scene, k=k: scene.heightfields[k].heights, scene, new)
+            return scene
+
+        return changed
+
+    def by_matrix(heights):
+        mesh = local_mesh()
+        known = linearise_each(scenes, change(jax.lax.stop_gradient(heights)), settings, mesh, channels)
+        return picture_each(known, scenes, change(heights), settings, mesh)[0]
+
+    def by_render(heights):
+        image = jaxhf.render(change(heights)(scene), settings)
+        return image if channels == 3 else image.mean(-1, keepdims=True)
+
+    return by_matrix, by_render
+
+
+@pytest.mark.parametrize(
+    ("which", "settings", "channels"),
+    [
+        ("one", jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3),
+        ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat"), 1),
+    ],
+    ids=["smooth with edges", "flat, several objects"],
+)
+def test_matrix_is_the_derivative_of_render(which, settings, channels):
+    """In every height, to rounding."""
+    scene = terrains(which)
+    heights = tuple(jnp.asarray(field.heights) for field in scene.heightfields)
+    cotangent = jax.random.normal(jax.random.key(1), (22, 37, channels), heights[0].dtype)
+
+    def both(picture):
+        image, pull = jax.vjp(picture, heights)
+        return image, pull(cotangent)[0]
+
+    by_matrix, by_render = (jax.jit(lambda f=f: both(f))() for f in pictures(scene, settings, channels))
+    for mine, theirs in zip(jax.tree.leaves(by_matrix), jax.tree.leaves(by_render), strict=True):
+        assert np.nanmax(np.abs(theirs)) > 1e-3
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-11 * np.nanmax(np.abs(theirs)))
+
+
+@pytest.mark.parametrize("surface", [1, 2])
+@pytest.mark.parametrize("receiver", [1, 2])
+def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(surface, receiver):
+    settings = jaxhf.Settings(edge_samples=1)
+    scene = localise(terrains("all"))
+    world, camera = make_world(scene, settings), scene.camera
+    point = EdgePoint(
+        valid=jnp.asarray(True), edge=jnp.int32(0), surface=jnp.int32(surface), light=jnp.int32(0),
+        start=jnp.array([5, 6], jnp.int32), end=jnp.array([6, 7], jnp.int32), s=jnp.asarray(0.3), measure=jnp.asarray(1.0),
+        receiver=jnp.int32(receiver), cell=jnp.array([2, 1], jnp.int32), upper=jnp.asarray(True), t=jnp.asarray(0.4),
+    )  # fmt: skip
+
+    def by_rows(rows):
+        surfaces = [
+            world.surfaces[0],
+            *(eqx.tree_at(lambda g: g.rows, g, r) for g, r in zip(world.surfaces[1:], rows, strict=True)),
+        ]
+        return picture_point(eqx.tree_at(lambda w: w.surfaces, world, tuple(surfaces)), camera, settings, point, point.s)[0]
+
+    expected = jnp.concatenate(
+        jax.jit(jax.jacrev(by_rows))([grid.rows for grid in world.surfaces if isinstance(grid, Grid)]), axis=1
+    )
+
+    def by_five(perturbation):
+        return picture_point(world, camera, settings, point, point.s, perturbation=perturbation)[0]
+
+    places = deciding_vertices(world, point)
+    found = jnp.zeros_like(expected).at[:, places].add(jax.jit(jax.jacrev(by_five))(jnp.zeros(5)))
+    assert np.count_nonzero(expected) == 10
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_what_a_mirror_shows_has_no_such_matrix():
+    mirrored = terrains("one", jaxhf.Mirror((0.7, 0.8, 0.9)))
+    assert can_be_linearised(terrains("one"), jaxhf.Settings())
+    assert not can_be_linearised(mirrored, jaxhf.Settings())
+    assert can_be_linearised(mirrored, jaxhf.Settings(max_depth=0))

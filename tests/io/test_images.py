@@ -1,0 +1,315 @@
+"""Images come back as they were written, and what is not an image is refused by name."""
+
+import os
+import re
+import struct
+import sys
+import zlib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxhf.io.files import MAX_PIXELS
+from jaxhf.io.images import load_image, require_writable, save_image
+
+
+@pytest.fixture
+def image():
+    return np.random.default_rng(0).random((5, 7, 3)).astype(np.float32)
+
+
+def write_png(path, header, rows, parts=None):
+    """A .png put together by hand: `header` is (width, height, depth, colour type, 0, 0, interlaced)."""
+
+    def part(kind, body):
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    chunks = [part(b"IHDR", struct.pack(">IIBBBBB", *header)), part(b"IDAT", zlib.compress(rows)), part(b"IEND", b"")]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks[:parts]))
+
+
+@pytest.mark.parametrize("ending", [".exr", ".pfm", ".npy", ".PFM"])
+def test_float_formats_keep_every_bit(tmp_path, image, ending):
+    image[0, 0], image[1, 1] = (np.nan, np.inf, -np.inf), (1e30, -1e-30, -5)
+    save_image(tmp_path / f"x{ending}", image)
+    back = load_image(tmp_path / f"x{ending}")
+    assert back.dtype == np.float32
+    np.testing.assert_array_equal(back, image)
+
+
+@pytest.mark.parametrize("ending", [".exr", ".pfm", ".npy", ".png"])
+def test_grey_becomes_three_equal_channels(tmp_path, image, ending):
+    save_image(tmp_path / f"x{ending}", image[:, :, 0])
+    back = load_image(tmp_path / f"x{ending}")
+    assert back.shape == (5, 7, 3)
+    # The steepest step of the curve near 1 is 1/255 encoded = 0.9 % linear, so half a step is below 0.005.
+    np.testing.assert_allclose(back, np.repeat(image[:, :, :1], 3, axis=2), atol=5e-3 if ending == ".png" else 0)
+
+
+def test_png_holds_every_byte_of_srgb(tmp_path):
+    # 0.5 -> 188 and 0.002 -> 0.02584 * 255 = 6.6 -> 7 are worked out by hand from the two pieces of the curve.
+    save_image(tmp_path / "x.png", np.array([[0.0, 1.0, 0.5, 0.002, -3.0, 9.0, np.nan, np.inf, -np.inf]]))
+    with Image.open(tmp_path / "x.png") as written:
+        assert np.asarray(written).tolist() == [[0, 255, 188, 7, 0, 255, 0, 255, 0]]
+    every = np.arange(256, dtype=np.uint8)[None]
+    Image.fromarray(every).save(tmp_path / "every.png")
+    save_image(tmp_path / "again.png", load_image(tmp_path / "every.png"))
+    with Image.open(tmp_path / "again.png") as written:
+        np.testing.assert_array_equal(np.asarray(written)[:, :, 1], every)
+
+
+def test_jax_arrays_and_every_dtype_are_written(tmp_path, image):
+    save_image(tmp_path / "a.npy", jnp.asarray(image, jnp.float16))
+    assert np.load(tmp_path / "a.npy").dtype == np.float16
+    save_image(tmp_path / "b.npy", jnp.asarray(image, jnp.bfloat16))
+    assert np.load(tmp_path / "b.npy").dtype == np.float32
+
+
+def test_exr_channels_stay_in_order(tmp_path):
+    exr = pytest.importorskip("OpenEXR")
+    planes = {"B": 3.0, "A": 9.0, "R": 1.0, "G": 2.0}  # the file sorts them by name
+    with exr.File({}, {name: np.full((2, 4), value, np.float16) for name, value in planes.items()}) as file:
+        file.write(str(tmp_path / "x.exr"))
+    np.testing.assert_array_equal(load_image(tmp_path / "x.exr"), np.broadcast_to([1, 2, 3], (2, 4, 3)))
+    save_image(tmp_path / "y.exr", np.broadcast_to([1.0, 2.0, 3.0], (2, 4, 3)))
+    assert (tmp_path / "y.exr").read_bytes()[:4] == b"v/1\x01"
+    with exr.File(str(tmp_path / "y.exr"), separate_channels=True) as file:
+        assert {name: channel.pixels[0, 0] for name, channel in file.channels().items()} == {"R": 1, "G": 2, "B": 3}
+
+
+@pytest.mark.parametrize(("order", "scale"), [("<", b"-1.0"), (">", b"1.0"), (">", b"2.5e0")])
+def test_pfm_by_hand(tmp_path, order, scale):
+    """Two rows of one pixel; the file starts at the bottom."""
+    (tmp_path / "x.pfm").write_bytes(b"PF\n1 2\n" + scale + b"\n" + struct.pack(f"{order}6f", 1, 2, 3, 4, 5, 6))
+    np.testing.assert_array_equal(load_image(tmp_path / "x.pfm"), [[[4, 5, 6]], [[1, 2, 3]]])
+    (tmp_path / "y.pfm").write_bytes(b"Pf 1 2 " + scale + b" " + struct.pack(f"{order}2f", 1, 2))
+    np.testing.assert_array_equal(load_image(tmp_path / "y.pfm")[:, :, 0], [[2], [1]])
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_16_bit_png_by_every_filter(tmp_path, channels):
+    """Five rows, filtered by the five filters of the specification, one byte after the other."""
+    h, w, step = 5, 6, 2 * channels
+    few = np.array([0, 1, 2, 255, 256, 258, 40000, 65535], np.uint16)  # so that the Paeth filter meets ties
+    samples = np.random.default_rng(channels).choice(few, (h, w, channels))
+    raw = samples.astype(">u2").tobytes()
+    stride, out = w * step, bytearray()
+
+    def byte(y, x):
+        return raw[y * stride + x] if y >= 0 and x >= 0 else 0
+
+    for y in range(h):
+        out.append(y)
+        for x in range(stride):
+            a, b, c = byte(y, x - step), byte(y - 1, x), byte(y - 1, x - step) if x >= step else 0
+            paeth = min((a, b, c), key=lambda value: abs(a + b - c - value))
+            out.append((byte(y, x) - (0, a, b, (a + b) // 2, paeth)[y]) % 256)
+    write_png(tmp_path / "x.png", (w, h, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0), bytes(out))
+    colour = samples[:, :, :3] if channels > 2 else np.repeat(samples[:, :, :1], 3, axis=2)
+    encoded = colour / 65535
+    expected = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(load_image(tmp_path / "x.png"), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "1", "RGB"])
+def test_8_bit_modes_of_png(tmp_path, mode):
+    """White at the top left, black elsewhere; alpha 0 everywhere leaves the colours as they are."""
+    picture = Image.new("RGB", (3, 2))
+    picture.putpixel((0, 0), (255, 255, 255))
+    picture = picture.convert(mode)
+    if "A" in mode:
+        picture.putalpha(0)
+    if mode == "P":
+        picture.info["transparency"] = b"\x00\x00"
+    picture.save(tmp_path / "x.png")
+    image = load_image(tmp_path / "x.png")
+    assert image.shape == (2, 3, 3)
+    np.testing.assert_array_equal(image[0, 0], 1)
+    assert image.sum() == 3
+
+
+def test_interlaced_png_is_whole(tmp_path):
+    """5 x 3 grey in the seven passes of Adam7: pass 1, 2, 4, 5, 6 and 7 have rows, pass 3 has none."""
+    passes = [(1, 1), (1, 1), (0, 0), (1, 1), (1, 3), (2, 2), (1, 5)]
+    rows = b"".join((b"\x00" + b"\xff" * w) * h for h, w in passes)
+    write_png(tmp_path / "x.png", (5, 3, 8, 0, 0, 0, 1), rows)
+    np.testing.assert_array_equal(load_image(tmp_path / "x.png"), 1)
+
+
+def test_jpeg_is_read(tmp_path):
+    Image.new("RGB", (16, 8), (255, 0, 0)).save(tmp_path / "x.jpg", quality=100)
+    image = load_image(tmp_path / "x.jpg")
+    assert image.shape == (8, 16, 3)
+    np.testing.assert_allclose(image, np.broadcast_to([1.0, 0, 0], image.shape), atol=0.02)  # JPEG is off by a byte or two
+
+
+def lying_npy(path):
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (16000, 16000)})
+        file.write(bytes(64))
+
+
+def huge_npy(path):
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": (2**40, 2**40)})
+
+
+def cut(keep, name):
+    def make(path):
+        save_image(path.with_name(f"whole{path.suffix}"), np.random.default_rng(0).random((40, 40, 3)))
+        data = path.with_name(f"whole{path.suffix}").read_bytes()
+        path.write_bytes(data[: int(len(data) * keep)])
+
+    make.__name__ = name
+    return make
+
+
+def flipped_bit(path):
+    save_image(path, np.random.default_rng(0).random((40, 40, 3)))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+def cut_jpeg(path):
+    Image.effect_noise((64, 64), 90).save(path, format="JPEG")
+    path.write_bytes(path.read_bytes()[:700])
+
+
+def yuv_exr(path):
+    exr = pytest.importorskip("OpenEXR")
+    with exr.File({}, {"Z": np.zeros((2, 2), np.float32)}) as file:
+        file.write(str(path))
+
+
+def text(path):
+    path.write_text("not a picture")
+
+
+BAD_FILES = [
+    ("text.png", text, "it is not a PNG"),
+    ("text.jpg", text, "not a JPEG"),
+    ("text.pfm", text, "it is not a PFM"),
+    ("text.npy", text, "magic"),
+    ("text.exr", text, "it is not an OpenEXR file"),
+    ("cut.png", cut(0.6, "cut"), "it is cut off inside its part 'IDAT'"),
+    ("end.png", cut(0.9999, "end"), "cut off"),
+    (
+        "short.png",
+        lambda path: write_png(path, (9, 9, 8, 2, 0, 0, 0), bytes(28 * 5)),
+        "9 x 9 pixels take 252 bytes, it holds 140",
+    ),
+    ("long.png", lambda path: write_png(path, (9, 9, 8, 2, 0, 0, 0), bytes(300)), "it holds more"),
+    ("noend.png", lambda path: write_png(path, (1, 1, 8, 0, 0, 0, 0), bytes(2), parts=2), "its end mark is missing"),
+    ("nothing.png", lambda path: write_png(path, (0, 4, 8, 0, 0, 0, 0), b""), "its size must be positive, it is 0 x 4"),
+    ("bomb.png", lambda path: write_png(path, (60000, 60000, 8, 2, 0, 0, 0), b""), f"at most {MAX_PIXELS} pixels"),
+    ("colour.png", lambda path: write_png(path, (1, 1, 8, 5, 0, 0, 0), bytes(2)), "no colour type 5 with 8 bits"),
+    ("filter.png", lambda path: write_png(path, (1, 1, 16, 0, 0, 0, 0), b"\x07ab"), "filters go from 0 to 4, it uses 7"),
+    ("adam7.png", lambda path: write_png(path, (1, 1, 16, 0, 0, 0, 1), b"\x00ab"), "interlaced 16-bit PNG is not read"),
+    ("bit.png", flipped_bit, "the checksum of its part 'IDAT' is wrong"),
+    ("cut.jpg", cut_jpeg, "truncated"),
+    ("cut.exr", cut(0.6, "cut"), "it is cut off or damaged"),
+    ("depth.exr", yuv_exr, "its channels must be R, G, B or Y, they are Z"),
+    ("cut.pfm", cut(0.6, "cut"), "40 x 40 pixels take 19200 bytes"),
+    ("zero.pfm", lambda path: path.write_bytes(b"Pf\n1 1\n0\n1234"), "its scale must not be 0"),
+    ("bomb.pfm", lambda path: path.write_bytes(b"Pf\n99999999 99999999\n-1\n"), "99999999 x 99999999"),
+    ("cut.npy", cut(0.6, "cut"), "its header declares 38400 bytes of data"),
+    ("lying.npy", lying_npy, "its header declares 1024000000 bytes of data, 64 are there"),
+    ("huge.npy", huge_npy, f"at most {MAX_PIXELS} pixels"),
+    ("pickle.npy", lambda path: np.save(path, np.array([{}]), allow_pickle=True), "must hold real numbers, it holds object"),
+    ("int.npy", lambda path: np.save(path, np.zeros((2, 2), np.uint8)), "in floats, it holds uint8"),
+    ("line.npy", lambda path: np.save(path, np.zeros(4)), "shape (h, w, 3) or (h, w), it has (4,)"),
+    ("rgba.npy", lambda path: np.save(path, np.zeros((2, 2, 4))), "shape (h, w, 3) or (h, w), it has (2, 2, 4)"),
+    ("empty.npy", lambda path: np.save(path, np.zeros((0, 3))), "its size must be positive"),
+    ("x.tga", text, "cannot read an image with the ending '.tga'; did you mean"),
+    ("x", text, "a name without an ending; known: .exr, .jpeg, .jpg, .npy, .pfm, .png"),
+]
+
+
+@pytest.mark.parametrize(("name", "make", "message"), BAD_FILES, ids=[name for name, _, _ in BAD_FILES])
+def test_what_is_not_an_image_is_refused_by_name(tmp_path, name, make, message):
+    path = tmp_path / name
+    make(path)
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        load_image(path)
+    assert str(path) in str(error.value)
+
+
+def test_a_missing_file_and_a_folder_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="none: there is no such file"):
+        load_image(tmp_path / "none")
+    with pytest.raises(ValueError, match="must be a file"):
+        load_image(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((2, 2, 4)), r"shape \(h, w, 3\) or \(h, w\), this one has \(2, 2, 4\)"),
+        (np.zeros(3), r"this one has \(3,\)"),
+        (np.zeros((0, 2, 3)), r"this one has \(0, 2, 3\)"),
+        (np.full((2, 2, 3), 255, np.uint8), "must hold linear radiance in floats, 1 being white; this one holds uint8"),
+        (jnp.ones((2, 2), int), "this one holds int64"),
+        (np.ones((2, 2), bool), "this one holds bool"),
+        (np.zeros((2, 2), complex), "this one holds complex128"),
+        (np.array([["a"]]), "must hold linear radiance in floats"),
+    ],
+)
+def test_what_cannot_be_an_image_is_not_written(tmp_path, image, message):
+    with pytest.raises(ValueError, match=message):
+        save_image(tmp_path / "x.png", image)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "message"),
+    [
+        ("x.jpg", ValueError, "cannot write an image with the ending '.jpg'"),
+        ("x.pngg", ValueError, "did you mean '.png'"),
+        ("x", ValueError, "without an ending"),
+        ("none/x.png", FileNotFoundError, "there is no folder"),
+        ("file/x.png", FileNotFoundError, "there is no folder"),
+        ("folder.png", ValueError, "it is a folder"),
+    ],
+)
+def test_require_writable(tmp_path, name, kind, message):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.png").mkdir()
+    for call in (require_writable, lambda path: save_image(path, np.zeros((2, 2)))):
+        with pytest.raises(kind, match=message) as error:
+            call(tmp_path / name)
+        assert name in str(error.value)
+    assert require_writable(tmp_path / "good.png") == tmp_path / "good.png"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder.png"]
+
+
+def test_without_openexr_the_message_says_what_to_install(tmp_path, monkeypatch):
+    (tmp_path / "x.exr").touch()
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    for call in (load_image, require_writable):
+        with pytest.raises(ValueError, match=r"x.exr: .*ing .exr needs OpenEXR: pip install 'jaxhf\[exr\]'"):
+            call(tmp_path / "x.exr")
+
+
+@pytest.mark.parametrize("ending", [".png", ".pfm", ".npy"])
+def test_a_failure_leaves_the_old_file_and_no_other(tmp_path, image, ending, monkeypatch):
+    path = tmp_path / f"x{ending}"
+    path.write_bytes(b"old")
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_image(path, image)
+    assert [(item.name, item.read_bytes()) for item in tmp_path.iterdir()] == [(path.name, b"old")]
+
+
+def test_a_link_stays_a_link_and_the_mode_is_the_usual_one(tmp_path, image):
+    (tmp_path / "link.npy").symlink_to(tmp_path / "real.npy")
+    save_image(tmp_path / "link.npy", image)
+    assert (tmp_path / "link.npy").is_symlink()
+    (tmp_path / "plain").touch()
+    assert (tmp_path / "real.npy").stat().st_mode == (tmp_path / "plain").stat().st_mode

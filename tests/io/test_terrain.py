@@ -1,0 +1,411 @@
+"""Heights end up where the file says, with the north up."""
+
+import io
+import re
+import struct
+import sys
+import zipfile
+import zlib
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxhf.io.files import MAX_PIXELS
+from jaxhf.io.georeference import metres_per_degree
+from jaxhf.io.save_terrain import save_heights
+from jaxhf.io.terrain import Terrain, jacksboro, load_heights
+
+# What a file with the north first holds: two rows, the northern one 1 2 3.
+NORTH_FIRST = np.array([[1, 2, 3], [4, 5, 6]], np.uint16)
+SOUTH_FIRST = NORTH_FIRST[::-1]
+
+IS_AREA, IS_POINT = 1, 2
+PROJECTED, GEOGRAPHIC = 1, 2
+
+
+def write_tiff(
+    path, heights, *, raster=IS_AREA, model=PROJECTED, scale=(30.0, 20.0, 0.0), tie=None, nodata=None, keys=None, metadata=None,
+    **options
+):  # fmt: skip
+    """A GeoTIFF by hand: ModelPixelScale 33550, ModelTiepoint 33922; GTModelTypeGeoKey 1024, GTRasterTypeGeoKey 1025.
+
+    Of further `keys`, floats stand in a tag of their own.
+    """
+    tifffile = pytest.importorskip("tifffile")
+    tags = []
+    if scale is not None:
+        tags.append((33550, "d", 3, scale, True))
+    if tie is not None:
+        tags.append((33922, "d", 6, tie, True))
+        keys = {1024: model, 1025: raster, **(keys or {})}
+        doubles = [value for value in keys.values() if isinstance(value, float)]
+        entries = [
+            (key, 34736, 1, doubles.index(value)) if isinstance(value, float) else (key, 0, 1, value)
+            for key, value in sorted(keys.items())
+        ]
+        directory = (1, 1, 0, len(keys), *(number for entry in entries for number in entry))
+        tags.append((34735, "H", len(directory), directory, True))
+        if doubles:
+            tags.append((34736, "d", len(doubles), doubles, True))
+    if nodata is not None:
+        tags.append((42113, "s", 0, nodata, True))
+    if metadata is not None:
+        tags.append((42112, "s", 0, f"<GDALMetadata>{metadata}</GDALMetadata>", True))
+    tifffile.imwrite(path, heights, extratags=tags, photometric="minisblack", **options)
+
+
+def placed(terrain):
+    return terrain.dx, terrain.dy, terrain.x0, terrain.y0
+
+
+def test_npy_is_in_jaxhfs_order(tmp_path):
+    np.save(tmp_path / "x.npy", SOUTH_FIRST.astype(np.float64))
+    terrain = load_heights(tmp_path / "x.npy")
+    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
+    assert terrain.heights.dtype == np.float64
+    assert placed(terrain) == (1, 1, 0, 0)
+
+
+def test_png_is_flipped(tmp_path):
+    Image.fromarray(NORTH_FIRST * 10000).save(tmp_path / "x.png")
+    terrain = load_heights(tmp_path / "x.png", z_scale=0.5, dx=30.0, dy=20.0, x0=5e6, y0=-7.0)
+    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST * 5000.0)
+    assert terrain.heights.dtype == np.float32
+    assert placed(terrain) == (30, 20, 5e6, -7)
+
+
+@pytest.mark.parametrize("compression", [None, "zlib"])
+@pytest.mark.parametrize("dtype", [np.int16, np.uint16, np.float32, ">f4", np.float64])
+def test_tiff_is_flipped(tmp_path, dtype, compression):
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST.astype(dtype), scale=None, compression=compression)
+    terrain = load_heights(tmp_path / "x.tif")
+    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
+    assert terrain.heights.dtype == (np.float64 if dtype is np.float64 else np.float32)
+    assert placed(terrain) == (1, 1, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("raster", "tie", "x0", "y0"),
+    [
+        # The tie point is the corner of the north-western pixel: its centre is half a pixel to the south-east of it, and
+        # the southern row one pixel further down.
+        (IS_AREA, (0, 0, 0, 500000, 4100000, 0), 500015, 4100000 - 10 - 20),
+        # It is that pixel's centre.
+        (IS_POINT, (0, 0, 0, 500000, 4100000, 0), 500000, 4100000 - 20),
+        # It is the south-western corner of the raster, or the centre of its south-eastern pixel.
+        (IS_AREA, (0, 2, 0, 500000, 4100000, 0), 500015, 4100010),
+        (IS_POINT, (2, 1, 0, 500000, 4100000, 0), 499940, 4100000),
+    ],
+)
+def test_tiff_is_placed_by_its_tags(tmp_path, raster, tie, x0, y0):
+    write_tiff(tmp_path / "x.tiff", NORTH_FIRST, raster=raster, tie=tie)
+    terrain = load_heights(tmp_path / "x.tiff")
+    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
+    assert placed(terrain) == (30, 20, x0, y0)
+    assert placed(load_heights(tmp_path / "x.tiff", x0=0.0, dy=7.0)) == (30, 7, 0, y0)
+
+
+def test_tiff_in_degrees_becomes_local_metres(tmp_path):
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST, model=GEOGRAPHIC, scale=(0.01, 0.01, 0), tie=(0, 0, 0, 10, 45.01, 0))
+    terrain = load_heights(tmp_path / "x.tif")
+    # The mean latitude is 45 degrees: 78,847 m and 111,132 m to a degree there, as tables of WGS84 have it.
+    np.testing.assert_allclose((terrain.dx, terrain.dy), (788.47, 1111.32), rtol=1e-5)
+    assert placed(terrain)[2:] == (0, 0)
+
+
+MOON, MARS = 1737400.0, 3396190.0
+
+
+def ellipse_at_60(a, c):
+    """By the parametric latitude b: the parallel's radius a cos(b), and the meridian's radius of curvature."""
+    b = np.arctan(c / a * np.tan(np.radians(60)))
+    return a * np.cos(b), ((a * np.sin(b)) ** 2 + (c * np.cos(b)) ** 2) ** 1.5 / (a * c)
+
+
+EARTH_AT_60 = ellipse_at_60(6378137.0, 6356752.314245)
+IN_DEGREES = {"model": GEOGRAPHIC, "scale": (0.01, 0.01, 0), "tie": (0, 0, 0, 10, 60.01, 0)}  # in the middle 60 degrees north
+
+
+@pytest.mark.parametrize(
+    ("keys", "along_x", "along_y"),
+    [
+        # A sphere's radius r: r cos(60) and r to a radian.
+        ({2048: 32767, 2057: MOON, 2058: MOON}, MOON / 2, MOON),
+        ({2048: 32767, 2057: MOON, 2059: 0.0}, MOON / 2, MOON),
+        ({2048: 49900, 2057: MARS, 2058: 3376200.0}, *ellipse_at_60(MARS, 3376200.0)),
+        # The Earth's systems without axes, and none at all: WGS84.
+        ({2048: 4269}, *EARTH_AT_60),
+        ({2048: 32767, 2056: 7030}, *EARTH_AT_60),
+        ({}, *EARTH_AT_60),
+    ],
+)
+def test_degrees_are_those_of_the_files_globe(tmp_path, keys, along_x, along_y):
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
+    terrain = load_heights(tmp_path / "x.tif")
+    np.testing.assert_allclose((terrain.dx, terrain.dy), np.radians(0.01) * np.array((along_x, along_y)), rtol=1e-7)
+
+
+@pytest.mark.parametrize("keys", [{2048: 32767}, {2048: 30100}, {2048: 32767, 2057: MOON}])
+def test_a_globe_of_unknown_size_needs_a_cell_size(tmp_path, keys):
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
+    with pytest.raises(ValueError, match=r"x\.tif: its degrees are on a globe of unknown size: dx and dy must be given"):
+        load_heights(tmp_path / "x.tif", dx=3.0)
+    assert placed(load_heights(tmp_path / "x.tif", dx=3.0, dy=4.0)) == (3, 4, 0, 0)
+
+
+SCALED = '<Item name="OFFSET" sample="0" role="offset">-500</Item><Item name="SCALE" sample="0" role="scale">0.25</Item>'
+
+
+def test_gdals_scale_and_offset_are_applied(tmp_path):
+    """To the stored value, which is also what nodata means; other items and other bands do not count."""
+    others = '<Item name="AREA">Point</Item><Item name="SCALE" sample="1" role="scale">9</Item>'
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST, scale=None, nodata="5", metadata=SCALED + others)
+    terrain = load_heights(tmp_path / "x.tif", z_scale=2.0)
+    np.testing.assert_array_equal(terrain.heights, [[-998, np.nan, -997], [-999.5, -999, -998.5]])
+    assert terrain.heights.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("latitude", "east", "north"), [(0.0, 111320, 110574), (45.0, 78847, 111132), (-75.0, 28902, 111618), (90.0, 0, 111694)]
+)
+def test_metres_per_degree(latitude, east, north):
+    """Tables of WGS84 give these in kilometres with three digits."""
+    np.testing.assert_allclose(metres_per_degree(latitude), (east, north), atol=1)
+
+
+HOLES = [
+    ("-9999", np.float32, -9999.0, {}),
+    ("-3.4028235e+38", np.float32, np.finfo(np.float32).min, {}),
+    ("-32768", np.int16, -32768, {}),
+    ("-9999", np.uint16, None, {}),  # a tag whose value the type cannot hold
+    (None, np.int16, -1, {"nodata": -1.0}),
+    ("-32768", np.int16, 0, {"nodata": 0.0}),  # the argument overrules the tag
+    (None, np.float32, np.nan, {}),
+    (None, np.float32, np.inf, {}),
+]
+
+
+@pytest.mark.parametrize(("tag", "dtype", "hole", "arguments"), HOLES)
+def test_what_means_no_data_is_a_hole(tmp_path, tag, dtype, hole, arguments):
+    stored = NORTH_FIRST.astype(dtype)
+    expected = stored.astype(np.float32) * 2
+    if hole is not None:
+        stored[0, 1], expected[0, 1] = hole, np.nan
+    write_tiff(tmp_path / "x.tif", stored, scale=None, nodata=tag)
+    terrain = load_heights(tmp_path / "x.tif", z_scale=2.0, **arguments)
+    np.testing.assert_array_equal(terrain.heights, expected[::-1])
+    np.testing.assert_array_equal(terrain.nodata, np.isnan(expected[::-1]))
+
+
+def test_npz_by_its_names(tmp_path):
+    heights = SOUTH_FIRST.astype(np.float32)
+    np.savez(tmp_path / "x.npz", heights=heights, dx=3, dy=4.0, x0=5, mask=np.zeros(3))
+    terrain = load_heights(tmp_path / "x.npz")
+    np.testing.assert_array_equal(terrain.heights, heights)
+    assert placed(terrain) == (3, 4, 5, 0)
+    np.savez_compressed(tmp_path / "sole.npz", anything=heights)
+    np.testing.assert_array_equal(load_heights(tmp_path / "sole.npz").heights, heights)
+
+
+@pytest.mark.parametrize(("ymin", "ymax"), [(44.99, 45.01), (45.01, 44.99)])
+def test_elevation_has_the_north_first_and_degrees(tmp_path, ymin, ymax):
+    bounds = {"xmin": 10.0, "xmax": 10.03, "ymin": ymin, "ymax": ymax}
+    np.savez(tmp_path / "x.npz", elevation=NORTH_FIRST, dx=0.01, dy=0.01, **bounds)
+    terrain = load_heights(tmp_path / "x.npz")
+    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
+    np.testing.assert_allclose((terrain.dx, terrain.dy), (788.47, 1111.32), rtol=1e-5)
+
+
+def test_jacksboro():
+    pytest.importorskip("matplotlib")
+    terrain = jacksboro()
+    assert terrain.heights.shape == (344, 403)
+    assert terrain.heights.dtype == np.float32
+    assert (terrain.heights.min(), terrain.heights.max()) == (236, 1076)
+    assert not terrain.nodata.any()
+    # A sphere of 6371 km is within 0.6 % of the ellipsoid; the field lies at 36.59 degrees north, with 3" to a cell.
+    second = np.radians(3 / 3600) * 6371000
+    np.testing.assert_allclose((terrain.dx, terrain.dy), (second * np.cos(np.radians(36.59)), second), rtol=6e-3)
+    assert placed(terrain)[2:] == (0, 0)
+    # The Cumberland Mountains fill the south-west, Powell Valley lies in the north-east below a ridge that runs to the
+    # east-north-east, the lowland of the Great Valley in the south-east.
+    half = 172, 201
+    assert terrain.heights[: half[0], : half[1]].mean() > terrain.heights[: half[0], half[1] :].mean() + 150
+    assert terrain.heights[: half[0], : half[1]].mean() > terrain.heights[half[0] :, : half[1]].mean()
+
+
+def test_extras_are_named(tmp_path, monkeypatch):
+    write_tiff(tmp_path / "x.tif", NORTH_FIRST)
+    monkeypatch.setitem(sys.modules, "tifffile", None)
+    with pytest.raises(ValueError, match=r"x.tif: reading .tif needs tifffile: pip install 'jaxhf\[geo\]'"):
+        load_heights(tmp_path / "x.tif")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ValueError, match=r"pip install 'jaxhf\[plot\]'"):
+        jacksboro()
+
+
+def save(**arrays):
+    return lambda path: np.savez(path, **arrays) if path.suffix == ".npz" else np.save(path, *arrays.values())
+
+
+def bomb_png(path):
+    header = struct.pack(">IIBBBBB", 40000, 40000, 16, 0, 0, 0, 0)
+    part = struct.pack(">I", 13) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + part + struct.pack(">I", 0) + b"IEND" + struct.pack(">I", zlib.crc32(b"IEND")))
+
+
+def cut_tiff(path):
+    write_tiff(path, np.zeros((64, 64), np.float32))
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def cut_npz(path):
+    np.savez(path, heights=np.zeros((64, 64)))
+    path.write_bytes(path.read_bytes()[:5000])
+
+
+def lying_npz(path):
+
+    member = io.BytesIO()
+    np.lib.format.write_array_header_1_0(member, {"descr": "<f8", "fortran_order": False, "shape": (16000, 16000)})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("heights.npy", member.getvalue())
+
+
+BAD_FILES = [
+    ("line.npy", save(a=np.zeros(4)), {}, "shape (ny, nx), theirs is (4,)"),
+    ("thin.npy", save(a=np.zeros((1, 5))), {}, "at least 2x2, theirs is (1, 5)"),
+    ("empty.npy", save(a=np.zeros((0, 5))), {}, "its size must be positive"),
+    ("bool.npy", save(a=np.zeros((2, 2), bool)), {}, "heights must be numbers, they are bool"),
+    ("text.npy", save(a=np.array([["a"]])), {}, "must hold real numbers, it holds <U1"),
+    ("names.npz", save(a=np.zeros((2, 2)), b=np.zeros((2, 2))), {}, "an array 'heights', or only one, it holds a, b"),
+    ("dx.npz", save(heights=np.zeros((2, 2)), dx=np.zeros(3)), {}, "its dx must be one number, its shape is (3,)"),
+    ("bare.npz", save(elevation=np.zeros((2, 2)), dx=1.0, dy=1.0), {}, "beside 'elevation' it must hold xmin, ymax, ymin"),
+    (
+        "metres.npz",
+        save(elevation=np.zeros((2, 2)), dx=30.0, dy=30.0, xmin=0.0, ymin=5e6, ymax=5e6),
+        {},
+        "degrees must lie on a globe",
+    ),
+    ("cut.npz", cut_npz, {}, "not a zip file"),
+    ("lying.npz", lying_npz, {}, "its header declares 2048000000 bytes of data, 0 are there"),
+    ("byte.png", lambda path: Image.new("L", (2, 2)).save(path), {}, "must be 16-bit grey, it has 1 channels of 8 bits"),
+    ("bomb.png", bomb_png, {}, f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000"),
+    ("cut.tif", cut_tiff, {}, "it is cut off: its pixels end at byte"),
+    ("text.tif", lambda path: path.write_text("no"), {}, "not a TIFF"),
+    ("rgb.tif", lambda path: write_rgb(path), {}, "must be one band, it has 3"),
+    ("nodata.tif", lambda path: write_tiff(path, NORTH_FIRST, scale=None, nodata="none"), {}, "must be a number, it is 'none'"),
+    (
+        "scale.tif",
+        lambda path: write_tiff(path, NORTH_FIRST, scale=None, metadata=SCALED.replace("0.25", "x")),
+        {},
+        "number, it is 'x'",
+    ),
+    (
+        "xml.tif",
+        lambda path: write_tiff(path, NORTH_FIRST, scale=None, metadata="<Item>"),
+        {},
+        "its GDAL_METADATA tag must be XML",
+    ),
+    (
+        "grads.tif",
+        lambda path: write_tiff(path, NORTH_FIRST, keys={2054: 9105}, **IN_DEGREES),
+        {},
+        "GeogAngularUnitsGeoKey is 9105",
+    ),
+    ("high.npy", save(a=np.full((2, 2), 1e300)), {"z_scale": 1e10}, "heights times z_scale must fit into float64"),
+    ("half.tif", lambda path: write_tiff(path, NORTH_FIRST, tie=None), {}, "rotated rasters are not read"),
+    ("x.npy", save(a=np.zeros((2, 2))), {"dx": 0.0}, "dx must be positive and finite, it is 0.0"),
+    ("x.npy", save(a=np.zeros((2, 2))), {"y0": np.nan}, "y0 must be finite, it is nan"),
+    ("x.npy", save(a=np.zeros((2, 2))), {"z_scale": 0.0}, "z_scale must be finite and not zero, it is 0.0"),
+    ("x.tfi", lambda path: path.touch(), {}, "cannot read heights from the ending '.tfi'; did you mean '.tif'?"),
+]
+
+
+def write_rgb(path):
+    pytest.importorskip("tifffile").imwrite(path, np.zeros((4, 4, 3), np.uint8), photometric="rgb")
+
+
+@pytest.mark.parametrize(("name", "make", "arguments", "message"), BAD_FILES, ids=[f"{row[0]} {row[2]}" for row in BAD_FILES])
+def test_what_is_not_terrain_is_refused_by_name(tmp_path, name, make, arguments, message):
+    path = tmp_path / name
+    make(path)
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        load_heights(path, **arguments)
+    assert str(path) in str(error.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="none: there is no such file"):
+        load_heights(tmp_path / "none")
+
+
+def test_terrain_checks_itself():
+    with pytest.raises(ValueError, match="dy must be positive and finite, it is -1"):
+        Terrain(np.zeros((2, 2)), dy=-1.0)
+
+
+@pytest.mark.parametrize("ending", [".npy", ".npz", ".tif"])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_written_heights_are_read_back(tmp_path, ending, dtype):
+    if ending == ".tif":
+        pytest.importorskip("tifffile")
+    heights = np.array([[1, np.nan, 3], [4, 5, np.pi]], dtype)
+    terrain = Terrain(heights, 30.0, 20.5, 500000.25, 4.1e6)
+    save_heights(tmp_path / f"x{ending}", terrain)
+    again = load_heights(tmp_path / f"x{ending}")
+    np.testing.assert_array_equal(again.heights, heights)
+    assert again.heights.dtype == dtype
+    assert placed(again) == ((1, 1, 0, 0) if ending == ".npy" else placed(terrain))
+    assert [path.name for path in tmp_path.iterdir()] == [f"x{ending}"]
+
+
+@pytest.mark.parametrize("model", [PROJECTED, GEOGRAPHIC])
+@pytest.mark.parametrize("raster", [IS_AREA, IS_POINT])
+def test_a_geotiff_may_take_over_the_place_of_another(tmp_path, model, raster):
+    """The rows are flipped back, and every tag of its place is the other's."""
+    tifffile = pytest.importorskip("tifffile")
+    write_tiff(tmp_path / "a.tif", NORTH_FIRST, model=model, raster=raster, scale=(0.5, 0.25, 0), tie=(0, 1, 0, 7, 40, 0))
+    first = load_heights(tmp_path / "a.tif")
+    save_heights(tmp_path / "b.tif", Terrain(first.heights * 2), like=tmp_path / "a.tif")
+    second = load_heights(tmp_path / "b.tif")
+    np.testing.assert_array_equal(second.heights, SOUTH_FIRST * 2)
+    assert placed(second) == placed(first)
+    assert placed(second) != (1, 1, 0, 0)
+    with tifffile.TiffFile(tmp_path / "a.tif") as a, tifffile.TiffFile(tmp_path / "b.tif") as b:
+        assert a.pages[0].geotiff_tags == b.pages[0].geotiff_tags
+    with pytest.raises(ValueError, match=r"a\.tif: it must have the shape of the heights, \(3, 3\); it has \(2, 3\)"):
+        save_heights(tmp_path / "c.tif", Terrain(np.zeros((3, 3))), like=tmp_path / "a.tif")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "b.tif"]
+
+
+def test_bare_heights_are_written_where_no_place_goes_with_them(tmp_path):
+    save_heights(tmp_path / "x.npy", jnp.asarray([[1.0, 2.5], [3, 4]], jnp.float32))
+    again = load_heights(tmp_path / "x.npy").heights
+    np.testing.assert_array_equal(again, [[1, 2.5], [3, 4]])
+    assert again.dtype == np.float32
+    for name, heights, message in (
+        ("y.npz", np.zeros((2, 2)), "y.npz: what is written must be a Terrain, whose place goes with it; it is a ndarray"),
+        (
+            "y.npy",
+            np.zeros(4),
+            "y.npy: heights must be a Terrain, or float32 or float64 of shape (ny, nx); they are float64 of shape (4,)",
+        ),
+        ("y.npy", np.zeros((2, 2), int), "they are int64 of shape (2, 2)"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            save_heights(tmp_path / name, heights)
+    assert [path.name for path in tmp_path.iterdir()] == ["x.npy"]
+
+
+def test_where_heights_cannot_be_written(tmp_path):
+    terrain = Terrain(np.zeros((2, 2)))
+    with pytest.raises(ValueError, match=r"x\.asc: cannot write heights with the ending '\.asc'"):
+        save_heights(tmp_path / "x.asc", terrain)
+    with pytest.raises(FileNotFoundError, match=r"x\.npy: there is no folder"):
+        save_heights(tmp_path / "none" / "x.npy", terrain)
+    (tmp_path / "x.npz").mkdir()
+    with pytest.raises(ValueError, match=r"x\.npz: heights cannot be written here, it is a folder"):
+        save_heights(tmp_path / "x.npz", terrain)

@@ -1,0 +1,207 @@
+"""What a scene does not use is not in its compiled program.
+
+For every feature, the code behind it is made to fail. The program of a scene without the feature must not change by that, to
+the letter; a scene that has it gets another, longer program, and cannot be traced once its code fails.
+"""
+
+import sys
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.boundary import guiding, sample
+from jaxhf.core import affine, autodiff
+from jaxhf.rendering import aovs as rendering_aovs, render as rendering_render
+from jaxhf.scene import localise
+from jaxhf.shade import lighting, radiance
+from jaxhf.trace import cylinder, intersect, normals, search, world as trace_world
+
+CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
+FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
+SUN, SKY = jaxhf.Directional((1, 2, 3)), jaxhf.Sky(0.5)
+BARE = jaxhf.Settings(shading="flat", shadows=False)
+
+
+def scene(*others: jaxhf.Object, material: jaxhf.Matte | None = None, world=None, lights=(SUN,)):
+    return jaxhf.Scene([jaxhf.Object(FIELD, material, world), *others], CAMERA, lights)
+
+
+class Case(NamedTuple):
+    """A scene and how it is rendered."""
+
+    scene: jaxhf.Scene
+    settings: jaxhf.Settings = BARE
+    aovs: tuple[str, ...] = ()
+
+    def program(self) -> str:
+        jax.clear_caches()  # or a trace from before the change would be taken
+        return jax.jit(lambda scene: jaxhf.render(scene, self.settings, aovs=self.aovs)).lower(self.scene).as_text()
+
+
+class Used(Exception):
+    """The code of an absent feature ran."""
+
+
+Change = Callable[[pytest.MonkeyPatch], None]
+
+
+def fails(*args, **kwargs):
+    raise Used
+
+
+def modules() -> list[Any]:
+    return [module for name, module in sys.modules.items() if name.split(".")[0] == "jaxhf"]
+
+
+def fails_everywhere(function: Callable[..., Any], when: Callable[..., bool] = lambda **_: True) -> Change:
+    """`function` fails under whatever names the package's modules know it, where `when` holds for its keyword arguments."""
+
+    def guarded(*args, **kwargs):
+        return fails() if when(**kwargs) else function(*args, **kwargs)
+
+    def change(patch):
+        for module in modules():
+            for name, value in list(vars(module).items()):
+                if value is function:
+                    patch.setattr(module, name, guarded)
+
+    return change
+
+
+def fails_in(place: Any, name: str) -> Change:
+    """`name` of a class or of one module fails; elsewhere it may be needed."""
+    return lambda patch: patch.setattr(place, name, fails)
+
+
+def recognised(place: Any, name: str) -> Change:
+    """isinstance(value, place.name) fails where it would be true: no branch for this kind of thing is entered."""
+    kind = getattr(place, name)
+
+    class Guard(type):
+        def __instancecheck__(cls, instance):
+            return fails() if isinstance(instance, kind) else False
+
+    return lambda patch: patch.setattr(place, name, Guard(name, (), {}))
+
+
+def without(place: Any, module: str, name: str) -> Change:
+    """`place` finds no function `name` in the module that it knows as `module`."""
+
+    class Rest:
+        def __getattr__(self, other):
+            return fails if other == name else getattr(original, other)
+
+    original = getattr(place, module)
+    return lambda patch: patch.setattr(place, module, Rest())
+
+
+def second_call_fails(function: Callable[..., Any]) -> Change:
+    calls = []
+
+    def second(**_):
+        calls.append(function)
+        return len(calls) > 1
+
+    def change(patch):
+        calls.clear()
+        fails_everywhere(function, second)(patch)
+
+    return change
+
+
+PLAIN = Case(scene())
+TEXTURE = jaxhf.Matte(jaxhf.ImageTexture(np.ones((2, 2, 3))))
+TILTED = np.array([[1, 0, 0, 0.1], [0, 1, 0.2, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+SMOOTH = jaxhf.Settings(shading="smooth", shadows=False)
+DEPTH = Case(scene(), aovs=("depth",))
+
+# feature: a scene without it, the same with it, and the changes that make its code fail
+FEATURES: dict[str, tuple[Case, Case, list[Change]]] = {
+    "shadows": (
+        PLAIN,
+        Case(scene(), jaxhf.Settings(shading="flat")),
+        [fails_everywhere(intersect.blocked), fails_everywhere(intersect.occluded)],
+    ),
+    "image texture": (PLAIN, Case(scene(material=TEXTURE)), [fails_in(jaxhf.ImageTexture, "__call__")]),
+    "mirror": (
+        PLAIN,
+        Case(scene(jaxhf.Object(FIELD, jaxhf.Mirror()))),
+        [fails_everywhere(radiance._reflect), fails_everywhere(radiance._mirrored), fails_everywhere(trace_world.nowhere)],
+    ),
+    "cylinder": (
+        PLAIN,
+        Case(scene(jaxhf.Object(jaxhf.Cylinder()))),
+        [fails_everywhere(cylinder.make_tube), fails_everywhere(cylinder.tube_distance), recognised(intersect, "Tube")],
+    ),
+    "second heightfield": (
+        Case(scene(), SMOOTH),
+        Case(scene(jaxhf.Object(FIELD)), SMOOTH),
+        [second_call_fails(trace_world.make_surface), second_call_fails(normals.vertex_normals)],
+    ),
+    "several samples": (
+        PLAIN,
+        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, samples=4)),
+        [without(rendering_render, "lax", "fori_loop")],
+    ),
+    "sky": (PLAIN, Case(scene(lights=(SUN, SKY))), [recognised(lighting, "Sky")]),
+    "point light": (
+        PLAIN,
+        Case(scene(lights=(jaxhf.Point((1, 2, 3)),))),
+        [recognised(localise, "Point"), without(lighting, "jnp", "sqrt")],
+    ),
+    "smooth normals": (
+        PLAIN,
+        Case(scene(), SMOOTH),
+        [fails_everywhere(normals.vertex_normals), fails_everywhere(lighting.rounded_abs)],
+    ),
+    "transform": (  # None is the identity, and nothing is inverted for it
+        PLAIN,
+        Case(scene(world=TILTED)),
+        [fails_in(trace_world, "affine"), fails_in(affine.Affine, "inverse")],
+    ),
+    "edge samples": (
+        PLAIN,
+        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, edge_samples=64)),
+        [fails_everywhere(sample.draw), fails_everywhere(guiding.plain_weights), fails_everywhere(autodiff.with_tangent)],
+    ),
+    "AOVs": (PLAIN, DEPTH, [fails_everywhere(rendering_aovs._observe)]),
+    "step counting": (
+        DEPTH,
+        Case(scene(), aovs=("depth", "steps")),
+        [fails_everywhere(search.first_hit, lambda count_steps=False, **_: count_steps)],
+    ),
+    "shadow AOV": (DEPTH, Case(scene(), aovs=("depth", "shadow")), [fails_everywhere(lighting.in_shadow)]),
+    "step budget": (
+        PLAIN,
+        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, max_steps=6)),
+        [fails_everywhere(search.first_hit, lambda max_steps=None, **_: max_steps is not None)],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_absent(name, monkeypatch):
+    without_it, with_it, changes = FEATURES[name]
+    program, other = without_it.program(), with_it.program()
+    assert other != program
+    assert len(other) > len(program) or name == "step budget"  # that is another number of steps, no more
+    for change in changes:
+        with monkeypatch.context() as patch:
+            change(patch)
+            with pytest.raises(Used):
+                with_it.program()
+    with monkeypatch.context() as patch:
+        for change in changes:
+            change(patch)
+        assert without_it.program() == program
+
+
+def test_max_depth_means_nothing_without_mirrors():
+    programs = {Case(scene(), jaxhf.Settings(max_depth=depth)).program() for depth in (0, 1, 7)}
+    assert len(programs) == 1
+    mirror = jaxhf.Scene([jaxhf.Object(FIELD, jaxhf.Mirror())], CAMERA, [SUN])
+    assert Case(mirror, jaxhf.Settings(max_depth=1)).program() != Case(mirror, jaxhf.Settings(max_depth=2)).program()

@@ -1,0 +1,156 @@
+"""The derivative inside triangles, pixel by pixel, for every number in a scene; two scenes that hold all kinds of things.
+
+No leaf is named here: they are found in the pytree, so that a new one is tested as soon as it is in a scene.
+"""
+
+import functools
+import math
+import re
+from typing import Any, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.scene.camera import Camera
+from jaxhf.scene.light import Light
+from jaxhf.scene.material import Material
+from jaxhf.scene.scene import Shape
+
+SIZE = 16  # pixels
+STEP = 1e-4
+
+
+def matrix(linear: Any, offset: Any) -> np.ndarray:
+    return np.block([[np.asarray(linear, float), np.reshape(offset, (3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def waves(ny: int, nx: int, seed: int, height: float) -> np.ndarray:
+    """Generic smooth heights: no two cells alike."""
+    y, x = np.mgrid[0:ny, 0:nx] / max(ny, nx)
+    a, b, c = np.random.default_rng(seed).uniform(1, 5, (3, 4))[:, :, None, None]
+    return height * np.sum(np.sin(a * x + b * y + c), axis=0)
+
+
+def reflected() -> jaxhf.Scene:
+    """A mirror that stands in a textured cylinder, under a lamp."""
+    texels = np.random.default_rng(1).uniform(0.2, 0.9, (3, 4, 3))
+    return jaxhf.Scene(
+        [
+            jaxhf.Object(
+                jaxhf.Heightfield(waves(5, 6, 2, 0.03)),
+                jaxhf.Mirror((0.7, 0.8, 0.9)),
+                matrix([[1, 0.1, 0.05], [-0.1, 0.9, 0.1], [0.1, 0.1, 0.8]], (0, 0, 0)),
+            ),
+            jaxhf.Object(
+                jaxhf.Cylinder(radius=1.2, z_min=-0.9, z_max=4.0),
+                jaxhf.Matte(jaxhf.ImageTexture(texels)),
+                matrix([[1, 0.1, 0], [-0.05, 1, 0.1], [0.02, 0, 1]], (0.4, 0.4, 0)),
+            ),
+        ],
+        jaxhf.Perspective.look_at((0.6, -0.5, 0.7), (0.5, 0.5, 0.1), fov=50.0, width=SIZE, height=SIZE),
+        [jaxhf.Point((0.4, 0.3, 1.2), (0.9, 0.8, 0.7))],
+    )
+
+
+def parallel() -> jaxhf.Scene:
+    """Terrain in the sun and under a sky, seen by parallel rays."""
+    place = matrix([[0.9, 0.1, 0.05], [-0.1, 0.9, 0.1], [0.05, 0.1, 0.8]], (0.1, 0, 0))
+    return jaxhf.Scene(
+        [jaxhf.Object(jaxhf.Heightfield(waves(9, 8, 5, 0.06)), jaxhf.Matte((0.3, 0.5, 0.7)), place)],
+        jaxhf.Orthographic.look_at((0.6, -0.7, 0.9), (0.5, 0.5, 0.0), extent=0.9, width=SIZE, height=SIZE),
+        [jaxhf.Directional((-0.7, 0.2, 0.4), (2, 3, 4)), jaxhf.Sky((0.1, 0.2, 0.4))],
+    )
+
+
+SCENES = {"reflected": reflected, "parallel": parallel}
+SETTINGS = jaxhf.Settings(max_depth=1, chunk=SIZE * SIZE)
+
+
+def test_scenes_hold_every_kind_of_thing():
+    """What has leaves of its own, and is in none of the scenes, would go untested."""
+    kinds = (*get_args(Shape), *get_args(Material), *get_args(Light), *get_args(Camera), jaxhf.ImageTexture)
+    held = {type(node) for make in SCENES.values() for node in nodes(make())}
+    assert set(kinds) <= held
+
+
+def nodes(tree: Any) -> list[Any]:
+    """All modules in a pytree."""
+    below, found = jax.tree.leaves(tree, is_leaf=lambda node: node is not tree), []
+    for node in below:
+        if isinstance(node, eqx.Module | tuple | list):
+            found += [node, *nodes(node)]
+    return found
+
+
+def random_change(leaf: jax.Array) -> jax.Array:
+    """As large as the leaf."""
+    change = np.random.default_rng(6).uniform(-1, 1, leaf.shape) * np.abs(leaf).max()
+    if leaf.shape == (4, 4):
+        change[3] = 0  # the last row of an affine matrix stays
+    return jnp.asarray(change)
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def differences(scene: jaxhf.Scene, change: jaxhf.Scene, settings: jaxhf.Settings) -> tuple[jax.Array, jax.Array]:
+    """Central differences of the picture, with STEP and with half of it."""
+
+    def at(step: jax.Array) -> jax.Array:
+        return jaxhf.render(jax.tree.map(lambda a, b: a + step * b, scene, change), settings)
+
+    ahead, behind, near, before = jax.lax.map(at, STEP * jnp.array([1, -1, 0.5, -0.5]))
+    return (ahead - behind) / (2 * STEP), (near - before) / STEP
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def forward(scene: jaxhf.Scene, change: jaxhf.Scene, settings: jaxhf.Settings) -> jax.Array:
+    return jax.jvp(lambda scene: jaxhf.render(scene, settings), (scene,), (change,))[1]
+
+
+@functools.partial(jax.jit, static_argnames=("settings",))
+def reverse(scene: jaxhf.Scene, weights: jax.Array, settings: jaxhf.Settings) -> jaxhf.Scene:
+    return jax.vjp(lambda scene: jaxhf.render(scene, settings), scene)[1](weights)[0]
+
+
+def test_reverse_mode_keeps_no_heights_a_tile():
+    """A conditional that returned the derivative of all heights or normals would cost every tile a pass over them."""
+    scene = parallel()
+    place = scene.objects[0].world_from_object
+    field = jaxhf.Heightfield(waves(37, 53, 5, 0.06))
+    scene = jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(0.5), place)], scene.camera, scene.lights)
+    gradient = jax.jit(jax.grad(lambda heights: jnp.sum(jaxhf.render(scene.with_heights(heights), SETTINGS))))
+    program = gradient.lower(jnp.asarray(scene.heights)).compile().as_text()
+    assert program is not None
+    results = [line.split(" conditional(")[0] for line in program.splitlines() if " conditional(" in line]
+    sizes = [math.prod(map(int, shape.split(","))) for result in results for shape in re.findall(r"\[([\d,]+)\]", result)]
+    assert sizes
+    assert max(sizes) < 37 * 53
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_leaf_pixel_by_pixel(name):
+    """Against central differences, in forward and in reverse mode.
+
+    A ray counts where the picture is smooth within the step: there the differences with half the step agree but for a third
+    derivative, while the border of a cell or of a shadow between the two shows. This asks nothing of the derivative itself.
+    The two differences together are exact but for a fifth derivative times STEP^4, and a rounding of 1e-16 / STEP.
+    """
+    scene = jax.tree.map(jnp.asarray, SCENES[name]())
+    leaves, structure = jax.tree.flatten_with_path(scene)
+    weights = np.random.default_rng(7).normal(size=(SIZE, SIZE, 3))
+    gradients = jax.tree.leaves(reverse(scene, jnp.asarray(weights), SETTINGS))
+    for k, (path, _) in enumerate(leaves):
+        where = jax.tree_util.keystr(path)
+        changes = [random_change(leaf) if j == k else jnp.zeros_like(leaf) for j, (_, leaf) in enumerate(leaves)]
+        change = jax.tree.unflatten(structure, changes)
+        wide, narrow = (np.asarray(value) for value in differences(scene, change, SETTINGS))
+        exact, numeric = np.asarray(forward(scene, change, SETTINGS)), (4 * narrow - wide) / 3
+        size = np.abs(numeric)
+        smooth = np.abs(wide - narrow) < 1e-4 * (size + 0.01)
+        assert smooth.mean() > 0.9, where
+        assert np.mean(size > 1e-4) > 0.1, where  # or all could be zero
+        np.testing.assert_allclose(exact[smooth], numeric[smooth], rtol=1e-6, atol=1e-9, err_msg=where)
+        np.testing.assert_allclose(np.vdot(gradients[k], changes[k]), np.vdot(weights, exact), rtol=1e-10, err_msg=where)

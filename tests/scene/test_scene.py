@@ -1,0 +1,332 @@
+"""What a scene is made of: which values are refused, and in which words; defaults; the normals at vertices."""
+
+import dataclasses
+import re
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.scene.localise import localise
+
+NAN, INF = np.nan, np.inf
+GRID = np.zeros((2, 3))
+FIELD = jaxhf.Heightfield(GRID)
+OBJECT = jaxhf.Object(FIELD)
+CAMERA = jaxhf.Perspective(np.eye(4))
+ANYTHING: Any = jaxhf  # the constructors as a program without type annotations uses them
+
+
+def matrix(**entries):
+    """The identity but for some entries, m03=... being that of row 0 and column 3."""
+    values = np.eye(4)
+    for name, value in entries.items():
+        values[int(name[1]), int(name[2])] = value
+    return values
+
+
+def placed(world):
+    return lambda: ANYTHING.Object(FIELD, None, world)
+
+
+def field(heights, **arguments):
+    return lambda: ANYTHING.Heightfield(heights, **arguments)
+
+
+def settings(**arguments):
+    return lambda: ANYTHING.Settings(**arguments)
+
+
+def look_at(*arguments, **more):
+    return lambda: ANYTHING.Perspective.look_at(*arguments, **more)
+
+
+def perspective(world=None, **arguments):
+    return lambda: ANYTHING.Perspective(np.eye(4) if world is None else world, **arguments)
+
+
+def orthographic(world=None, **arguments):
+    return lambda: ANYTHING.Orthographic(np.eye(4) if world is None else world, **arguments)
+
+
+def scene(objects: Any = (OBJECT,), camera: Any = CAMERA, lights: Any = (), **arguments):
+    return lambda: ANYTHING.Scene(objects, camera, lights, **arguments)
+
+
+def directional(*arguments):
+    return lambda: ANYTHING.Directional(*arguments)
+
+
+# What is made, and what the message says: the place, the rule, the value.
+BAD = [
+    (field(np.zeros((1, 5))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (1, 5)"),
+    (field(np.zeros((5, 1))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (5, 1)"),
+    (field([]), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (0,)"),
+    (field(np.zeros((0, 3))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (0, 3)"),
+    (field(np.zeros((2, 2, 2))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (2, 2, 2)"),
+    (field(GRID, dx=0.0), "Heightfield: dx must be positive and finite, it is 0.0"),
+    (field(GRID, dx=-1.0), "Heightfield: dx must be positive and finite, it is -1.0"),
+    (field(GRID, dx=1.0, dy=INF), "Heightfield: dy must be positive and finite, it is inf"),
+    (field(GRID, dx=NAN), "Heightfield: dx must be positive and finite, it is nan"),
+    (field(GRID, x0=NAN), "Heightfield: x0 must be finite, it is nan"),
+    (field(GRID, y0=-INF), "Heightfield: y0 must be finite, it is -inf"),
+    (field(np.zeros((2, 2), np.float16)), "Heightfield: heights must be float32, float64 or whole numbers, they are float16"),
+    (field(jnp.zeros((2, 2), jnp.bfloat16)), "Heightfield: heights must be float32, float64 or whole numbers, they are bf"),
+    (field(np.zeros((2, 2), complex)), "Heightfield: heights must be float32, float64 or whole numbers, they are complex128"),
+    (
+        field(jaxhf.Terrain(GRID)),
+        "Heightfield: heights must be an array of numbers, they are a Terrain: take its .heights, .dx, .dy, .x0 and .y0",
+    ),
+    (field("high"), "Heightfield: heights must be an array of numbers, they are a str"),
+    (placed(np.zeros((4, 4))), "Object: world_from_object must be affine (last row 0 0 0 1), its last row is [0.0, 0"),
+    (placed(matrix(m22=0)), "Object: world_from_object must be invertible, it flattens space: "),
+    (placed(matrix(m10=2, m11=0, m01=0)), "Object: world_from_object must be invertible, it flattens space: "),
+    (placed(matrix(m11=1e-30)[:, [0, 0, 2, 3]]), "Object: world_from_object must be invertible, it flattens space: "),
+    (placed(matrix(m31=1)), "Object: world_from_object must be affine (last row 0 0 0 1), its last row is [0.0, 1.0"),
+    (placed(matrix(m03=NAN)), "Object: world_from_object must be finite, it is "),
+    (placed(np.eye(3)), "Object: world_from_object must be a 4x4 matrix, its shape is (3, 3)"),
+    (placed(jnp.eye(3)), "Object: world_from_object must be a 4x4 matrix, its shape is (3, 3)"),
+    (lambda: ANYTHING.Object(GRID), "Object: shape must be a Heightfield or a Cylinder, it is ndarray"),
+    (lambda: ANYTHING.Object(FIELD, 0.7), "Object: material must be Matte or Mirror, it is float"),
+    (lambda: ANYTHING.Matte([1, 2]), "Matte: albedo must be one number or three, its shape is (2,)"),
+    (lambda: ANYTHING.Matte(NAN), "Matte: albedo must be finite, it is [nan, nan, nan]"),
+    (lambda: ANYTHING.Mirror(np.ones((2, 2))), "Mirror: reflectance must be one number or three, its shape is (2, 2)"),
+    (lambda: ANYTHING.Mirror([0, INF, 0]), "Mirror: reflectance must be finite, it is [ 0., inf,  0.]"),
+    (lambda: ANYTHING.ImageTexture(np.ones((2, 2))), "ImageTexture: texels must have shape (h, w, 3), theirs is (2, 2)"),
+    (lambda: ANYTHING.ImageTexture(np.ones((2, 2, 4))), "ImageTexture: texels must have shape (h, w, 3), theirs is (2, 2, 4)"),
+    (lambda: ANYTHING.ImageTexture(np.ones((0, 2, 3))), "ImageTexture: texels must have shape (h, w, 3), theirs is (0, 2, 3)"),
+    (lambda: ANYTHING.ImageTexture(np.full((2, 2, 3), NAN)), "ImageTexture: texels must be finite"),
+    (directional([0, 0, 0]), "Directional: towards must not be zero, it is [0, 0, 0]"),
+    (directional([0, NAN, 1]), "Directional: towards must be finite, it is [ 0., nan,  1.]"),
+    (directional([1, 2]), "Directional: towards must hold three numbers, its shape is (2,)"),
+    (directional(1), "Directional: towards must hold three numbers, its shape is ()"),
+    (directional([0, 0, 1], [1, 2]), "Directional: radiance must hold three numbers, its shape is (2,)"),
+    (lambda: jaxhf.Directional.from_angles(NAN), "Directional: towards must be finite, it is "),
+    (lambda: jaxhf.Point([1, 2]), "Point: p must hold three numbers, its shape is (2,)"),
+    (lambda: jaxhf.Point([1, 2, INF]), "Point: p must be finite, it is [ 1.,  2., inf]"),
+    (lambda: jaxhf.Point([1, 2, 3], [1, 2]), "Point: intensity must hold three numbers, its shape is (2,)"),
+    (lambda: jaxhf.Sky([1, 2, 3, 4]), "Sky: radiance must hold three numbers, its shape is (4,)"),
+    (lambda: jaxhf.Sky(NAN), "Sky: radiance must be finite, it is [nan, nan, nan]"),
+    (perspective(fov=0), "Perspective: fov must lie between 0 and 180 degrees, it is 0.0"),
+    (perspective(fov=180), "Perspective: fov must lie between 0 and 180 degrees, it is 180.0"),
+    (perspective(fov=NAN), "Perspective: fov must lie between 0 and 180 degrees, it is nan"),
+    (perspective(fov=[30, 40]), "Perspective: fov must be one number"),
+    (perspective(width=-4), "Perspective: width must be a whole number of pixels from 1 on, it is -4"),
+    (perspective(height=0), "Perspective: height must be a whole number of pixels from 1 on, it is 0"),
+    (perspective(height=2.5), "Perspective: height must be a whole number of pixels from 1 on, it is 2.5"),
+    (perspective(np.eye(3)), "Perspective: world_from_camera must be a 4x4 matrix, its shape is (3, 3)"),
+    (perspective(matrix(m00=NAN)), "Perspective: world_from_camera must be finite, it is "),
+    (perspective(matrix(m11=0)), "Perspective: world_from_camera must be invertible, it flattens space: "),
+    (orthographic(extent=0), "Orthographic: extent must be positive and finite, it is 0.0"),
+    (orthographic(extent=NAN), "Orthographic: extent must be positive and finite, it is nan"),
+    (orthographic(extent=INF), "Orthographic: extent must be positive and finite, it is inf"),
+    (orthographic(width=-1), "Orthographic: width must be a whole number of pixels from 1 on, it is -1"),
+    (look_at((1, 2, 3), (1, 2, 3)), "look_at: target must differ from eye, both are [1.0, 2.0, 3.0]"),
+    (look_at((0, 0, 5), (0, 0, 0)), "look_at: up must not point along the view, it is [0.0, 0.0, 1.0] for the view"),
+    (look_at((0, 0, 0), (1, 0, 0), (0, 0, 0)), "look_at: up must not point along the view, it is [0.0, 0.0, 0.0]"),
+    (look_at((0, NAN, 0), (1, 0, 0)), "look_at: eye must be finite, it is [ 0., nan,  0.]"),
+    (look_at((0, 0, 0), (1, 0)), "look_at: target must hold three numbers, its shape is (2,)"),
+    (scene(objects=[]), "Scene: objects must hold at least one Object, it is empty"),
+    (scene(objects=[FIELD]), "Scene: objects does not take a Heightfield"),
+    (scene(camera="front"), "Scene: camera does not take a str"),
+    (scene(lights=[CAMERA]), "Scene: lights does not take a Perspective"),
+    (scene(lights=[jaxhf.Sky(1), jaxhf.Sky(2)]), "Scene: lights may hold one Sky, they hold more"),
+    (scene(samples=0), "Scene: samples must be a whole number from 1 on, it is 0"),
+    (scene(samples=2.0), "Scene: samples must be a whole number from 1 on, it is 2.0"),
+    (settings(traversal="fast"), "Settings: traversal must be one of "),
+    (settings(shading="gouraud"), "Settings: shading must be one of smooth, flat; it is 'gouraud'"),
+    (settings(normals="five"), "Settings: normals must be one of central, four, six, six-angle, six-equal; it is 'five'"),
+    (settings(shadows=1), "Settings: shadows must be True or False, it is 1"),
+    (settings(max_steps=0), "Settings: max_steps must be a whole number from 1 on, it is 0"),
+    (settings(max_steps=2.0), "Settings: max_steps must be a whole number from 1 on, it is 2.0"),
+    (settings(samples=0), "Settings: samples must be a whole number from 1 on, it is 0"),
+    (settings(samples=8), "Settings: samples must be a square number (1, 4, 9, ...), it is 8"),
+    (settings(max_depth=-1), "Settings: max_depth must be a whole number from 0 on, it is -1"),
+    (settings(max_depth=True), "Settings: max_depth must be a whole number from 0 on, it is True"),
+    (settings(chunk=63), "Settings: chunk must be a whole number from 64 on, it is 63"),
+    (settings(chunk="1024"), "Settings: chunk must be a whole number from 64 on, it is '1024'"),
+    (lambda: jaxhf.Cylinder(radius=0), "Cylinder: radius must be positive, it is 0.0"),
+    (lambda: jaxhf.Cylinder(radius=INF), "Cylinder: radius must be positive"),
+    (lambda: jaxhf.Cylinder(radius=NAN), "Cylinder: radius must be positive, it is nan"),
+    (lambda: jaxhf.Cylinder(z_min=1, z_max=1), "Cylinder: z_min must lie below z_max, they are 1.0 and 1.0"),
+    (lambda: jaxhf.Cylinder(z_max=NAN), "Cylinder: z_min must lie below z_max, they are -1.0 and nan"),
+    (lambda: jaxhf.Cylinder(z_min=-INF), "Cylinder: z_min must be finite"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("make", "message"), BAD, ids=[message[:70] for _, message in BAD])
+def test_bad_input_is_refused(make, message):
+    jaxtyping.config.update("jaxtyping_disable", True)  # as a user has it: nobody checks the annotations
+    try:
+        with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+            make()
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_settings_are_frozen_and_hashable():
+    one = jaxhf.Settings(shadows=False)
+    assert {one: "found"}[jaxhf.Settings(shadows=False)] == "found"
+    assert one != jaxhf.Settings()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        one.shadows = True  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "spacing"),
+    [({}, (1 / 4, 1 / 2)), ({"dx": 3.0}, (3, 3)), ({"dy": 2.0}, (2, 2)), ({"dx": 3.0, "dy": 2.0}, (3, 2))],
+)
+def test_cell_size(arguments, spacing):
+    """Nothing given: pbrt's unit square. One of the two alone counts for both."""
+    made = jaxhf.Heightfield(np.zeros((3, 5)), **arguments)
+    assert (made.dx, made.dy) == spacing
+    assert (made.x0, made.y0) == (0, 0)
+
+
+def test_precision_of_heights():
+    assert jaxhf.Heightfield([[1, 2], [3, 4]]).heights.dtype == jnp.float32
+    assert jaxhf.Heightfield(np.array([[1, 2], [3, 4]], np.uint8)).heights.dtype == jnp.float32
+    assert jaxhf.Heightfield(np.zeros((2, 2), np.float32)).heights.dtype == jnp.float32
+    assert jaxhf.Heightfield(np.zeros((2, 2))).heights.dtype == jnp.float64
+
+
+@pytest.mark.parametrize(("ny", "nx", "padded"), [(11520, 23040, "16384 x 32768"), (2, 2**27 + 2, "2 x 268435456")])
+def test_no_more_cells_than_can_be_traced(ny, nx, padded):
+    """Shapes alone: both are fewer than 2^28 heights."""
+    with pytest.raises(
+        ValueError, match=re.escape(f"at most 2**28 cells, each side rounded up to a power of two; shape {(ny, nx)}")
+    ) as error:
+        jax.eval_shape(jaxhf.Heightfield, jax.ShapeDtypeStruct((ny, nx), jnp.float32))
+    assert str(error.value).endswith(f"makes {padded}")
+
+
+@pytest.mark.parametrize(("ny", "nx"), [(11520, 16385), (16384, 16384), (2, 2**27 + 1)])
+def test_as_many_cells_as_can_be_traced(ny, nx):
+    def lowered(heights):
+        return jaxhf.cast(jaxhf.Heightfield(heights), (0.5, 0.5, 9.0), (0, 0, -1.0)).t
+
+    assert jax.eval_shape(lowered, jax.ShapeDtypeStruct((ny, nx), jnp.float32)).shape == ()
+
+
+@pytest.mark.parametrize("dtype", [jnp.int32, jnp.uint8, bool])
+def test_whole_numbers_in_jax_become_floats(dtype):
+    """Whatever moves them later would lose its fractions."""
+    three, square = jnp.array([0, 0, 1], dtype), jnp.eye(4).astype(dtype)
+    leaves: tuple[Any, ...] = (
+        jaxhf.Point(three, three).p, jaxhf.Point(three, three).intensity, jaxhf.Directional(three, three).radiance,
+        jaxhf.Matte(three).albedo, jaxhf.Matte(jnp.array(1, dtype)).albedo, jaxhf.Cylinder(jnp.array(1, dtype)).radius,
+        jaxhf.Object(FIELD, None, square).world_from_object, jaxhf.Perspective(square).world_from_camera,
+    )  # fmt: skip
+    assert {leaf.dtype for leaf in leaves} == {np.dtype(np.float64)}
+    np.testing.assert_array_equal(leaves[0], (0, 0, 1))
+
+
+def test_a_light_at_whole_numbers_stands_there_beside_a_shifted_grid():
+    """Localised, the grid's corner (0.5, 0.25) is the origin."""
+    made = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(GRID, x0=0.5, y0=0.25))], CAMERA, [jaxhf.Point(jnp.array([0, 0, 5]))])
+    (light,) = localise(made).lights
+    assert isinstance(light, jaxhf.Point)
+    np.testing.assert_array_equal(light.p, (-0.5, -0.25, 5))
+
+
+def test_defaults():
+    assert OBJECT.world_from_object is None
+    assert isinstance(OBJECT.material, jaxhf.Matte)
+    np.testing.assert_array_equal(np.asarray(OBJECT.material.albedo), (0.7, 0.7, 0.7))
+    np.testing.assert_array_equal(jaxhf.Mirror().reflectance, (0.9, 0.9, 0.9))
+    np.testing.assert_array_equal(jaxhf.Matte((1, 2, 3)).albedo, (1, 2, 3))
+    made = jaxhf.Scene([OBJECT], CAMERA)
+    assert (made.lights, made.samples) == ((), 1)
+    assert (CAMERA.fov, CAMERA.width, CAMERA.height) == (45, 512, 512)
+
+
+def test_positions_keep_double_precision():
+    """Python and NumPy numbers stay NumPy float64 until the origin has moved; JAX arrays stay as they are."""
+    light = jaxhf.Point((5e6 + 0.125, 0, 0))
+    assert isinstance(light.p, np.ndarray)
+    assert light.p[0] == 5e6 + 0.125
+    single = jaxhf.Point(jnp.ones(3, jnp.float32))
+    assert single.p.dtype == jnp.float32
+
+
+def test_heights_of_a_scene():
+    first, second = jaxhf.Heightfield(np.zeros((2, 3))), jaxhf.Heightfield(np.ones((4, 4)), dx=2.0)
+    objects = [jaxhf.Object(jaxhf.Cylinder()), jaxhf.Object(first), jaxhf.Object(second)]
+    made = jaxhf.Scene(objects, CAMERA, [jaxhf.Sky(1)], samples=4)
+    assert made.heightfields == (first, second)
+    assert made.heights is first.heights
+    changed = made.with_heights([[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(changed.heights, [[1, 2, 3], [4, 5, 6]])
+    assert changed.heights.dtype == jnp.float64
+    assert changed.heightfields[1].heights is second.heights
+    assert (changed.lights, changed.samples) == (made.lights, 4)
+    assert not made.heights.any()
+
+
+def test_heights_of_a_scene_without_any():
+    made = jaxhf.Scene([jaxhf.Object(jaxhf.Cylinder())], CAMERA)
+    assert made.heightfields == ()
+    with pytest.raises(ValueError, match="Scene: there is no heightfield among its objects"):
+        _ = made.heights
+    with pytest.raises(ValueError, match="Scene: there is no heightfield among its objects"):
+        made.with_heights(GRID)
+
+
+SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
+
+
+def units(vectors):
+    vectors = np.asarray(vectors)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("shape", [(5, 6), (2, 2)])
+def test_normals_of_a_plane(shape, scheme):
+    """They are the plane's, at the border as well."""
+    y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
+    plane = 3 * 0.5 * x - 2 * 0.25 * y + 1
+    normals = jaxhf.vertex_normals(jnp.asarray(plane), 0.5, 0.25, scheme)
+    expected = np.broadcast_to(np.array([-3, 2, 1]) / np.sqrt(14), (*shape, 3))
+    np.testing.assert_allclose(units(normals), expected, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "normal"),
+    [
+        ("central", [-0.5, 0, 1]),
+        ("four", 2 * units([-1, 0, 1]) + [0, 0, 2]),
+        ("six", [-2, 1, 6]),
+        ("six-equal", units([-1, 1, 1]) + units([-1, 0, 1]) + [0, 0, 4]),
+        ("six-angle", 60 * units([-1, 1, 1]) + 90 * units([-1, 0, 1]) + [0, 0, 45 + 90 + 45 + 45]),
+    ],
+)
+def test_normals_by_hand(scheme, normal):
+    """The vertex in the middle of eight, of which only its eastern neighbour is higher, by 1."""
+    heights = jnp.asarray(np.array([[0, 0, 0], [0, 0, 1], [0, 0, 0.0]]))
+    np.testing.assert_allclose(units(jaxhf.vertex_normals(heights, 1.0, 1.0, scheme)[1, 1]), units(normal), atol=1e-15)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("hole", [NAN, INF, -INF])
+def test_holes_take_no_part_in_normals(hole, scheme):
+    y, x = np.mgrid[0:6, 0:7]
+    plane = 0.5 * x - 0.25 * y
+    plane[0, 0] = plane[2, 3] = plane[5, 4] = hole
+    normals = np.asarray(jaxhf.vertex_normals(jnp.asarray(plane), 1.0, 1.0, scheme))
+    assert np.isfinite(normals).all()
+    expected = np.broadcast_to(units([-0.5, 0.25, 1]), normals.shape)
+    present = np.isfinite(plane)
+    np.testing.assert_allclose(units(normals)[present], expected[present], atol=1e-15)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_vertex_alone_points_up(scheme):
+    heights = np.full((3, 3), NAN)
+    heights[1, 1] = 4
+    normals = jaxhf.vertex_normals(jnp.asarray(heights), 1.0, 1.0, scheme)
+    np.testing.assert_array_equal(normals, np.broadcast_to([0, 0, 1], (3, 3, 3)))

@@ -1,0 +1,341 @@
+"""Light on surfaces against closed forms: planes, walls, mirrors and a cylinder whose radiance can be written down by hand.
+
+All grids have 5 x 9 heights and cells of 1 x 1, so the ground is 0..8 by 0..4. Everything runs in float64; where no other
+reason is given, a tolerance of 1e-12 stands for the rounding of some hundred operations.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.shade.lighting import rounded_abs
+from jaxhf.shade.radiance import _reflect
+
+ROUNDING = 1e-12
+ALBEDO = np.array([0.2, 0.5, 0.8])
+RADIANCE = np.array([1.0, 2.0, 3.0])
+Y, X = np.mgrid[0:5, 0:9].astype(float)
+FLAT = np.zeros((5, 9))
+TILTED = 0.3 * X - 0.2 * Y
+TILTED_NORMAL = np.array([-0.3, 0.2, 1.0]) / np.sqrt(1.13)
+STEP = np.where(X < 3.5, 0.0, 1.0)  # a plain, a wall between x = 3 and x = 4, a plateau
+
+
+def ground(heights, material=None, **placement):
+    material = jaxhf.Matte(ALBEDO) if material is None else material
+    return jaxhf.Object(jaxhf.Heightfield(heights, **{"dx": 1.0, **placement}), material)
+
+
+def vertical(x, y, extent, side=1, width=16, height=16):
+    """A camera that looks straight down with the north up, or straight up (side -1); what it sees is `places`."""
+    return jaxhf.Orthographic.look_at((x, y, 10 * side), (x, y, 0), (0, 1, 0), extent, width=width, height=height)
+
+
+def places(x, y, extent, side=1, width=16, height=16):
+    """Where the rays of `vertical` meet a horizontal plane, by hand: (h, w) each."""
+    pixel = extent / min(width, height)
+    east = x + side * (np.arange(width) + 0.5 - width / 2) * pixel
+    north = y - (np.arange(height) + 0.5 - height / 2) * pixel
+    return np.meshgrid(east, north)
+
+
+def perspective(eye, target, fov=45.0, size=16):
+    """A camera, and the unit directions of its rays by hand, shape (size, size, 3)."""
+    eye, target = np.array(eye, float), np.array(target, float)
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0, 0, 1))
+    right /= np.linalg.norm(right)
+    across = (2 * np.arange(size) + 1 - size) / size * np.tan(np.radians(fov / 2))
+    d = forward + across[None, :, None] * right - across[:, None, None] * np.cross(right, forward)
+    return jaxhf.Perspective.look_at(eye, target, fov=fov, width=size, height=size), d / np.linalg.norm(d, axis=-1)[..., None]
+
+
+def from_point(p, n, light, intensity):
+    """Irradiance from a point light at points p, shape (..., 3), with unit normals n; shape (..., 3)."""
+    to = light - p
+    distance = np.linalg.norm(to, axis=-1)
+    cosine = np.abs((to * n).sum(-1)) / distance
+    return intensity * (cosine / distance**2)[..., None]
+
+
+@pytest.mark.parametrize("light_side", [1, -1])
+@pytest.mark.parametrize("camera_side", [1, -1])
+def test_plane_under_directional_light(camera_side, light_side):
+    towards = light_side * np.array([0.3, 0.5, 0.8])
+    lights = [jaxhf.Directional(7 * towards, RADIANCE)]  # the length of the vector does not matter
+    image = jaxhf.render(jaxhf.Scene([ground(TILTED)], vertical(4, 2, 2, camera_side), lights))
+    cosine = abs(towards @ TILTED_NORMAL) / np.linalg.norm(towards)
+    expected = ALBEDO / np.pi * RADIANCE * cosine if light_side == camera_side else np.zeros(3)
+    np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "altitude", "towards"),
+    [
+        (0, 0, (0, 1, 0)),
+        (90, 0, (1, 0, 0)),
+        (180, 0, (0, -1, 0)),
+        (123, 90, (0, 0, 1)),
+        (315, 45, (-0.5, 0.5, np.sqrt(0.5))),
+    ],
+)
+def test_directions_from_azimuth_and_altitude(azimuth, altitude, towards):
+    np.testing.assert_allclose(jaxhf.Directional.from_angles(azimuth, altitude).towards, towards, atol=1e-15)
+    traced = jax.jit(lambda a, h: jaxhf.Directional.from_angles(a, h).towards)(float(azimuth), float(altitude))
+    np.testing.assert_allclose(traced, towards, atol=1e-15)
+
+
+def test_default_light_is_that_of_maps():
+    light, default = jaxhf.Directional.from_angles(315, 45), jaxhf.Directional.from_angles()
+    np.testing.assert_array_equal(default.towards, light.towards)
+    np.testing.assert_array_equal(default.radiance, np.full(3, np.pi))
+
+
+def test_point_light_falls_off_with_the_square():
+    p = np.array([3.0, 1.0, 2.0])
+    image = jaxhf.render(jaxhf.Scene([ground(FLAT)], vertical(4, 2, 4), [jaxhf.Point(p, RADIANCE)]))
+    x, y = places(4, 2, 4)
+    expected = ALBEDO / np.pi * from_point(np.stack([x, y, 0 * x], -1), (0, 0, 1), p, RADIANCE)
+    np.testing.assert_allclose(image, expected, rtol=ROUNDING)
+    assert image.max() > 2 * image.min()
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_sky(side):
+    """Its colour is behind everything; a matte plane with slope beta sees (1 + cos beta) / 2 of it."""
+    image = jaxhf.render(jaxhf.Scene([ground(TILTED)], vertical(4, 2, 12, side), [jaxhf.Sky(RADIANCE)]))
+    x, y = places(4, 2, 12, side)
+    met = ((x > 0) & (x < 8) & (y > 0) & (y < 4))[..., None]
+    diffuse = ALBEDO * RADIANCE * (1 + side * TILTED_NORMAL[2]) / 2
+    np.testing.assert_allclose(image, np.where(met, diffuse, RADIANCE), rtol=ROUNDING)
+    assert 0 < met.mean() < 1
+
+
+# The wall's upper edge is the line x = 4, z = 1. Seen from a light at slope 1/2, or from (6, *, 2), it lies over x = 2, z = 0.
+BEHIND_WALL = {"directional": jaxhf.Directional((1, 0, 0.5)), "point": jaxhf.Point((6, 2.5, 2), 10.0)}
+
+
+@pytest.mark.parametrize("extent", [3.97, 1e-2, 1e-9])
+@pytest.mark.parametrize("kind", BEHIND_WALL)
+def test_wall_casts_a_shadow(kind, extent):
+    light = BEHIND_WALL[kind]
+    scene = jaxhf.Scene([ground(STEP)], vertical(2, 1.99, extent), [light])
+    image, aov = jaxhf.render(scene, aovs=("shadow",))
+    x, y = places(2, 1.99, extent)
+    lit = x < 2
+    np.testing.assert_array_equal(aov["shadow"][:, :, 0], ~lit)
+    p, n = np.stack([x, y, 0 * x], -1), np.array([0, 0, 1])
+    if isinstance(light, jaxhf.Point):
+        expected = ALBEDO / np.pi * from_point(p, n, np.asarray(light.p), np.asarray(light.intensity))
+    else:
+        expected = np.broadcast_to(ALBEDO * np.sqrt(0.2), p.shape)
+    np.testing.assert_allclose(image, np.where(lit[..., None], expected, 0), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    "p",
+    [
+        (2.5, 2.0, 0.3),  # most rays to it would go on into the wall
+        (2.999, 2.0, 0.5),  # just before its foot
+        (0.5, 1.0, 3.0),  # above the plain
+    ],
+)
+def test_light_before_the_wall_is_not_blocked(p):
+    scene = jaxhf.Scene([ground(STEP)], vertical(1, 1.7, 1.9), [jaxhf.Point(p, 10.0)])
+    image, aov = jaxhf.render(scene, aovs=("shadow",))
+    assert not aov["shadow"].any()
+    x, y = places(1, 1.7, 1.9)
+    expected = ALBEDO / np.pi * from_point(np.stack([x, y, 0 * x], -1), (0, 0, 1), np.array(p), 10.0)
+    np.testing.assert_allclose(image, expected, rtol=ROUNDING)
+
+
+def test_one_heightfield_shadows_another():
+    # A tile over 3..5 by 1.5..2.5 at height 2; the light has slope 1 along x, so its shadow is 2 further west.
+    tile = ground(np.full((5, 9), 2.0), dx=0.25, x0=3.0, y0=1.5)
+    scene = jaxhf.Scene([ground(FLAT), tile], vertical(4, 2, 4, width=32), [jaxhf.Directional((1, 0, 1), np.pi)])
+    image, aov = jaxhf.render(scene, aovs=("object", "shadow"))
+    x, y = places(4, 2, 4, width=32)
+    beside = (y > 1.5) & (y < 2.5)
+    on_tile, in_shadow = beside & (x > 3) & (x < 5), beside & (x > 1) & (x < 3)
+    np.testing.assert_array_equal(aov["object"], on_tile)
+    np.testing.assert_array_equal(aov["shadow"][:, :, 0], in_shadow)
+    expected = np.where(in_shadow[..., None], 0, ALBEDO * np.sqrt(0.5))
+    np.testing.assert_allclose(image, expected, rtol=ROUNDING)
+    assert in_shadow.sum() == on_tile.sum() == 8 * 4
+
+
+def texture_by_hand(texels, u, v):
+    """Periodic bilinear interpolation as a sum over all texels, each with a tent of width 1 about its centre."""
+
+    def tents(position, count):
+        apart = np.abs(position[..., None] * count - 0.5 - np.arange(count)) % count
+        return np.maximum(0, 1 - np.minimum(apart, count - apart))
+
+    return np.einsum("...i,...j,ijc->...c", tents(v, texels.shape[0]), tents(u, texels.shape[1]), texels)
+
+
+def test_texture_lookup():
+    texels = np.random.default_rng(0).uniform(size=(3, 4, 3))
+    lookup = jax.vmap(jaxhf.ImageTexture(texels))
+    rows, columns = np.mgrid[0:3, 0:4]
+    centres = np.stack([(columns + 0.5) / 4, (rows + 0.5) / 3], -1).reshape(-1, 2)  # row 0 is v = 0, u runs along it
+    np.testing.assert_allclose(lookup(jnp.asarray(centres)), texels.reshape(-1, 3), rtol=ROUNDING)
+    np.testing.assert_allclose(lookup(jnp.asarray(centres + np.array([5, -7]))), texels.reshape(-1, 3), rtol=ROUNDING)
+    corner = lookup(jnp.zeros((1, 2)))[0]  # between the four corners of the image, as it repeats
+    np.testing.assert_allclose(corner, texels[[0, 0, -1, -1], [0, -1, 0, -1]].mean(0), rtol=ROUNDING)
+    uv = np.random.default_rng(1).uniform(-2, 2, (200, 2))
+    np.testing.assert_allclose(lookup(jnp.asarray(uv)), texture_by_hand(texels, uv[:, 0], uv[:, 1]), rtol=ROUNDING)
+
+
+def test_texture_lies_on_the_ground():
+    texels = np.random.default_rng(2).uniform(size=(4, 6, 3))
+    scene = jaxhf.Scene(
+        [ground(FLAT, jaxhf.Matte(jaxhf.ImageTexture(texels)))],
+        vertical(4, 2, 4, width=32),
+        [jaxhf.Directional((0, 0, 1), np.pi)],
+    )
+    x, y = places(4, 2, 4, width=32)
+    np.testing.assert_allclose(jaxhf.render(scene), texture_by_hand(texels, x / 8, y / 4), rtol=ROUNDING)
+
+
+def test_inside_a_textured_cylinder():
+    texels = np.random.default_rng(3).uniform(size=(4, 6, 3))
+    shape = jaxhf.Cylinder(radius=2, z_min=-1, z_max=3)
+    eye, light = np.array([0.3, -0.2, 0.5]), np.array([0.1, 0.2, 1.5])
+    camera, d = perspective(eye, (2, 0.2, 0.9), fov=100)  # towards the seam, phi = 0
+    scene = jaxhf.Scene([jaxhf.Object(shape, jaxhf.Matte(jaxhf.ImageTexture(texels)))], camera, [jaxhf.Point(light, RADIANCE)])
+    image, aov = jaxhf.render(scene, aovs=("uv", "status"))
+
+    a, b, c = (d[..., :2] ** 2).sum(-1), d[..., :2] @ eye[:2], eye[:2] @ eye[:2] - 4
+    t = (-b + np.sqrt(b * b - a * c)) / a
+    p = eye + t[..., None] * d
+    met = (p[..., 2] > -1) & (p[..., 2] < 3)
+    u, v = np.arctan2(p[..., 1], p[..., 0]) / (2 * np.pi) % 1, (p[..., 2] + 1) / 4
+    n = p * [0.5, 0.5, 0]
+    expected = texture_by_hand(texels, u, v) / np.pi * from_point(p, n, light, RADIANCE)
+    np.testing.assert_array_equal(aov["status"], np.where(met, jaxhf.Status.HIT, jaxhf.Status.MISS))
+    np.testing.assert_allclose(aov["uv"], np.where(met[..., None], np.stack([u, v], -1), 0), rtol=ROUNDING, atol=ROUNDING)
+    np.testing.assert_allclose(image, np.where(met[..., None], expected, 0), rtol=1e-11)  # rounding of u, times the texels
+    assert 0.5 < met.mean() < 1
+    assert u[met].min() < 0.1
+    assert u[met].max() > 0.9
+
+
+LOWER, UPPER = np.array([0.9, 0.8, 0.5]), np.array([0.7, 0.6, 0.3])
+
+
+def parallel_mirrors(camera):
+    """Two horizontal mirrors, at z = 0 and z = 1, that face each other."""
+    return jaxhf.Scene(
+        [ground(FLAT, jaxhf.Mirror(LOWER)), ground(FLAT + 1, jaxhf.Mirror(UPPER))], camera, [jaxhf.Sky(RADIANCE)]
+    )
+
+
+@pytest.mark.parametrize(("z", "reflectance"), [(2.0, UPPER), (-1.0, LOWER)])
+def test_mirror_under_the_sky(z, reflectance):
+    camera, _ = perspective((4, 1, z), (4, 2, 0.5))
+    image = jaxhf.render(parallel_mirrors(camera))
+    np.testing.assert_allclose(image, np.broadcast_to(reflectance * RADIANCE, image.shape), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("max_depth", [0, 1, 4])
+def test_max_depth_ends_what_parallel_mirrors_reflect(max_depth):
+    eye = np.array([0.1, 2.0, 0.5])
+    camera, d = perspective(eye, (3.0, 2.1, 0.4), fov=80)
+    image = jaxhf.render(parallel_mirrors(camera), jaxhf.Settings(max_depth=max_depth))
+    # Unfolded, the ray goes straight on until it is over the mirrors' border, and passes the heights 1/2 + k.
+    leaves = np.minimum((8 - eye[0]) / d[..., 0], (np.where(d[..., 1] > 0, 4, 0) - eye[1]) / d[..., 1])
+    bounces = np.floor(leaves * np.abs(d[..., 2]) + 0.5)
+    first, second = np.where(d[..., 2:] < 0, LOWER, UPPER), np.where(d[..., 2:] < 0, UPPER, LOWER)
+    left = first ** np.ceil(bounces / 2)[..., None] * second ** np.floor(bounces / 2)[..., None] * RADIANCE
+    np.testing.assert_allclose(image, np.where(bounces[..., None] <= max_depth, left, 0), rtol=ROUNDING)
+    assert bounces.max() > 4
+    assert set(range(5)) < set(bounces.ravel())
+
+
+def test_mirror_shows_a_wall():
+    tilt = np.array([-0.1, 0.05, 1.0]) / np.linalg.norm([-0.1, 0.05, 1.0])
+    floor = ground(0.1 * X - 0.05 * Y, jaxhf.Mirror(UPPER))
+    upright = np.array([[1, 0, 0, 0], [0, 0, -1, 4], [0, 1, 0, 0], [0, 0, 0, 1.0]])  # the object's y is up; it stands at y = 4
+    wall = jaxhf.Object(jaxhf.Heightfield(FLAT, dx=1.0), jaxhf.Matte(ALBEDO), upright)
+    eye, light = np.array([4, 0.5, 2]), np.array([3, 1, 3])
+    camera, d = perspective(eye, (4, 2.5, 0.3), fov=25)
+    image = jaxhf.render(jaxhf.Scene([floor, wall], camera, [jaxhf.Point(light, RADIANCE)]))
+
+    mirrored_at = eye - ((eye @ tilt) / (d @ tilt))[..., None] * d  # the floor's plane contains the origin
+    out = d - 2 * (d @ tilt)[..., None] * tilt
+    p = mirrored_at + ((4 - mirrored_at[..., 1]) / out[..., 1])[..., None] * out
+    assert np.all((p > (0, 3.9, 0.1)) & (p < (8, 4.1, 4)))
+    expected = UPPER * ALBEDO / np.pi * from_point(p, np.array([0, 1, 0]), light, RADIANCE)
+    np.testing.assert_allclose(image, expected, rtol=ROUNDING)
+
+
+def test_no_black_holes():
+    """Where the triangle faces the light there is light, although some interpolated normals face away from it."""
+    heights = np.random.default_rng(4).normal(0, 1.5, (5, 5))
+    eye = np.array([-1.0, -2.0, 4.0])
+    camera, d = perspective(eye, (2, 2, 0), fov=50, size=32)
+    scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights, dx=1.0), jaxhf.Matte(1.0))], camera, [jaxhf.Point(eye, 20.0)])
+    image, aov = jaxhf.render(scene, aovs=("normal", "status"))
+    _, flat = jaxhf.render(scene, jaxhf.Settings(shading="flat", shadows=False), aovs=("normal",))
+    met = np.asarray(aov["status"]) == jaxhf.Status.HIT
+    n, ns = np.asarray(flat["normal"]), np.asarray(aov["normal"])
+    side = -np.sign((n * d).sum(-1))
+    away = met & (side * (ns * -d).sum(-1) < 0)
+    assert away.sum() > 10
+    assert np.all(np.asarray(image)[met] > 0)  # the light is at the eye: what is seen faces it
+    tangent = np.random.default_rng(5).normal(size=heights.shape)
+    _, change = jax.jvp(lambda heights: jaxhf.render(scene.with_heights(heights)), (scene.heights,), (jnp.asarray(tangent),))
+    assert np.isfinite(change).all()
+    assert np.all(np.abs(np.asarray(change)[away]).max(-1) > 0)
+
+
+def test_rounded_abs():
+    """|x| beyond 0.01; below, the parabola that continues it in value and in slope, 0.005 at zero."""
+    slope = jax.vmap(jax.grad(rounded_abs))
+    x = np.concatenate([np.linspace(-1, 1, 2000), np.linspace(-0.02, 0.02, 2001)])
+    value = np.asarray(jax.vmap(rounded_abs)(jnp.asarray(x)))
+    beyond = np.abs(x) > 0.01
+    np.testing.assert_array_equal(value[beyond], np.abs(x)[beyond])
+    np.testing.assert_allclose(value[~beyond], (50 * x * x + 0.005)[~beyond], rtol=1e-13)
+    np.testing.assert_array_equal(slope(jnp.asarray(x[beyond])), np.sign(x[beyond]))
+    np.testing.assert_allclose(slope(jnp.asarray(x[~beyond])), 100 * x[~beyond], atol=1e-13)
+    for sign in (-1, 1):
+        near = jnp.asarray(sign * (0.01 + np.array([-1e-12, 0, 1e-12])))
+        np.testing.assert_allclose(jax.vmap(rounded_abs)(near), 0.01, atol=2e-12)
+        np.testing.assert_allclose(slope(near), sign, atol=2e-10)
+
+
+def test_mirrored_ray_never_enters_its_triangle():
+    rng = np.random.default_rng(6)
+
+    def units():
+        v = rng.normal(size=(20_000, 3))
+        return v / np.linalg.norm(v, axis=1)[:, None]
+
+    d, n, ns = units(), units(), units()
+    d[:100] = np.cross(n[:100], ns[:100])  # grazing
+    ns[100:5000] = n[100:5000] + 0.1 * ns[100:5000]  # as most are: near the triangle's own
+    ns /= np.linalg.norm(ns, axis=1)[:, None]
+    side = np.where((d * n).sum(1) < 0, 1, -1)
+    zero, whole = jnp.zeros(3), jnp.zeros((), jnp.int32)
+
+    @jax.jit
+    @jax.vmap
+    def reflected(d, n, ns, side):
+        hit = jaxhf.Hit(
+            status=whole, t=zero[0], p=zero, n=n, ns=ns, uv=zero[:2], dp_du=zero, dp_dv=zero, dn_du=zero, dn_dv=zero,
+            cell=jnp.zeros(2, jnp.int32), triangle=whole, side=side,
+        )  # fmt: skip
+        return _reflect(d, hit)
+
+    out = np.asarray(reflected(jnp.asarray(d), jnp.asarray(n), jnp.asarray(ns), jnp.asarray(side)))
+    height = side * (out * n).sum(1)
+    assert height.min() > 0
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1, rtol=ROUNDING)
+    mirrored = d - 2 * (d * ns).sum(1)[:, None] * ns
+    high = side * (mirrored * n).sum(1) > 0.01 + ROUNDING
+    np.testing.assert_allclose(out[high], mirrored[high], atol=ROUNDING)
+    assert 0.1 < high.mean() < 0.9

@@ -1,0 +1,239 @@
+"""What a sweep measures, against counts by hand, and what it recommends."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.scene.views import shrunk
+from jaxhf.study.measure import DERIVATIVE_PIXELS, centre_hits, gradient_errors, picture_errors, wrong_share
+from jaxhf.study.pareto import curves, front, markdown, recommend
+from jaxhf.study.plan import KNOBS, Configuration, Measured, plan
+from jaxhf.study.plots import plot
+
+SCENES = Path(__file__).parents[2] / "scenes"
+SCENE = """samples = 1
+[camera]
+type = "orthographic"
+eye = [0.5, 0.2, 5]
+target = [0.5, 0.5, 0]
+up = [0, 1, 0]
+extent = 1.2
+width = 24
+height = 16
+[[lights]]
+type = "directional"
+[[objects]]
+shape = "heightfield"
+heights = [[0, 0.1, 0.3, 0], [0.2, 0, 0.1, 0.1], [0.1, 0.3, 0, 0.2]]
+"""
+
+
+def test_picture_errors_by_hand():
+    reference = np.full((10, 100, 3), 2.0)
+    image = reference.copy()
+    image[0, :5, 1] += 0.5  # five pixels of a thousand, one channel of three
+    errors = picture_errors(image, reference)
+    np.testing.assert_allclose(errors["rmse"], np.sqrt(0.25 * 5 / 3000) / 2)
+    np.testing.assert_allclose(errors["p999"], 0.25)
+    image[0, 0, 1] = reference[0, 0, 0]
+    image[0, 1:5, 1] = reference[0, 0, 0]
+    image[3, 3, 0] = 7.0  # one of a thousand: 99.9 % is next to it
+    assert picture_errors(image, reference)["p999"] < 2.5 * 0.01
+
+
+def test_wrong_share_by_hand():
+    found = np.zeros((8, 5), int)
+    reference = found.copy()
+    reference[2, 1] = reference[2, 3] = reference[5, 4] = 1
+    assert wrong_share(found, reference) == 2 / 8
+
+
+def test_gradient_errors_by_hand():
+    errors = gradient_errors(np.array([3.0, 0.0]), np.array([3.0, 4.0]))
+    np.testing.assert_allclose([errors["cosine"], errors["relative_error"]], [0.6, 0.8])
+    assert gradient_errors(np.zeros(2), np.ones(2)) == {"cosine": 0.0, "relative_error": 1.0}
+
+
+def test_centre_hits_are_those_of_the_aovs():
+    """A terrain that fills the middle of the picture only; its triangles from the place in the cell."""
+    heights = np.arange(12.0).reshape(3, 4) / 30
+    camera = jaxhf.Orthographic.look_at((0.5, 0.4, 5), (0.5, 0.5, 0), up=(0, 1, 0), extent=1.3, width=30, height=20)
+    scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera)
+    _, aovs = jaxhf.render(scene, aovs=("object", "cell", "status", "uv"))
+    hits = centre_hits(scene, jaxhf.Settings()).reshape(20, 30, 5)
+    np.testing.assert_array_equal(hits[..., 0], aovs["object"])
+    np.testing.assert_array_equal(hits[..., 1:3], aovs["cell"])
+    np.testing.assert_array_equal(hits[..., 4], aovs["status"])
+    met = hits[..., 0] >= 0
+    u, v = np.moveaxis(np.asarray(aovs["uv"]) * (3, 2) - np.asarray(aovs["cell"]), -1, 0)
+    np.testing.assert_array_equal(hits[..., 3][met], (v > u)[met])
+    assert 0.2 < met.mean() < 0.8
+    assert (hits[~met][:, :4] == -1).all()
+
+
+def row(task="picture", seconds=1.0, error=1.0, **knobs: str):
+    base = Configuration(task, tolerance=1e-4) if task == "fit" else Configuration(task)
+    name = "relative_error" if task == "derivative" else "rmse"
+    figures = {"seconds": seconds, "cpu_seconds": seconds, "against_base": seconds, "compile_seconds": 1.0, "peak_mb": 100.0}
+    figures |= {"p999": 0.0, "wrong_hits": 0.0, "cosine": 0.0, "spread": 0.1, name: error}
+    return Measured(task, base.knobs | knobs, figures)
+
+
+ROWS = [
+    row(seconds=1.0, error=0.1),
+    row(seconds=0.5, error=0.5, samples="1"),
+    row(seconds=0.7, error=0.6, shading="flat"),  # slower and worse than the one before
+    row(seconds=4.0, error=0.01, samples="16"),
+    row(seconds=5.0, error=0.01, samples="25"),  # slower and no better
+    row(task="derivative", seconds=2.0, error=0.3, edge_samples="1000"),
+    row(task="derivative", seconds=3.0, error=0.3, edge_samples="2000"),
+]
+
+
+def test_front_by_hand():
+    assert [one.figures["seconds"] for one in front(ROWS, "picture")] == [0.5, 1.0, 4.0]
+    assert front(ROWS, "fit") == []
+
+
+@pytest.mark.parametrize(
+    ("error", "seconds", "picture", "derivative"),
+    [
+        (0.2, None, "Settings(), float32: error 0.1, 1 s", "nothing that was measured keeps that; nearest is Settings(edge"),
+        (0.3, None, "Settings(), float32", "Settings(edge_samples=1000), float32: error 0.3, 2 s"),
+        (None, 3.0, "Settings(), float32", "Settings(edge_samples=1000)"),
+        (None, 9.0, "Settings(samples=16), float32: error 0.01", "Settings(edge_samples=1000)"),
+        (None, 0.1, "nothing that was measured keeps that; nearest is Settings(samples=1)", "nothing that was measured"),
+        (0.2, 0.6, "nothing that was measured keeps that", "nothing that was measured keeps that"),
+    ],
+)
+def test_recommendations_by_hand(error, seconds, picture, derivative):
+    lines = recommend(ROWS, error, seconds)
+    assert len(lines) == 2
+    assert lines[0].partition(": ")[2].startswith(picture)
+    assert lines[1].partition(": ")[2].startswith(derivative)
+
+
+def test_what_is_recommended_can_be_written_as_it_stands():
+    (line,) = recommend([row(samples="16", normals="four", shadows="False", max_steps="32")], 1.0, None)
+    settings = eval(line[line.index("Settings(") : line.index("), float32") + 1], {"Settings": jaxhf.Settings})
+    assert settings == jaxhf.Settings(samples=16, normals="four", shadows=False, max_steps=32)
+
+
+def test_curves_change_one_knob():
+    rows = [*ROWS, row(samples="4", shading="flat"), row(max_steps="8"), row(max_steps="16")]
+    found = curves(rows, "picture")
+    assert list(found) == ["samples", "shading", "max_steps"]
+    assert [value for value, _ in found["max_steps"]] == ["8", "16", "None"]
+    assert [value for value, _ in found["samples"]] == ["1", "16", "25", "None"]
+    assert [value for value, _ in found["shading"]] == ["flat", "smooth"]  # not with other samples as well
+
+
+def test_tables_and_plot_hold_every_row():
+    text = markdown(ROWS)
+    assert text.count("\n| ") == len(ROWS) + 1  # and the second table's head
+    assert "| **samples 16** | 0.01 |" in text
+    assert "| samples 25 | 0.01 |" in text
+    figure = plot(ROWS, "by hand")
+    titles = {axes.get_title() for axes in figure.axes} - {""}
+    assert titles == {
+        "picture", "derivative", "picture: samples", "picture: shading", "derivative: edge_samples",
+    }  # fmt: skip
+
+
+def knobs_of(sweep):
+    base = sweep.configurations[0].knobs
+    return [
+        {knob for knob in KNOBS if one.knobs[knob] != base[knob]} for one in sweep.configurations if one.task == "picture"
+    ]  # fmt: skip
+
+
+def test_plan_sweeps_what_the_scene_has():
+    landsea, texture, debug = (plan(SCENES / f"{name}.toml") for name in ("landsea", "texture", "debug4x4"))
+    swept = {knob for changed in knobs_of(landsea) for knob in changed}
+    assert swept == {
+        "precision", "traversal", "max_steps", "samples", "shading", "normals", "shadows", "max_depth", "chunk",
+    }  # fmt: skip
+    assert {knob for changed in knobs_of(texture) for knob in changed} == swept - {"max_depth"}
+    assert knobs_of(texture)[0] == set()
+    assert len(set(debug.configurations)) == len(debug.configurations)
+    assert (landsea.width, landsea.height) == (480, 270)
+    assert {one.task for one in landsea.configurations} == {"picture", "derivative"}
+
+
+def test_plan_has_no_shadows_under_a_sky_alone(tmp_path):
+    (tmp_path / "a.toml").write_text(SCENE.replace('type = "directional"', 'type = "sky"\nradiance = 0.5'))
+    assert not any("shadows" in changed for changed in knobs_of(plan(tmp_path / "a.toml")))
+
+
+def test_plan_of_some_knobs():
+    sweep = plan(SCENES / "texture.toml", knobs=("samples", "shading"), quick=True, width=96)
+    assert (sweep.width, sweep.height) == (96, 72)
+    assert {frozenset(changed) for changed in knobs_of(sweep)} == {
+        frozenset(), frozenset({"samples"}), frozenset({"shading"}), frozenset({"samples", "shading"}),
+    }  # fmt: skip
+    assert len(plan(SCENES / "texture.toml", knobs=("edge_samples",)).configurations) == 5
+    fits = plan(SCENES / "texture.toml", knobs=("shading",), fits=True).configurations
+    assert [one.tolerance for one in fits if one.task == "fit"] == [1e-4, 1e-2, 1e-3, 1e-5, 1e-4]
+    fits = plan(SCENES / "texture.toml", knobs=("levels",)).configurations
+    assert [(one.task, one.levels) for one in fits] == [("picture", None), ("fit", None), ("fit", (1.0,))]
+
+
+@pytest.mark.parametrize(
+    ("samples", "quick", "expected"), [(1, False, 256), (1, True, 64), (64, True, 256), (256, False, 1024)]
+)
+def test_the_reference_is_finer_than_the_base(tmp_path, samples, quick, expected):
+    (tmp_path / "a.toml").write_text(SCENE.replace("samples = 1", f"samples = {samples}"))
+    assert plan(tmp_path / "a.toml", quick=quick).reference_samples == expected
+
+
+def test_plan_refuses_fits_of_holes(tmp_path):
+    np.save(tmp_path / "hole.npy", np.array([[0, 0.1, 0.3], [0.2, np.nan, 0.1]]))
+    (tmp_path / "a.toml").write_text(SCENE[: SCENE.index("heights = ")] + 'file = "hole.npy"\n')
+    with pytest.raises(ValueError, match=r"a\.toml: a fit's terrain must be without holes, this one has 1"):
+        plan(tmp_path / "a.toml", fits=True)
+    assert plan(tmp_path / "a.toml").configurations
+
+
+def test_identity(tmp_path):
+    """It tells scenes, sizes and devices apart, and does not mind where the file lies or which knobs are asked for."""
+
+    def identity(text=SCENE, name="a.toml", **options):
+        (tmp_path / name).write_text(text)
+        return plan(tmp_path / name, devices=options.pop("devices", 1), **options).identity
+
+    one = identity()
+    assert one == identity(name="b.toml", knobs=("samples",))
+    others = [
+        identity(SCENE.replace("0.3", "0.31")), identity(SCENE.replace("extent = 1.2", "extent = 1.3")), identity(width=20),
+        identity(devices=2), identity(quick=True), identity(SCENE + "dx = 0.5\n"),
+    ]  # fmt: skip
+    assert len({one, *others}) == 7
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"knobs": ("sample",)}, r"knobs must be among .*'sample'"),
+        ({"width": 0}, r"width must be a whole number from 1 on, it is 0"),
+        ({"devices": -1}, r"devices must be .* it is -1"),
+    ],
+)
+def test_plan_refuses(options, message):
+    with pytest.raises(ValueError, match=message):
+        plan(SCENES / "texture.toml", **options)
+
+
+def test_plan_refuses_a_scene_without_terrain(tmp_path):
+    text = SCENE[: SCENE.index("[[objects]]")] + '[[objects]]\nshape = "cylinder"\n'
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(ValueError, match=r"a\.toml: there is no heightfield"):
+        plan(tmp_path / "a.toml")
+
+
+def test_derivatives_are_measured_in_a_small_picture(tmp_path):
+    scene = jaxhf.load_scene(SCENES / "texture.toml")  # 480 x 360
+    small = shrunk(scene, DERIVATIVE_PIXELS)
+    assert (small.camera.width, small.camera.height) == (160, 120)
+    assert (shrunk(small, 1000).camera.width, scene.camera.width) == (160, 480)
