@@ -39,7 +39,7 @@ def without_bounds() -> None:
     import equinox as eqx
     import jax.numpy as jnp
 
-    from jaxhf.trace import search as _march, walk as _walk, world as _world
+    from jaxhf.trace import search as _search, walk as _walk, world as _world
 
     make_grid = _world.make_grid
 
@@ -47,7 +47,7 @@ def without_bounds() -> None:
         grid = make_grid(*arguments, **options)
         return eqx.tree_at(lambda grid: grid.pyramid.bounds, grid, jnp.zeros(0, grid.z_top.dtype))
 
-    _march._SKIPS = 0
+    _search._SKIPS = 0
     _walk.Walk.skip = lambda self, state: state
     _world.make_grid = grid_of
 

@@ -70,19 +70,19 @@ MUTATIONS = {
     ),
     "derivative of the hit": Mutation(
         "trace/intersect.py",
-        "t = distance(plane, ray, found)",
-        "t = lax.stop_gradient(distance(plane, ray, found))",
+        "t = plane_distance(plane, ray, found)",
+        "t = lax.stop_gradient(plane_distance(plane, ray, found))",
         "rendering/test_gradient.py::test_every_leaf_pixel_by_pixel[parallel]",
     ),
     "which vertices a sample shows": Mutation(
         "fitting/linearise.py",
-        "before + jnp.stack(here)",
+        "first + jnp.stack(here)",
         "jnp.stack(here)",
         "fitting/test_linearise.py::test_matrix_is_the_derivative_of_render[flat, several objects]",
     ),
-    "pixels looked at again": Mutation(
+    "resampled pixels": Mutation(
         "fitting/linearise.py",
-        ".at[edges.pixels].set(finer, unique_indices=True)",
+        ".at[edges.resampled].set(finer, unique_indices=True)",
         "",
         "fitting/test_linearise.py::test_matrix_is_the_derivative_of_render[smooth with edges]",
     ),

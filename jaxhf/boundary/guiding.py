@@ -1,4 +1,4 @@
-"""Which edges may bound something in the picture, and by what chance each is drawn."""
+"""The distribution from which edges are drawn: by how much each is expected to change the picture as it moves."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
-from ..core.settings import Settings
+from ..core.settings import Shading
 from ..core.types import Index
 from ..core.vector import unit
 from ..scene.camera import Camera
@@ -16,14 +16,14 @@ from ..trace.grid import Grid
 from ..trace.world import World
 from .silhouette import EdgeFlags, Viewpoint, all_edges, lit_lengths, seen_lengths, silhouettes
 
-# The sum of the whole numbers that edges are drawn by: below 2^31 with room for rounding up.
-_TICKETS = 2**30
+# The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
+_TOTAL_WEIGHT = 2**30
 # Vertices along the side of the blocks over which a first round of draws is averaged.
 _BLOCK = 8
 
 
-class Source(NamedTuple):
-    """The edges of one surface, where they stand (`light` None) or cast by a light; `first` is the number of its first."""
+class EdgeSet(NamedTuple):
+    """The edges of one surface, seen where they stand (`light` None) or by their shadow; `first` is the number of its first."""
 
     surface: int
     light: int | None
@@ -36,33 +36,35 @@ class Source(NamedTuple):
         return self.first + 3 * self.ny * self.nx
 
 
-def sources(world: World, settings: Settings) -> tuple[Source, ...]:
+def edge_sets(world: World) -> tuple[EdgeSet, ...]:
     """All edges of the scene that may bound something, in one numbering. A cylinder has none."""
     found, first = [], 0
-    casting = [number for number, light in enumerate(world.lights) if not isinstance(light, Sky)] if settings.shadows else []
+    casting = (
+        [number for number, light in enumerate(world.lights) if not isinstance(light, Sky)] if world.settings.shadows else []
+    )
     for k, surface in enumerate(world.surfaces):
         if not isinstance(surface, Grid):
             continue
         for light in (None, *casting):
             ny, nx = surface.shape
-            found.append(Source(k, light, first, ny, nx))
+            found.append(EdgeSet(k, light, first, ny, nx))
             first = found[-1].end
     return tuple(found)
 
 
-def plain_weights(world: World, camera: Camera, settings: Settings) -> Float[jax.Array, " edges"]:
-    """How much each edge may count, as far as can be told without a ray; those of a source sum to one, or are zero."""
+def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
+    """Weights of the edges by their lengths as seen or lit, without tracing a ray; those of a set sum to one, or are zero."""
     lights = {number: _viewpoint(light) for number, light in enumerate(world.lights) if not isinstance(light, Sky)}
     weights = []
-    for source in sources(world, settings):
-        surface = world.surfaces[source.surface]
+    for edges in edge_sets(world):
+        surface = world.surfaces[edges.surface]
         assert isinstance(surface, Grid)
-        if source.light is None:
-            flags = _standing(surface, camera, list(lights.values()), settings)
+        if edges.light is None:
+            flags = _standing(surface, camera, list(lights.values()), world.settings.shading)
             lengths = seen_lengths(surface, camera)
         else:
-            flags = silhouettes(surface, lights[source.light])
-            lengths = lit_lengths(surface, lights[source.light])
+            flags = silhouettes(surface, lights[edges.light])
+            lengths = lit_lengths(surface, lights[edges.light])
         lengths = jnp.where(flags, lengths, 0).ravel()
         largest = jnp.max(lengths)
         lengths = lengths / jnp.where(largest > 0, largest, 1)
@@ -71,9 +73,9 @@ def plain_weights(world: World, camera: Camera, settings: Settings) -> Float[jax
     return jnp.concatenate(weights)
 
 
-def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], settings: Settings) -> EdgeFlags:
+def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], shading: Shading) -> EdgeFlags:
     """Edges across which what is seen jumps at the edge itself; one that is a silhouette for several counts once."""
-    if settings.shading == "flat":
+    if shading == "flat":
         return all_edges(grid)
     flags = silhouettes(grid, Viewpoint(*camera.viewpoint()))
     for light in lights:
@@ -85,56 +87,54 @@ def _viewpoint(light: Directional | Point) -> Viewpoint:
     return Viewpoint(light.p, True) if isinstance(light, Point) else Viewpoint(unit(light.towards), False)
 
 
-class Lottery(eqx.Module):
-    """Edges to be drawn in proportion to whole numbers, their tickets.
+class GuidingDistribution(eqx.Module):
+    """A discrete distribution over the edges, with integer weights, for stratified sampling.
 
-    A running sum of a million weights loses small ones in single precision; one of whole numbers is exact, and so is the
-    chance that follows from it.
+    A running sum of a million weights loses small ones in single precision; one of integers is exact, and so are the
+    probabilities that follow from it.
 
     Attributes:
-      cumulative: the number of tickets up to and with each edge.
-      stratum: tickets in each of the strata, of which every draw takes one.
+      cumulative: the sum of the weights up to and with each edge.
+      stratum: the weight of each stratum; every draw has a stratum of its own.
     """
 
     cumulative: Int[jax.Array, " edges"]
     stratum: Index
 
 
-def make_lottery(weights: Float[jax.Array, " edges"], draws: Index) -> Lottery:
-    """Every edge with a weight gets a ticket at least."""
+def make_distribution(weights: Float[jax.Array, " edges"], draws: Index) -> GuidingDistribution:
+    """The distribution in proportion to `weights`, in as many strata as there are draws; no positive weight becomes zero."""
     count = weights.shape[0]
-    if count >= _TICKETS // 2:
-        raise ValueError(f"Settings: edge_samples works for fewer than {_TICKETS // 2} edges, the scene has {count}")
+    if count >= _TOTAL_WEIGHT // 2:
+        raise ValueError(f"Settings: edge_samples works for fewer than {_TOTAL_WEIGHT // 2} edges, the scene has {count}")
     total = jnp.sum(weights)
-    tickets = jnp.ceil(weights / jnp.where(total > 0, total, 1) * (_TICKETS - count)).astype(jnp.int32)
-    cumulative = jnp.cumsum(tickets, dtype=jnp.int32)
-    return Lottery(cumulative, jnp.maximum((cumulative[-1] + draws - 1) // draws, 1))
+    integers = jnp.ceil(weights / jnp.where(total > 0, total, 1) * (_TOTAL_WEIGHT - count)).astype(jnp.int32)
+    cumulative = jnp.cumsum(integers, dtype=jnp.int32)
+    return GuidingDistribution(cumulative, jnp.maximum((cumulative[-1] + draws - 1) // draws, 1))
 
 
 def refined_weights(
     world: World,
-    settings: Settings,
     weights: Float[jax.Array, " edges"],
     edge: Int[jax.Array, " n"],
     found: Float[jax.Array, " n"],
 ) -> Float[jax.Array, " edges"]:
-    """The weights times what a first round of draws from them has found on each edge.
+    """The weights times an estimate, from a first round of draws, of the change that each edge makes per unit of weight.
 
-    Where an edge has few draws, the mean over its block of cells counts, and where that has few, the mean over all: as if each
-    edge had one draw more, with the mean of its block. No edge that may count loses all its weight, so nothing is biased;
-    where nothing was found at all, the weights stay as they are.
+    Shrinks each edge's estimate towards the mean of its 8x8 block, and that towards the global mean, with one pseudo-count
+    each; no weight becomes zero, so the estimator stays unbiased. Where nothing was found at all, the weights stay as they are.
 
     Args:
-      world, settings: for `sources`.
-      weights: `plain_weights`.
-      edge, found: of each draw, its edge and the change that it stands for.
+      world: for `edge_sets`.
+      weights: `initial_weights`.
+      edge, found: of each draw, its edge and the size of the change that it contributes.
     """
     none = jnp.zeros_like(weights)
     draws, sums = none.at[edge].add(1), none.at[edge].add(found)
     everywhere = jnp.mean(found)
     refined = []
-    for source in sources(world, settings):
-        n, total = (value[source.first : source.end].reshape(3, source.ny, source.nx) for value in (draws, sums))
+    for edges in edge_sets(world):
+        n, total = (value[edges.first : edges.end].reshape(3, edges.ny, edges.nx) for value in (draws, sums))
         n_block, total_block = _over_blocks(n), _over_blocks(total)
         mean = (jnp.sum(total) + everywhere) / (jnp.sum(n) + 1)
         mean = (total_block + mean) / (n_block + 1)

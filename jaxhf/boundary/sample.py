@@ -8,7 +8,7 @@ sampling, SIGGRAPH Asia 2018, equation 5; for shadows Zhang et al., Path-space d
 
 On a heightfield every boundary is the image of edges: of those that separate triangles facing the eye or a light from
 triangles facing away, where they stand; and of the latter's shadows. A point is drawn on such an edge and followed to its
-place x in the picture by plain arithmetic, which carries the derivative; all else is discrete or held constant.
+position x in the picture by plain arithmetic, which carries the derivative; all else is discrete or held constant.
 docs/gradients.md derives this.
 """
 
@@ -19,35 +19,36 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from ..core.affine import affine
+from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
-from ..core.settings import Settings
 from ..core.types import Flag, Index, Point2, Scalar, Vector
-from ..core.vector import largest_component, power_of_two, unit
+from ..core.vector import largest_component, unit
 from ..scene.camera import Camera
 from ..scene.light import Point, Sky
 from ..trace.cylinder import tube_distance
 from ..trace.grid import Grid, triangle_plane
+from ..trace.hit import Hit
 from ..trace.status import Status
-from ..trace.triangle import plane_through, triangle_corners, triangle_places
-from ..trace.world import Vertex, World, first_vertex, nowhere
-from .guiding import Lottery, sources
+from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
+from ..trace.world import World, first_hit, no_hit
+from .guiding import GuidingDistribution, edge_sets
 from .silhouette import STEPS, framed_part
 
 
-class EdgePoint(eqx.Module):
-    """A point on an edge, and where its shadow falls. Discrete, but for its place along the edge.
+class BoundarySample(eqx.Module):
+    """A point sampled on an edge, and where its shadow falls. All of it is discrete but `s`, the position along the edge.
 
     Attributes:
       valid: whether there is such a point, and it can be seen in the picture but for what hides it.
-      edge: its number, see `sources`.
-      surface: whose edge it is.
-      light: by which it is cast; -1: it is seen where it stands.
+      edge: its number, see `edge_sets`.
+      surface: the object whose edge it is.
+      light: the one that casts its shadow; -1: it is seen where it stands.
       start, end: the edge's vertices, (ix, iy).
-      s: the place between them, 0..1.
-      measure: of s for which this point stands: one over the density with which it was drawn.
-      receiver: the surface on which its shadow falls.
+      s: the position between them, 0..1.
+      measure: the reciprocal of the probability density of s.
+      receiver: the object on which its shadow falls.
       cell, upper: the triangle there.
-      t: how far away that is.
+      t: the distance to it, along the light's direction.
     """
 
     valid: Flag
@@ -64,32 +65,32 @@ class EdgePoint(eqx.Module):
     t: Scalar
 
 
-def draw(world: World, camera: Camera, settings: Settings, lottery: Lottery, k: Index, u: Point2) -> EdgePoint:
-    """The k-th stratum's point; `u` are two numbers in 0..1 that choose its ticket and its place in the ticket's part."""
+def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u: Point2) -> BoundarySample:
+    """The sample of the k-th stratum, from two uniform random numbers."""
     dtype = u.dtype
-    ticket = jnp.minimum((u[0] * lottery.stratum.astype(dtype)).astype(jnp.int32), lottery.stratum - 1)
-    ticket = ticket + k * lottery.stratum
-    cumulative = lottery.cumulative
-    edge = jnp.searchsorted(cumulative, ticket, side="right").astype(jnp.int32)
-    valid = ticket < cumulative[-1]
+    chosen = jnp.minimum((u[0] * guiding.stratum.astype(dtype)).astype(jnp.int32), guiding.stratum - 1)
+    chosen = chosen + k * guiding.stratum  # of the integers that the weights add up to
+    cumulative = guiding.cumulative
+    edge = jnp.searchsorted(cumulative, chosen, side="right").astype(jnp.int32)
+    valid = chosen < cumulative[-1]
     edge = jnp.minimum(edge, cumulative.shape[0] - 1)
     before = jnp.where(edge > 0, cumulative[jnp.maximum(edge - 1, 0)], 0)
-    held = jnp.maximum(cumulative[edge] - before, 1)
-    s = ((ticket - before).astype(dtype) + u[1]) / held.astype(dtype)
-    measure = lottery.stratum.astype(dtype) / held.astype(dtype)
+    weight = jnp.maximum(cumulative[edge] - before, 1)
+    s = ((chosen - before).astype(dtype) + u[1]) / weight.astype(dtype)
+    measure = guiding.stratum.astype(dtype) / weight.astype(dtype)
 
     none = jnp.zeros((), jnp.int32)
     surface, light, kind, ix, iy = none, none - 1, none, none, none
-    for source in sources(world, settings):
-        here = (edge >= source.first) & (edge < source.end)
-        local, area = edge - source.first, source.ny * source.nx
-        surface = jnp.where(here, source.surface, surface)
-        light = jnp.where(here, -1 if source.light is None else source.light, light)
+    for edges in edge_sets(world):
+        here = (edge >= edges.first) & (edge < edges.end)
+        local, area = edge - edges.first, edges.ny * edges.nx
+        surface = jnp.where(here, edges.surface, surface)
+        light = jnp.where(here, -1 if edges.light is None else edges.light, light)
         kind = jnp.where(here, local // area, kind)
-        ix, iy = jnp.where(here, local % source.nx, ix), jnp.where(here, local % area // source.nx, iy)
+        ix, iy = jnp.where(here, local % edges.nx, ix), jnp.where(here, local % area // edges.nx, iy)
     steps = jnp.array(STEPS, jnp.int32)
     start = jnp.stack([ix, iy])
-    point = EdgePoint(
+    point = BoundarySample(
         valid=valid, edge=edge, surface=surface, light=light, start=start, end=start + steps[kind], s=s, measure=measure,
         receiver=none, cell=jnp.zeros(2, jnp.int32), upper=jnp.zeros((), bool), t=jnp.zeros((), dtype),
     )  # fmt: skip
@@ -106,33 +107,33 @@ def draw(world: World, camera: Camera, settings: Settings, lottery: Lottery, k: 
     )
 
 
-def cast_shadow(world: World, point: EdgePoint, settings: Settings) -> EdgePoint:
-    """Follows the light past the point to what its shadow falls on. No derivative."""
+def cast_shadow(world: World, point: BoundarySample) -> BoundarySample:
+    """The sample with the triangle on which its shadow falls, found by a ray along the light. No derivative."""
     p = _on_edge(world, point, point.s)
     away = _away_from_light(world, point, p)
-    origin = _departure(world, point, away)
+    leaving = _lit_side(world, point, away)
     casts = point.valid & (point.light >= 0)
-    vertex = first_vertex(world, Ray(p, away), settings, origin, casts)
-    met = vertex.hit.status == int(Status.HIT)
+    hit = first_hit(world, Ray(p, away), leaving, casts)
+    met = hit.status == int(Status.HIT)
     return eqx.tree_at(
         lambda point: (point.valid, point.receiver, point.cell, point.upper, point.t),
         point,
         (
             point.valid & (met | (point.light < 0)),
-            jnp.maximum(vertex.index, 0),
-            vertex.hit.cell,
-            vertex.hit.triangle == 1,
-            jnp.where(met, vertex.hit.t, 0),
+            jnp.maximum(hit.object, 0),
+            hit.cell,
+            hit.triangle == 1,
+            jnp.where(met, hit.t, 0),
         ),
     )
 
 
-def _departure(world: World, point: EdgePoint, away: Vector) -> Vertex:
-    """The edge's triangle over which the light goes on, as what it leaves: it cannot be met again.
+def _lit_side(world: World, point: BoundarySample, away: Vector) -> Hit:
+    """A hit on the edge's triangle over which the light goes on, for a ray that leaves it and so cannot meet it again.
 
     On an edge with exactly one triangle facing the light, the light passes both on the same side.
     """
-    origin = nowhere(away.dtype)
+    leaving = no_hit(away.dtype)
     ix, iy = point.start[0], point.start[1]
     along_x, along_y = point.end[1] == iy, point.end[0] == ix
     for k, grid in enumerate(world.surfaces):
@@ -152,8 +153,8 @@ def _departure(world: World, point: EdgePoint, away: Vector) -> Vertex:
         x, y = _between_ends(point, point.s)
         cells_x, cells_y = grid.cells
         here = eqx.tree_at(
-            lambda vertex: (vertex.hit.cell, vertex.hit.triangle, vertex.hit.side, vertex.hit.uv, vertex.index),
-            origin,
+            lambda hit: (hit.cell, hit.triangle, hit.side, hit.uv, hit.object),
+            leaving,
             (
                 jnp.stack([cell_x, cell_y]),
                 upper.astype(jnp.int32),
@@ -162,8 +163,8 @@ def _departure(world: World, point: EdgePoint, away: Vector) -> Vertex:
                 jnp.full((), k, jnp.int32),
             ),
         )
-        origin = jax.tree.map(lambda new, old, k=k: jnp.where(point.surface == k, new, old), here, origin)
-    return origin
+        leaving = jax.tree.map(lambda new, old, k=k: jnp.where(point.surface == k, new, old), here, leaving)
+    return leaving
 
 
 def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
@@ -173,14 +174,14 @@ def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
     return (x == ix) & (y == iy) & jnp.isfinite(z[y, x] + z[y, x + 1] + z[y + 1, x] + z[y + 1, x + 1])
 
 
-def _between_ends(point: EdgePoint, s: Scalar) -> tuple[Scalar, Scalar]:
+def _between_ends(point: BoundarySample, s: Scalar) -> tuple[Scalar, Scalar]:
     a, b = point.start.astype(s.dtype), point.end.astype(s.dtype)
     return a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1])
 
 
 def _on_edge(
     world: World,
-    point: EdgePoint,
+    point: BoundarySample,
     s: Scalar,
     lift: Scalar | None = None,
     perturbation: Float[jax.Array, "5"] | None = None,
@@ -190,7 +191,7 @@ def _on_edge(
     for k, grid in enumerate(world.surfaces):
         if isinstance(grid, Grid):
             x, y = _between_ends(point, s)
-            z0, z1 = (grid.rows.at[place].get(mode="clip") for place in _ends(grid, point))
+            z0, z1 = (grid.rows.at[end].get(mode="clip") for end in _ends(grid, point))
             if perturbation is not None:
                 z0, z1 = z0 + perturbation[0], z1 + perturbation[1]
             z0, z1 = (jnp.where(jnp.isfinite(z), z, 0) for z in (z0, z1))
@@ -201,33 +202,33 @@ def _on_edge(
     return chosen
 
 
-def _ends(grid: Grid, point: EdgePoint) -> tuple[Index, Index]:
-    """Where the ends of the edge are in the rows of its grid."""
+def _ends(grid: Grid, point: BoundarySample) -> tuple[Index, Index]:
+    """The numbers of the edge's two vertices in its grid, row by row."""
     start, end = (vertex[1] * grid.shape[1] + vertex[0] for vertex in (point.start, point.end))
     return start, end
 
 
-def _receiving_cell(grid: Grid, point: EdgePoint) -> Int[jax.Array, "2"]:
+def _receiving_cell(grid: Grid, point: BoundarySample) -> Int[jax.Array, "2"]:
     """In range also where the shadow falls on another surface."""
     return jnp.clip(point.cell, 0, jnp.array(grid.cells, jnp.int32) - 1)
 
 
-def deciding_vertices(world: World, point: EdgePoint) -> Int[jax.Array, "5"]:
-    """The vertices on whose heights the point's place in the picture depends, numbered over all surfaces.
+def deciding_vertices(world: World, point: BoundarySample) -> Int[jax.Array, "5"]:
+    """The vertices on whose heights the position in the picture depends, numbered over all grids.
 
     The edge's two; and the three of the triangle on which its shadow falls.
     """
-    places = jnp.zeros(5, jnp.int32)
+    vertices = jnp.zeros(5, jnp.int32)
     for k, grid, before in world.grids:
         cell = _receiving_cell(grid, point)
         ends = jnp.clip(jnp.stack(_ends(grid, point)), 0, grid.rows.shape[0] - 1)
-        triangle = jnp.stack(triangle_places(grid.shape[1], cell[0], cell[1], point.upper))
+        triangle = jnp.stack(triangle_vertices(grid.shape[1], cell[0], cell[1], point.upper))
         here = jnp.stack([point.surface == k] * 2 + [point.receiver == k] * 3)
-        places = jnp.where(here, before + jnp.concatenate([ends, triangle]), places)
-    return places
+        vertices = jnp.where(here, before + jnp.concatenate([ends, triangle]), vertices)
+    return vertices
 
 
-def _away_from_light(world: World, point: EdgePoint, p: Vector) -> Vector:
+def _away_from_light(world: World, point: BoundarySample, p: Vector) -> Vector:
     """The unit direction in which light goes on past p."""
     chosen = jnp.zeros_like(p)
     for number, light in enumerate(world.lights):
@@ -237,7 +238,7 @@ def _away_from_light(world: World, point: EdgePoint, p: Vector) -> Vector:
     return chosen
 
 
-def _fallen(world: World, point: EdgePoint, p: Vector, perturbation: Float[jax.Array, "5"] | None = None) -> Vector:
+def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Float[jax.Array, "5"] | None = None) -> Vector:
     """Where the light past p meets the triangle that was found; differentiable."""
     away = _away_from_light(world, point, p)
     near = p + jnp.where(point.valid, point.t, 0) * away
@@ -254,7 +255,7 @@ def _fallen(world: World, point: EdgePoint, p: Vector, perturbation: Float[jax.A
             u, v = local.o[0] - cell[0].astype(p.dtype), local.o[1] - cell[1].astype(p.dtype)
             # At a length around one, as the derivative has the slope's square in it; a power of two changes no bit.
             size = largest_component(local.d)
-            size = power_of_two(jnp.where(size > 0, size, 1))
+            size = floor_to_power_of_two(jnp.where(size > 0, size, 1))
             d = local.d / size
             slope = d[2] - a * d[0] - b * d[1]
             grazing = (slope == 0) | ~point.valid
@@ -269,21 +270,20 @@ def _fallen(world: World, point: EdgePoint, p: Vector, perturbation: Float[jax.A
 def picture_point(
     world: World,
     camera: Camera,
-    settings: Settings,
-    point: EdgePoint,
+    point: BoundarySample,
     s: Scalar,
     lift: Scalar | None = None,
     perturbation: Float[jax.Array, "5"] | None = None,
 ) -> tuple[Point2, Flag]:
-    """Where the point, or its shadow, is in the picture, and whether within its frame; differentiable.
+    """The position of the sample, or of its shadow, in the picture (pixels), and whether it is in the frame; differentiable.
 
     In every leaf of the scene, and in s while the shadow stays in its triangle; in `perturbation`, which is added to the
     heights at its `deciding_vertices`.
     """
     p = _on_edge(world, point, s, lift, perturbation)
-    if any(source.light is not None for source in sources(world, settings)):
+    if any(edges.light is not None for edges in edge_sets(world)):
         p = jnp.where(point.light >= 0, _fallen(world, point, p, perturbation), p)
-    # Of a point that does not count, a place may be larger than any number, and its derivative, times zero, none.
+    # Of a point that does not count, the position may be larger than any number, and its derivative, times zero, none.
     ahead = affine(jnp.asarray(camera.world_from_camera)).point(jnp.array([0, 0, 1], p.dtype))
     at = camera.film_from_world()(jnp.where(point.valid, p, lax.stop_gradient(ahead)))
     before = (at[2] > 0) & (at[3] > 0)
@@ -292,14 +292,14 @@ def picture_point(
     return x, point.valid & before & (x >= 0).all() & (x < size).all()
 
 
-class Crossing(eqx.Module):
-    """A point's place in the picture.
+class BoundarySegment(eqx.Module):
+    """The boundary in the picture round a sample of it.
 
     Attributes:
-      valid: whether it has one.
-      x: pixels from the top left corner.
-      across: normal to the boundary, of the length by which the place moves with s.
-      sides: the places x - eps n and x + eps n, n being the unit normal.
+      valid: whether the sample is in the picture.
+      x: its position, pixels from the top left corner.
+      across: normal to the boundary, of length |dx/ds|.
+      sides: the positions x - eps n and x + eps n, n being the unit normal.
       speed: at which the boundary moves in the picture as the edge is lifted, pixels by the grid's unit of height.
     """
 
@@ -310,13 +310,15 @@ class Crossing(eqx.Module):
     speed: Scalar
 
 
-def make_crossing(world: World, camera: Camera, settings: Settings, point: EdgePoint) -> Crossing:
-    def place(s: Scalar) -> tuple[Point2, Flag]:
-        return picture_point(world, camera, settings, point, s)
+def boundary_segment(world: World, camera: Camera, point: BoundarySample) -> BoundarySegment:
+    """The boundary round a sample: its position in the picture, its normal and its speed, by forward differentiation."""
 
-    x, along, valid = jax.jvp(place, (point.s,), (jnp.ones_like(point.s),), has_aux=True)
+    def position(s: Scalar) -> tuple[Point2, Flag]:
+        return picture_point(world, camera, point, s)
+
+    x, along, valid = jax.jvp(position, (point.s,), (jnp.ones_like(point.s),), has_aux=True)
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
-    # Of what would cross the whole picture within less than the rounding of s, no place is known.
+    # Of what would cross the whole picture within less than the rounding of s, no position is known.
     valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)
     x = jnp.where(valid, x, 0)
     across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
@@ -324,17 +326,17 @@ def make_crossing(world: World, camera: Camera, settings: Settings, point: EdgeP
     step = n * side_step(camera, x.dtype)
 
     def lifted(lift: Scalar) -> Point2:
-        return picture_point(world, camera, settings, point, point.s, lift)[0]
+        return picture_point(world, camera, point, point.s, lift)[0]
 
     _, motion = jax.jvp(lifted, (jnp.zeros_like(point.s),), (jnp.ones_like(point.s),))
     speed = jnp.abs(n[0] * motion[0] + n[1] * motion[1])
-    return Crossing(valid, x, across, jnp.stack([x - step, x + step]), jnp.where(valid & jnp.isfinite(speed), speed, 0))
+    return BoundarySegment(valid, x, across, jnp.stack([x - step, x + step]), jnp.where(valid & jnp.isfinite(speed), speed, 0))
 
 
-def side_ray(camera: Camera, crossing: Crossing, side: Point2) -> Ray:
-    """The camera's ray beside a boundary; one that goes nowhere, and costs nothing, where there is no crossing."""
+def side_ray(camera: Camera, segment: BoundarySegment, side: Point2) -> Ray:
+    """The camera's ray beside a boundary; without a direction, so that it costs nothing, where the segment is not valid."""
     ray = camera.ray(side[0], side[1])
-    return Ray(ray.o, jnp.where(crossing.valid, ray.d, 0))
+    return Ray(ray.o, jnp.where(segment.valid, ray.d, 0))
 
 
 def side_step(camera: Camera, dtype) -> float:

@@ -23,7 +23,7 @@ EdgeWeights = Float[jax.Array, "3 ny nx"]
 
 
 class Viewpoint(eqx.Module):
-    """An eye or a light: at the place `v`, or infinitely far away in the direction `v`; world frame."""
+    """An eye or a light: at the point `v`, or infinitely far away in the direction `v`; world frame."""
 
     v: Vector
     at_place: bool = eqx.field(static=True)
@@ -81,7 +81,7 @@ def _vertices(grid: Grid) -> tuple[jax.Array, jax.Array]:
 
 
 def _ends(values: Float[jax.Array, "ny nx"]) -> tuple[EdgeWeights, EdgeWeights]:
-    """What stands at the two ends of every edge."""
+    """The values at the two ends of every edge."""
     ny, nx = values.shape
     padded = jnp.pad(values, ((0, 1), (0, 1)), mode="edge")
     return jnp.stack([values] * 3), jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS])
@@ -133,7 +133,7 @@ def _inside(camera: Camera, at: Any) -> tuple[jax.Array, ...]:
 
 
 def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:
-    """How long every edge looks from a light: its length across the light, for one at a place as an angle."""
+    """The length of every edge as seen from a light: projected across its direction; for a point light, as an angle."""
     z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
     x, y = _vertices(grid)
     (x0, x1), (y0, y1), (z0, z1) = _ends(x), _ends(y), _ends(z)

@@ -1,4 +1,4 @@
-"""The derivative that moving boundaries add to a picture: many points on edges, drawn, followed and summed.
+"""The boundary term of a picture's derivative: samples of moving boundaries, drawn, traced and summed.
 
 And a finer look at the pixels in which they were seen. Beside a silhouette the interior derivative is as large as one over a
 cosine, and at a shadow it ends: a few pixels hold nearly all of its error.
@@ -14,102 +14,108 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
-from ..core.devices import map_over
-from ..core.materialise import stored
+from ..core.devices import map_over, on_every_device
+from ..core.materialise import materialise
 from ..core.sampling import sample_offset
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..shade.radiance import radiance
 from ..trace.world import World
-from .guiding import Lottery, make_lottery, plain_weights, refined_weights
-from .sample import Crossing, EdgePoint, cast_shadow, draw, make_crossing, picture_point, side_ray
+from .guiding import GuidingDistribution, initial_weights, make_distribution, refined_weights
+from .sample import BoundarySample, BoundarySegment, boundary_segment, cast_shadow, draw, picture_point, side_ray
 
-# Of this many rounds of points on edges, the first finds out which edges count.
+# The first of this many rounds of samples only refines the guiding distribution.
 _ROUNDS = 4
-# Samples along a pixel's side where it is looked at again; twice the picture's, where that is more.
-_FINER = 8
+# Samples along a pixel's side where its interior derivative is resampled; twice the picture's, where that is more.
+_RESAMPLED_SIDE = 8
 
 
-def moving_boundaries(
-    world: World,
-    camera: Camera,
-    settings: Settings,
-    key: jax.Array,
-    mesh: Mesh,
-    image: Float[jax.Array, "h w 3"],
+def default_key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
+    """The key of the random numbers, a fixed one where the caller gives none; None where the settings draw none."""
+    if not settings.edge_samples:
+        return None
+    return on_every_device(jax.random.key(0) if key is None else key, mesh)
+
+
+def boundary_term(
+    world: World, camera: Camera, key: jax.Array, mesh: Mesh, image: Float[jax.Array, "h w 3"]
 ) -> Float[jax.Array, "h w 3"]:
-    """An image that means nothing, but whose derivative is what is to be added to that of the picture `image`."""
-    drawn = draw_boundaries(world, camera, settings, key, mesh)
+    """The boundary term as an image: its value is meaningless, its tangent is d(pixel)/d(scene) from moving silhouettes and
+    shadow edges, and from resampling the pixels that they cross.
+
+    Use only as `with_tangent(image, ...)`, `image` being the picture.
+    """
+    drawn = draw_boundaries(world, camera, key, mesh)
 
     @jax.checkpoint
-    def carry(world: World, camera: Camera, point: EdgePoint, flow: jax.Array):
-        x, _ = picture_point(world, camera, settings, point, point.s)
+    def moved_light(world: World, camera: Camera, sample: BoundarySample, flow: jax.Array):
+        x, _ = picture_point(world, camera, sample, sample.s)
         return flow[:, 0] * x[0] + flow[:, 1] * x[1]
 
-    def chunk(seen: tuple[World, Camera], drawn: tuple[EdgePoint, jax.Array]):
-        return jax.vmap(carry, in_axes=(None, None, 0, 0))(*seen, *drawn)
+    def chunk(seen: tuple[World, Camera], drawn: tuple[BoundarySample, jax.Array]):
+        return jax.vmap(moved_light, in_axes=(None, None, 0, 0))(*seen, *drawn)
 
-    light = map_over(mesh, chunk, (world, camera), (drawn.points, drawn.flows)).reshape(-1, 3)
+    light = map_over(mesh, chunk, (world, camera), (drawn.samples, drawn.flows)).reshape(-1, 3)
     flat = image.reshape(-1, 3)
-    finer = _finer(world, camera, settings, mesh, drawn.pixels) - flat[drawn.pixels]
-    return jnp.zeros_like(flat).at[drawn.place].add(light).at[drawn.pixels].add(finer).reshape(image.shape)
+    finer = _resampled(world, camera, mesh, drawn.resampled) - flat[drawn.resampled]
+    return jnp.zeros_like(flat).at[drawn.pixel].add(light).at[drawn.resampled].add(finer).reshape(image.shape)
 
 
 class Boundaries(eqx.Module):
-    """Points on moving boundaries, without a derivative, in chunks; pixels are numbered from the top left corner, row by row.
+    """Samples of moving boundaries, without a derivative, in chunks; pixels are numbered from the top left corner, row by row.
 
     Attributes:
-      points: those drawn; valid where they count. Their leaves have the leading axes (chunks, size).
-      flows: by how much the light that leaves a point's pixel changes with the point's place in the picture.
-      place: the pixel of each point.
-      pixels: those in which most changes, to be looked at again with `finer_side` squared samples each.
+      samples: valid where they contribute. Their leaves have the leading axes (chunks, size).
+      flows: derivative of the light that leaves a sample's pixel in the sample's position in the picture.
+      pixel: the pixel of each sample.
+      resampled: the pixels that change most, whose interior derivative is taken from `resampled_side` squared samples.
     """
 
-    points: EdgePoint
+    samples: BoundarySample
     flows: Float[jax.Array, "chunks size 3 2"]
-    place: Int[jax.Array, " points"]
-    pixels: Int[jax.Array, " pixels"]
+    pixel: Int[jax.Array, " points"]
+    resampled: Int[jax.Array, " pixels"]
 
 
-def draw_boundaries(world: World, camera: Camera, settings: Settings, key: jax.Array, mesh: Mesh) -> Boundaries:
-    """Draws `settings.edge_samples` points."""
+def draw_boundaries(world: World, camera: Camera, key: jax.Array, mesh: Mesh) -> Boundaries:
+    """Draws `edge_samples` samples of boundaries."""
+    settings = world.settings
     chunks = math.ceil(settings.edge_samples / (_ROUNDS * settings.chunk))
     size = math.ceil(settings.edge_samples / (_ROUNDS * chunks))
-    points, crossings, flows = lax.stop_gradient(_draw_edges(world, camera, settings, key, mesh, chunks, size))
-    points = eqx.tree_at(lambda points: points.valid, points, (flows != 0).any((2, 3)))
-    column, row = (crossings.x[..., axis].astype(jnp.int32).ravel() for axis in (0, 1))
-    place, all_pixels = row * camera.width + column, camera.width * camera.height
+    samples, segments, flows = lax.stop_gradient(_draw_edges(world, camera, key, mesh, chunks, size))
+    samples = eqx.tree_at(lambda samples: samples.valid, samples, (flows != 0).any((2, 3)))
+    column, row = (segments.x[..., axis].astype(jnp.int32).ravel() for axis in (0, 1))
+    pixel, all_pixels = row * camera.width + column, camera.width * camera.height
 
-    # The points know nothing of the picture's samples: a choice by these would keep what they happen to miss.
+    # They are chosen by the boundaries alone: a choice by the picture's own samples would keep what these happen to miss.
     sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(2, 3))).ravel()
-    count = min(math.ceil(settings.edge_samples / finer_side(settings) ** 2), all_pixels)
-    _, pixels = lax.top_k(jnp.zeros(all_pixels, sizes.dtype).at[place].add(sizes), count)
-    return Boundaries(points, flows, place, pixels.astype(jnp.int32))
+    count = min(math.ceil(settings.edge_samples / resampled_side(settings) ** 2), all_pixels)
+    _, resampled = lax.top_k(jnp.zeros(all_pixels, sizes.dtype).at[pixel].add(sizes), count)
+    return Boundaries(samples, flows, pixel, resampled.astype(jnp.int32))
 
 
-def finer_side(settings: Settings) -> int:
-    """How many samples along a pixel's side are taken where it is looked at again."""
-    return max(_FINER, 2 * math.isqrt(settings.samples or 1))
+def resampled_side(settings: Settings) -> int:
+    """The number of samples along the side of a pixel that is resampled."""
+    return max(_RESAMPLED_SIDE, 2 * math.isqrt(settings.samples or 1))
 
 
-def finer_points(camera: Camera, settings: Settings, pixel: jax.Array, sample: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where in the picture these samples of these pixels are."""
+def resampled_points(camera: Camera, settings: Settings, pixel: jax.Array, sample: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The positions in the picture, x and y, of these samples of these pixels."""
     dtype = camera.world_from_camera.dtype
-    dx, dy = sample_offset(sample, finer_side(settings), dtype)
+    dx, dy = sample_offset(sample, resampled_side(settings), dtype)
     return (pixel % camera.width).astype(dtype) + dx, (pixel // camera.width).astype(dtype) + dy
 
 
-def _finer(
-    world: World, camera: Camera, settings: Settings, mesh: Mesh, pixels: Int[jax.Array, " n"]
-) -> Float[jax.Array, "n 3"]:
-    """The light of pixels from many samples each."""
-    side = finer_side(settings)
+def _resampled(world: World, camera: Camera, mesh: Mesh, pixels: Int[jax.Array, " n"]) -> Float[jax.Array, "n 3"]:
+    """The radiance of pixels, as the mean over many samples each."""
+    settings = world.settings
+    side = resampled_side(settings)
     together = min(max(settings.chunk // side**2, 1), pixels.shape[0])
     samples = jnp.arange(side * side, dtype=jnp.int32)
 
     def one(world: World, camera: Camera, pixel: jax.Array, sample: jax.Array) -> jax.Array:
-        ray = camera.ray(*finer_points(camera, settings, pixel, sample))
-        return radiance(world, stored(ray, world.surfaces[0].sure), settings)[0]
+        ray = camera.ray(*resampled_points(camera, world.settings, pixel, sample))
+        return radiance(world, materialise(ray))[0]
 
     def chunk(seen: tuple[World, Camera], pixels: jax.Array) -> jax.Array:
         light = jax.vmap(functools.partial(one, *seen))(jnp.repeat(pixels, side * side), jnp.tile(samples, together))
@@ -119,51 +125,48 @@ def _finer(
     return map_over(mesh, chunk, (world, camera), chunks).reshape(-1, 3)[: pixels.shape[0]]
 
 
-def _draw_edges(world: World, camera: Camera, settings: Settings, key: jax.Array, mesh: Mesh, chunks: int, size: int):
-    """Points on edges, in chunks: the points, their places in the picture, and for each by how much the light that leaves
-    its pixel changes with its place, shape (3, 2)."""
+def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks: int, size: int):
+    """Samples in chunks, the boundaries round them in the picture, and their flows, see `Boundaries`."""
     world, camera = lax.stop_gradient((world, camera))
 
-    def one(world: World, camera: Camera, lottery: Lottery, k: jax.Array, u: jax.Array):
-        sure = world.surfaces[0].sure
-        point = stored(draw(world, camera, settings, lottery, k, u), sure)
-        point = stored(cast_shadow(world, point, settings), sure)
-        return stored((point, make_crossing(world, camera, settings, point)), sure)
+    def one(world: World, camera: Camera, guiding: GuidingDistribution, k: jax.Array, u: jax.Array):
+        sample = materialise(draw(world, camera, guiding, k, u))
+        sample = materialise(cast_shadow(world, sample))
+        return materialise((sample, boundary_segment(world, camera, sample)))
 
-    def beside(world: World, camera: Camera, crossing: Crossing, side: jax.Array) -> jax.Array:
-        return radiance(world, stored(side_ray(camera, crossing, side), world.surfaces[0].sure), settings)[0]
+    def beside(world: World, camera: Camera, segment: BoundarySegment, side: jax.Array) -> jax.Array:
+        return radiance(world, materialise(side_ray(camera, segment, side)))[0]
 
-    def chunk(known: tuple[World, Camera, Lottery], drawn: tuple[jax.Array, jax.Array]):
-        (world, camera, lottery), (key, first) = known, drawn
+    def chunk(known: tuple[World, Camera, GuidingDistribution], drawn: tuple[jax.Array, jax.Array]):
+        (world, camera, guiding), (key, first) = known, drawn
         u = jax.random.uniform(key, (size, 2), camera.world_from_camera.dtype)
-        points, crossings = jax.vmap(functools.partial(one, world, camera, lottery))(
+        samples, segments = jax.vmap(functools.partial(one, world, camera, guiding))(
             first + jnp.arange(size, dtype=jnp.int32), u
         )
         # One batch: a `vmap` of a `vmap` would have to do all that `only_where` leaves out.
-        sides, both = crossings.sides.reshape(-1, 2), jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), crossings)
+        sides, both = segments.sides.reshape(-1, 2), jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), segments)
         light = jax.vmap(functools.partial(beside, world, camera))(both, sides).reshape(size, 2, 3)
-        jump = (light[:, 0] - light[:, 1]) * jnp.where(crossings.valid, points.measure, 0)[:, None]
-        return points, crossings, jump[:, :, None] * crossings.across[:, None, :]
+        jump = (light[:, 0] - light[:, 1]) * jnp.where(segments.valid, samples.measure, 0)[:, None]
+        return samples, segments, jump[:, :, None] * segments.across[:, None, :]
 
     def in_round(weights: jax.Array, number: jax.Array):
         per_round = chunks * size
-        lottery = make_lottery(weights, jnp.where(number == 0, per_round, (_ROUNDS - 1) * per_round))
+        guiding = make_distribution(weights, jnp.where(number == 0, per_round, (_ROUNDS - 1) * per_round))
         firsts = jnp.maximum(number - 1, 0) * per_round + jnp.arange(chunks, dtype=jnp.int32) * size
         keys = jax.random.split(jax.random.fold_in(key, number), chunks)
-        drawn = map_over(mesh, chunk, (world, camera, lottery), (keys, firsts))
+        drawn = map_over(mesh, chunk, (world, camera, guiding), (keys, firsts))
 
         def refined(weights: jax.Array) -> jax.Array:
-            points, crossings, flows = drawn
+            samples, segments, flows = drawn
             sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(2, 3)))
             # By how much the pixel changes as the edge is lifted; and, for what moves it otherwise, as if all had one speed.
             total = jnp.sum(sizes)
-            mean_speed = jnp.sum(sizes * crossings.speed) / jnp.where(total > 0, total, 1)
+            mean_speed = jnp.sum(sizes * segments.speed) / jnp.where(total > 0, total, 1)
             mean_speed = jnp.where(mean_speed > 0, mean_speed, 1)  # seen from straight above, lifting moves nothing
-            sizes = sizes * (crossings.speed + mean_speed)
-            return refined_weights(world, settings, weights, points.edge.ravel(), sizes.ravel())
+            sizes = sizes * (segments.speed + mean_speed)
+            return refined_weights(world, weights, samples.edge.ravel(), sizes.ravel())
 
         return lax.cond(number == 0, refined, lambda weights: weights, weights), drawn
 
-    weights = plain_weights(world, camera, settings)
-    _, drawn = lax.scan(in_round, weights, jnp.arange(_ROUNDS, dtype=jnp.int32))
+    _, drawn = lax.scan(in_round, initial_weights(world, camera), jnp.arange(_ROUNDS, dtype=jnp.int32))
     return jax.tree.map(lambda leaf: leaf[1:].reshape(-1, *leaf.shape[2:]), drawn)

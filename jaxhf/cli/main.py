@@ -254,7 +254,7 @@ def _timed_render(scene: "Scene", settings: "Settings") -> tuple[Any, str]:
     import numpy as np
 
     from ..rendering.render import render
-    from ..trace.world import settle
+    from ..trace.world import resolve_settings
 
     compiling = _CompileTime()
     begin = time.perf_counter()
@@ -262,7 +262,7 @@ def _timed_render(scene: "Scene", settings: "Settings") -> tuple[Any, str]:
         image, aovs = render(scene, settings, aovs=("exhausted",), progress=progress)
     elapsed = time.perf_counter() - begin
     seconds = max(elapsed - compiling.seconds, 1e-9)
-    samples = settle(settings, scene).samples or 1
+    samples = resolve_settings(settings, scene).samples or 1
     height, width = image.shape[:2]
     rays = height * width * samples
     return image, (

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .powers import floor_to_power_of_two
 from .ray import Ray
 from .types import AnyArray, Vector
-from .vector import power_of_two
 
 
 class Affine(eqx.Module):
@@ -46,7 +46,7 @@ class Affine(eqx.Module):
         host = isinstance(linear, np.ndarray) and isinstance(self.offset, np.ndarray)
         xp: Any = np if host else jnp
         # Each column is divided by about its size, as the derivative has the determinant's square in it.
-        sizes: Any = np.ones(3) if host else power_of_two(jnp.abs(linear).max(axis=0))
+        sizes: Any = np.ones(3) if host else floor_to_power_of_two(jnp.abs(linear).max(axis=0))
         linear = linear / sizes[None, :]
         a, b, c = linear[:, 0], linear[:, 1], linear[:, 2]
         adjugate = xp.stack([xp.cross(b, c), xp.cross(c, a), xp.cross(a, b)])

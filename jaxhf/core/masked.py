@@ -1,4 +1,4 @@
-"""Leaving out what none of the rays that are traced together needs."""
+"""Leaving out what none of the rays of a batch needs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -30,15 +30,15 @@ def only_where(needed: Flag, fun: Callable[..., Any], *args: Any) -> Any:
 
     @run.def_vmap
     def run_many(axis_size: int, in_batched: Any, needed: jax.Array, args: tuple[Any, ...]) -> Any:
-        lanes, shared = eqx.partition(args, in_batched[1])
-        many = jax.vmap(lambda lanes: fun(*eqx.combine(lanes, shared)), axis_size=axis_size)
-        traced, shapes = jax.make_jaxpr(many, return_shape=True)(lanes)  # once, for its shapes and for the conditional
+        batched, shared = eqx.partition(args, in_batched[1])
+        many = jax.vmap(lambda batched: fun(*eqx.combine(batched, shared)), axis_size=axis_size)
+        traced, shapes = jax.make_jaxpr(many, return_shape=True)(batched)  # once, for its shapes and for the conditional
         leaves, structure = jax.tree.flatten(shapes)
 
         def nothing(*_: Any) -> list[jax.Array]:
             return [jnp.zeros(leaf.shape, leaf.dtype) for leaf in leaves]
 
-        result = lax.cond(needed.any(), jaxpr_as_fun(traced), nothing, *jax.tree.leaves(lanes))
+        result = lax.cond(needed.any(), jaxpr_as_fun(traced), nothing, *jax.tree.leaves(batched))
         return jax.tree.unflatten(structure, result), jax.tree.map(lambda _: True, shapes)
 
     return run(needed, args)

@@ -13,7 +13,7 @@ def grid_side(samples: int) -> int:
 
 
 def sample_offset(k: Int[jax.Array, "*n"], side: int, dtype) -> tuple[Float[jax.Array, "*n"], Float[jax.Array, "*n"]]:
-    """The k-th sample's place in its pixel, 0..1 each way: the centres of a regular grid.
+    """The k-th sample's position in its pixel, 0..1 each way: the centres of a regular grid.
 
     With the box filter of a pixel's width, the pixel is the mean of its samples.
     """

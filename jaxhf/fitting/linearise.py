@@ -1,9 +1,9 @@
-"""Pictures whose derivative in the heights is kept as a sparse matrix, for the many products of a fit.
+"""Linearised pictures: their derivative in the heights as a sparse matrix, for the many products of a fit.
 
-What a sample shows depends on the heights and normals at the three vertices of one triangle, and on which triangle that is,
-which has no derivative. So its row of the matrix is a dozen numbers, taken once by reverse differentiation. A product then
-is three lookups for each sample, where JAX's own linearised picture reads every intermediate value of its shading
-again. A point on a moving boundary depends on five heights at most.
+The radiance of a sample depends on the heights and normals at the three vertices of one triangle (and on which triangle
+that is, which has no derivative). So its row of the matrix is a dozen numbers, taken once by reverse differentiation. A
+product then is three lookups for each sample, where JAX's own linearised picture reads every intermediate value of its
+shading again. A sample of a moving boundary depends on five heights at most.
 """
 
 import dataclasses
@@ -18,62 +18,63 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
-from ..boundary.guiding import sources
-from ..boundary.sample import EdgePoint, deciding_vertices, picture_point
-from ..boundary.term import Boundaries, draw_boundaries, finer_points, finer_side
+from ..boundary.guiding import edge_sets
+from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
+from ..boundary.term import Boundaries, default_key, draw_boundaries, resampled_points, resampled_side
 from ..core.autodiff import with_tangent
 from ..core.devices import map_over, on_every_device
-from ..core.materialise import stored
+from ..core.materialise import materialise
 from ..core.sampling import sample_offset
 from ..core.settings import Settings
-from ..rendering.render import settled_key
 from ..rendering.tiles import Tiling
 from ..scene.camera import Camera
 from ..scene.scene import Scene
-from ..shade.radiance import direct, mirrors
+from ..shade.radiance import direct, has_mirrors
 from ..trace.grid import Grid
-from ..trace.triangle import Corners, triangle_places
-from ..trace.world import Vertex, World, make_world, settle
+from ..trace.hit import Hit
+from ..trace.triangle import Corners, triangle_vertices
+from ..trace.world import World, make_world, resolve_settings
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
 _TOGETHER = 1024
 
 
 class Linearised(eqx.Module):
-    """A picture, and its derivative in what stands at the vertices of its scene.
+    """A picture, and its derivative in the heights and normals at the vertices of its scene.
 
     Attributes:
       image: shape (h, w, c).
-      slopes: a sample's derivatives, (chunks, c, 3 or 12, lanes): in the three heights, then, vertex by vertex, in the normals.
-      places: the numbers of those vertices over all surfaces, (chunks, 3, lanes).
-      edges: of points on moving boundaries; None where the settings ask for none.
+      slopes: derivatives of each sample, (chunks, c, 3 or 12, samples): in the three heights, then, vertex by vertex, in the
+        normals.
+      vertices: the numbers of those three vertices over all grids, (chunks, 3, samples).
+      edges: of samples of moving boundaries; None where the settings ask for none.
     """
 
     image: Float[jax.Array, "*n h w c"]
-    slopes: Float[jax.Array, "*n chunks c k lanes"]
-    places: Int[jax.Array, "*n chunks 3 lanes"]
+    slopes: Float[jax.Array, "*n chunks c k samples"]
+    vertices: Int[jax.Array, "*n chunks 3 samples"]
     edges: "LinearisedEdges | None"
 
 
 class LinearisedEdges(eqx.Module):
-    """What points on moving boundaries bring.
+    """The boundary term's part of a linearised picture.
 
     Attributes:
-      slopes: the derivatives of the light in five heights, (chunks, c, 5, size).
-      places: the numbers of their vertices, (chunks, 5, size).
-      pixel: which pixel each point is in; they are numbered row by row.
-      pixels: those that are looked at again, by samples after the picture's.
+      slopes: derivatives of the light in five heights, (chunks, c, 5, size).
+      vertices: the numbers of their vertices, (chunks, 5, size).
+      pixel: which pixel each boundary sample is in; they are numbered row by row.
+      resampled: the pixels that are resampled, by samples after the picture's.
     """
 
     slopes: Float[jax.Array, "*n chunks c 5 size"]
-    places: Int[jax.Array, "*n chunks 5 size"]
+    vertices: Int[jax.Array, "*n chunks 5 size"]
     pixel: Int[jax.Array, "*n points"]
-    pixels: Int[jax.Array, "*n pixels"]
+    resampled: Int[jax.Array, "*n pixels"]
 
 
 def can_be_linearised(scene: Scene, settings: Settings) -> bool:
-    """Whether each sample shows one triangle, not what is mirrored in it."""
-    return not mirrors((obj.material for obj in scene.objects), settings)
+    """Whether each sample depends on one triangle alone, as it does where no mirror shows another one."""
+    return not has_mirrors((obj.material for obj in scene.objects), settings)
 
 
 def linearise_each(
@@ -105,43 +106,42 @@ def picture_each(
 
 
 def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int) -> Linearised:
-    settings = settle(settings, scene)
     world, camera = make_world(scene, settings), scene.camera
-    key = settled_key(None, settings, mesh)
+    key = default_key(None, world.settings, mesh)
     drawn = None
-    if key is not None and sources(world, settings):
-        drawn = draw_boundaries(world, camera, settings, key, mesh)
-    points = _points(camera, settings)
+    if key is not None and edge_sets(world):
+        drawn = draw_boundaries(world, camera, key, mesh)
+    points = _sample_points(camera, world.settings)
     if drawn is not None:
-        points = _in_a_row(points, _finer_points(camera, settings, drawn))
-    light, slopes, places = map_over(mesh, functools.partial(_samples, settings, channels), (world, camera), points)
-    image, edges = _in_pixels(light, camera, settings), None
+        points = _in_a_row(points, _resampled_points(camera, world.settings, drawn))
+    light, slopes, vertices = map_over(mesh, functools.partial(_samples, channels), (world, camera), points)
+    image, edges = _in_pixels(light, camera, world.settings), None
     if drawn is not None:
-        followed = functools.partial(_edge_points, settings, channels)
-        edge_slopes, edge_places = map_over(mesh, followed, (world, camera), (drawn.points, drawn.flows))
-        edges = LinearisedEdges(edge_slopes, edge_places, drawn.place, drawn.pixels)
-    return Linearised(image, slopes, places, edges)
+        followed = functools.partial(_boundary_samples, channels)
+        edge_slopes, edge_vertices = map_over(mesh, followed, (world, camera), (drawn.samples, drawn.flows))
+        edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, drawn.resampled)
+    return Linearised(image, slopes, vertices, edges)
 
 
 def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "h w c"]:
-    settings = settle(settings, scene)
+    settings = resolve_settings(settings, scene)
     at_vertices = _at_vertices(make_world(scene, settings))
-    moved = _product(mesh, at_vertices, known.slopes, known.places)
+    moved = _product(mesh, at_vertices, known.slopes, known.vertices)
     change = _in_pixels(moved, scene.camera, settings)
     if known.edges is not None:
         edges, flat = known.edges, change.reshape(-1, change.shape[-1])
         tiling, samples = Tiling(scene.camera, settings), settings.samples
         assert samples is not None
-        shape = (edges.pixels.shape[0], finer_side(settings) ** 2)
+        shape = (edges.resampled.shape[0], resampled_side(settings) ** 2)
         finer = moved[tiling.count * samples :].reshape(-1, moved.shape[-1])[: shape[0] * shape[1]].reshape(*shape, -1).mean(1)
-        heights = at_vertices[:, 0].at[edges.places].get(mode="promise_in_bounds")
+        heights = at_vertices[:, 0].at[edges.vertices].get(mode="promise_in_bounds")
         light = jnp.moveaxis(jnp.sum(edges.slopes * heights[:, None], axis=2), 1, -1)
-        flat = flat.at[edges.pixels].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, flat.shape[1]))
+        flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, flat.shape[1]))
         change = flat.reshape(change.shape)
     return with_tangent(known.image, change)
 
 
-def _in_pixels(values: Float[jax.Array, "chunks lanes c"], camera: Camera, settings: Settings) -> Float[jax.Array, "h w c"]:
+def _in_pixels(values: Float[jax.Array, "chunks n c"], camera: Camera, settings: Settings) -> Float[jax.Array, "h w c"]:
     """The means over the samples of each pixel."""
     tiling, samples = Tiling(camera, settings), settings.samples
     assert samples is not None
@@ -157,36 +157,36 @@ def _in_a_row(*parts: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
     return tuple(jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
 
 
-def _points(camera: Camera, settings: Settings) -> tuple[jax.Array, ...]:
-    """Where in the picture its samples are, x and y, (chunks, lanes) each, tile by tile."""
+def _sample_points(camera: Camera, settings: Settings) -> tuple[jax.Array, ...]:
+    """The positions of all samples in the picture, x and y, (chunks, n) each, tile by tile."""
     tiling, dtype = Tiling(camera, settings), camera.world_from_camera.dtype
     assert settings.samples is not None
     pixels = jax.vmap(tiling.pixels)(jnp.arange(tiling.count, dtype=jnp.int32))
     offsets = sample_offset(jnp.arange(settings.samples, dtype=jnp.int32), math.isqrt(settings.samples), dtype)
-    lanes = tiling.side * tiling.side
+    size = tiling.side * tiling.side
     return tuple(
-        (pixel.astype(dtype)[:, None, :] + offset[None, :, None]).reshape(-1, lanes)
+        (pixel.astype(dtype)[:, None, :] + offset[None, :, None]).reshape(-1, size)
         for pixel, offset in zip(pixels, offsets, strict=True)
     )
 
 
-def _finer_points(camera: Camera, settings: Settings, boundaries: Boundaries) -> tuple[jax.Array, ...]:
-    """The same for the pixels that are looked at again, one after the other."""
-    lanes = Tiling(camera, settings).side ** 2
-    samples = finer_side(settings) ** 2
-    repeated = jnp.repeat(boundaries.pixels, samples)
-    numbers = jnp.tile(jnp.arange(samples, dtype=jnp.int32), boundaries.pixels.shape[0])
+def _resampled_points(camera: Camera, settings: Settings, boundaries: Boundaries) -> tuple[jax.Array, ...]:
+    """The same for the pixels that are resampled, one after the other."""
+    size = Tiling(camera, settings).side ** 2
+    samples = resampled_side(settings) ** 2
+    repeated = jnp.repeat(boundaries.resampled, samples)
+    numbers = jnp.tile(jnp.arange(samples, dtype=jnp.int32), boundaries.resampled.shape[0])
     return tuple(
-        jnp.pad(values, (0, -values.shape[0] % lanes), mode="edge").reshape(-1, lanes)
-        for values in finer_points(camera, settings, repeated, numbers)
+        jnp.pad(values, (0, -values.shape[0] % size), mode="edge").reshape(-1, size)
+        for values in resampled_points(camera, settings, repeated, numbers)
     )
 
 
-def _samples(settings: Settings, channels: int, seen: tuple[World, Camera], points: tuple[jax.Array, ...]):
-    """Light at points of the picture, (lanes, c), its derivatives and in what: see `Linearised`."""
+def _samples(channels: int, seen: tuple[World, Camera], points: tuple[jax.Array, ...]):
+    """Radiance at points of the picture, (n, c), and its slopes and vertices, see `Linearised`."""
     world, camera = seen
     x, y = points
-    smooth = settings.shading == "smooth"
+    smooth = world.settings.shading == "smooth"
 
     def one(x: jax.Array, y: jax.Array, perturbation: jax.Array) -> tuple[jax.Array, jax.Array]:
         corners = Corners(perturbation[:3], perturbation[3:].reshape(3, 3) if smooth else None)
@@ -194,43 +194,42 @@ def _samples(settings: Settings, channels: int, seen: tuple[World, Camera], poin
             dataclasses.replace(surface, perturbation=corners) if isinstance(surface, Grid) else surface
             for surface in world.surfaces
         )
-        ray = stored(camera.ray(x, y), world.surfaces[0].sure)
-        light, _, vertex = direct(dataclasses.replace(world, surfaces=surfaces), ray, settings)
-        return _channels(light, channels), _places(world, vertex)
+        light, _, hit = direct(dataclasses.replace(world, surfaces=surfaces), materialise(camera.ray(x, y)))
+        return _channels(light, channels), _vertices(world, hit)
 
     def shade(perturbations: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.vmap(one, in_axes=(0, 0, 1), out_axes=(0, 1))(x, y, perturbations)
 
-    light, pull, places = jax.vjp(shade, jnp.zeros((12 if smooth else 3, x.shape[0]), x.dtype), has_aux=True)
+    light, pull_back, vertices = jax.vjp(shade, jnp.zeros((12 if smooth else 3, x.shape[0]), x.dtype), has_aux=True)
     each = jnp.broadcast_to(jnp.eye(channels, dtype=x.dtype)[:, None], (channels, *light.shape))
-    slopes = pull(each[0])[0][None] if channels == 1 else jax.vmap(pull)(each)[0]
-    return light, slopes, places
+    slopes = pull_back(each[0])[0][None] if channels == 1 else jax.vmap(pull_back)(each)[0]
+    return light, slopes, vertices
 
 
-def _places(world: World, vertex: Vertex) -> Int[jax.Array, "3"]:
-    """The numbers of the vertices of the triangle that was hit, over all surfaces; any that there are where there is none."""
-    places, cell = jnp.zeros(3, jnp.int32), vertex.hit.cell
-    for k, grid, before in world.grids:
-        here = triangle_places(grid.shape[1], cell[0], cell[1], vertex.hit.triangle == 1)
-        places = jnp.where(vertex.index == k, before + jnp.stack(here), places)
-    return places
+def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
+    """The numbers of the vertices of the triangle that was hit, over all grids; any that there are where there is no hit."""
+    vertices, cell = jnp.zeros(3, jnp.int32), hit.cell
+    for number, grid, first in world.grids:
+        here = triangle_vertices(grid.shape[1], cell[0], cell[1], hit.triangle == 1)
+        vertices = jnp.where(hit.object == number, first + jnp.stack(here), vertices)
+    return vertices
 
 
-def _edge_points(
-    settings: Settings, channels: int, seen: tuple[World, Camera], drawn: tuple[EdgePoint, Float[jax.Array, "n 3 2"]]
-):
-    """Derivatives of the light that points bring, and in what: see `LinearisedEdges`."""
+def _boundary_samples(channels: int, seen: tuple[World, Camera], drawn: tuple[BoundarySample, Float[jax.Array, "n 3 2"]]):
+    """Slopes and vertices of boundary samples, see `LinearisedEdges`."""
     world, camera = seen
-    points, flows = drawn
+    samples, flows = drawn
     flows = jnp.moveaxis(_channels(jnp.moveaxis(flows, 1, -1), channels), -1, 0)
 
-    def place(point: EdgePoint, perturbation: jax.Array) -> jax.Array:
-        return picture_point(world, camera, settings, point, point.s, perturbation=perturbation)[0]
+    def position(sample: BoundarySample, perturbation: jax.Array) -> jax.Array:
+        return picture_point(world, camera, sample, sample.s, perturbation=perturbation)[0]
 
     count = flows.shape[1]
-    _, pull = jax.vjp(lambda values: jax.vmap(place, in_axes=(0, 1))(points, values), jnp.zeros((5, count), flows.dtype))
-    slopes = jax.vmap(pull)(flows)[0]
-    return slopes, jax.vmap(functools.partial(deciding_vertices, world), out_axes=1)(points)
+    _, pull_back = jax.vjp(
+        lambda values: jax.vmap(position, in_axes=(0, 1))(samples, values), jnp.zeros((5, count), flows.dtype)
+    )
+    slopes = jax.vmap(pull_back)(flows)[0]
+    return slopes, jax.vmap(functools.partial(deciding_vertices, world), out_axes=1)(samples)
 
 
 def _at_vertices(world: World) -> Float[jax.Array, "vertices n"]:
@@ -244,11 +243,11 @@ def _at_vertices(world: World) -> Float[jax.Array, "vertices n"]:
 def _product(
     mesh: Mesh,
     at_vertices: Float[jax.Array, "vertices n"],
-    slopes: Float[jax.Array, "chunks c k lanes"],
-    places: Int[jax.Array, "chunks 3 lanes"],
-) -> Float[jax.Array, "chunks lanes c"]:
+    slopes: Float[jax.Array, "chunks c k samples"],
+    vertices: Int[jax.Array, "chunks 3 n"],
+) -> Float[jax.Array, "chunks n c"]:
     """The matrix of all samples times what stands at the vertices."""
-    chunks, channels, _, lanes = slopes.shape
+    chunks, channels, _, size = slopes.shape
     parts = mesh.devices.size * math.ceil(chunks / (mesh.devices.size * _TOGETHER))
 
     def in_parts(values: jax.Array) -> jax.Array:
@@ -257,17 +256,17 @@ def _product(
         return values.reshape(*values.shape[:-2], -1)
 
     def part(at_vertices: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
-        slopes, places = rows
+        slopes, vertices = rows
         total = jnp.zeros((channels, slopes.shape[-1]), slopes.dtype)
         # Looked up a row of four at a time and used number by number: 262144 samples took 0.8 ms, and 2.9 ms transposed. A
         # number at a time it was 1.1 and 10 ms, with sums over the rows 11 and 3.9 ms.
         for vertex in range(3):
-            row = at_vertices.at[places[vertex]].get(mode="promise_in_bounds")
+            row = at_vertices.at[vertices[vertex]].get(mode="promise_in_bounds")
             for number in range(row.shape[1]):
                 slope = slopes[:, vertex if number == 0 else 3 * vertex + number + 2]
                 total = total + slope * row[:, number][None]
         return total
 
-    moved = map_over(mesh, part, at_vertices, (in_parts(slopes), in_parts(places)))
-    moved = jnp.moveaxis(moved.reshape(parts, channels, -1, lanes), 1, -1)
-    return moved.reshape(-1, lanes, channels)[:chunks]
+    moved = map_over(mesh, part, at_vertices, (in_parts(slopes), in_parts(vertices)))
+    moved = jnp.moveaxis(moved.reshape(parts, channels, -1, size), 1, -1)
+    return moved.reshape(-1, size, channels)[:chunks]

@@ -17,7 +17,7 @@ from ..scene.localise import localise
 from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
-from ..trace.world import settle
+from ..trace.world import resolve_settings
 from .basis import Basis, Unknowns, beyond, cosines, resample
 from .linearise import Linearised
 
@@ -127,7 +127,7 @@ def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], settings: Setti
         target, weight = _picture(k, scene, targets[k], weight)
         local = localise(scene)
         leaves, structure = jax.tree.flatten(local)
-        kind = (structure, settle(settings, scene).samples, tuple(leaf.shape for leaf in leaves), target.shape)
+        kind = (structure, resolve_settings(settings, scene).samples, tuple(leaf.shape for leaf in leaves), target.shape)
         found.setdefault(kind, []).append((k, local, target, weight / noise[k]))
     dtype = scenes[0].heights.dtype
     return tuple(

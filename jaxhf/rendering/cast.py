@@ -20,17 +20,14 @@ from ..scene.scene import Scene
 from ..trace.grid import Grid
 from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
-from ..trace.world import Vertex, first_vertex, make_surface, make_world
+from ..trace.world import first_hit, make_surface, make_world
 
 
-def cast_camera(
-    scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings = Settings()
-) -> Vertex:
+def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings = Settings()) -> Hit:
     """The first hits of the camera's rays through the points (x, y) of the picture, in pixels from its top left corner.
 
     Returns:
-      A `Vertex` whose leaves have a leading axis n: the hits, with `p` relative to the terrain's corner, and the number of
-      the object that each is on, -1 for none.
+      A `Hit` whose leaves have a leading axis n, with `p` relative to the terrain's corner.
     """
     local = localise(scene)
     dtype = local.camera.world_from_camera.dtype
@@ -38,11 +35,11 @@ def cast_camera(
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
-def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -> Vertex:
+def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -> Hit:
     world = make_world(scene, settings)
 
-    def one(x: jax.Array, y: jax.Array) -> Vertex:
-        return first_vertex(world, scene.camera.ray(x, y), settings)
+    def one(x: jax.Array, y: jax.Array) -> Hit:
+        return first_hit(world, scene.camera.ray(x, y))
 
     return jax.vmap(one)(x, y)
 
@@ -102,8 +99,8 @@ def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, 
 
     def one(rays: tuple[jax.Array | Hit, jax.Array]) -> Hit:
         start, d = rays
-        ray, origin = leave(surface, start, d) if isinstance(start, Hit) else (Ray(start, d), None)
-        return intersect(surface, ray, settings, origin)
+        ray, leaving = leave(surface, 0, start, d) if isinstance(start, Hit) else (Ray(start, d), None)
+        return intersect(surface, 0, ray, max_steps=settings.max_steps, leaving=leaving)
 
     chunk = settings.chunk
     rays = d.shape[0]

@@ -1,4 +1,4 @@
-"""From a scene to a picture: the only place where rays are batched."""
+"""From a scene to a picture."""
 
 import dataclasses
 import functools
@@ -12,26 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from ..boundary.guiding import sources
-from ..boundary.term import moving_boundaries
+from ..boundary.guiding import edge_sets
+from ..boundary.term import boundary_term, default_key
 from ..core.autodiff import with_tangent
-from ..core.devices import local_mesh, map_over, on_every_device
-from ..core.materialise import stored
-from ..core.sampling import sample_offset
+from ..core.devices import local_mesh, on_every_device
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.localise import localise, localise_camera
 from ..scene.scene import Scene
-from ..shade.radiance import radiance
-from ..trace.world import World, make_world, settle
-from .aovs import AOVS, _observe
-from .tiles import Tiling
+from ..trace.world import World, make_world, resolve_settings
+from .aovs import AOVS
+from .tiles import Tiling, trace_tiles
 
 
 class Prepared(eqx.Module):
-    """A scene of which all is done that does not depend on the camera; `prepare` makes it, `render` takes it.
+    """A scene with all that its pictures need and that does not depend on the camera; `prepare` makes it, `render` takes it.
 
     Attributes:
       scene: as it was given, with the camera that is to see it.
@@ -40,9 +37,12 @@ class Prepared(eqx.Module):
     """
 
     scene: Scene
-    settings: Settings = eqx.field(static=True)
     mesh: Mesh = eqx.field(static=True)
     _world: World
+
+    @property
+    def settings(self) -> Settings:
+        return self._world.settings
 
     def with_camera(self, camera: Camera) -> "Prepared":
         """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
@@ -54,8 +54,8 @@ def prepare(scene: Scene, settings: Settings = Settings(), *, mesh: Mesh | None 
 
     The arguments are those of `render`.
     """
-    settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
-    return Prepared(scene, settings, mesh, _make_world(on_every_device(localise(scene), mesh), settings=settings))
+    settings, mesh = resolve_settings(settings, scene), local_mesh() if mesh is None else mesh
+    return Prepared(scene, mesh, _make_world(on_every_device(localise(scene), mesh), settings=settings))
 
 
 def render(
@@ -99,18 +99,18 @@ def render(
     if isinstance(scene, Prepared):
         if mesh is not None and mesh != scene.mesh:
             raise ValueError(f"render: the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
-        if settings != Settings() and settle(settings, scene.scene) != scene.settings:
+        if settings != Settings() and resolve_settings(settings, scene.scene) != scene.settings:
             raise ValueError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
-        settings, world, mesh = scene.settings, scene._world, scene.mesh
+        world, mesh = scene._world, scene.mesh
         camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:
-            outputs = _trace_prepared(world, camera, settings, aovs, mesh, settled_key(key, settings, mesh))
+            outputs = _trace_prepared(world, camera, aovs, mesh, default_key(key, world.settings, mesh))
         else:
-            outputs = _trace_in_parts(world, camera, settings, aovs, mesh, progress)
+            outputs = _trace_in_parts(world, camera, aovs, mesh, progress)
     else:
-        settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
+        settings, mesh = resolve_settings(settings, scene), local_mesh() if mesh is None else mesh
         local = on_every_device(localise(scene), mesh)
-        outputs = _trace_all(local, settings, aovs, mesh, settled_key(key, settings, mesh))
+        outputs = _trace_all(local, settings, aovs, mesh, default_key(key, settings, mesh))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -127,102 +127,46 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
 
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
-        settled = settle(settings, scene)
-        return _trace_all(on_every_device(scene, mesh), settled, (), mesh, settled_key(None, settled, mesh))["image"]
+        resolved = resolve_settings(settings, scene)
+        return _trace_all(on_every_device(scene, mesh), resolved, (), mesh, default_key(None, resolved, mesh))["image"]
 
     return lax.map(one, scenes)
-
-
-def settled_key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
-    if not settings.edge_samples:
-        return None
-    return on_every_device(jax.random.key(0) if key is None else key, mesh)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "aovs", "mesh"))
 def _trace_all(
     scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
 ) -> dict[str, jax.Array]:
-    return _trace_world(make_world(scene, settings), scene.camera, settings, aovs, mesh, key)
+    return _trace_world(make_world(scene, settings), scene.camera, aovs, mesh, key)
 
 
 def _trace_world(
-    world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
 ) -> dict[str, jax.Array]:
-    tiling = Tiling(camera, settings)
-    tiles = _trace_each(mesh, world, camera, settings, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
+    tiling = Tiling(camera, world.settings)
+    tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
     outputs = jax.tree.map(tiling.assemble, tiles)
-    if key is not None and sources(world, settings):
+    if key is not None and edge_sets(world):
         image = outputs["image"]
-        outputs["image"] = with_tangent(image, moving_boundaries(world, camera, settings, key, mesh, image))
+        outputs["image"] = with_tangent(image, boundary_term(world, camera, key, mesh, image))
     return outputs
 
 
-_trace_prepared = jax.jit(_trace_world, static_argnames=("settings", "aovs", "mesh"))
-
-
-def _trace_each(
-    mesh: Mesh, world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]
-):
-    """Tiles one after the other, (n, side * side, ...) of each output."""
-    return map_over(mesh, lambda seen, tile: _trace_tile(seen[0], seen[1], settings, aovs, tile), (world, camera), tiles)
-
-
-_trace_tiles = jax.jit(_trace_each, static_argnames=("mesh", "settings", "aovs"))
-
-
+_trace_prepared = jax.jit(_trace_world, static_argnames=("aovs", "mesh"))
+_trace_tiles = jax.jit(trace_tiles, static_argnames=("mesh", "aovs"))
 _make_world = jax.jit(make_world, static_argnames=("settings",))
 
 
 def _trace_in_parts(
-    world: World,
-    camera: Camera,
-    settings: Settings,
-    aovs: tuple[str, ...],
-    mesh: Mesh,
-    progress: Callable[[int, int], None],
-):
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, progress: Callable[[int, int], None]
+) -> dict[str, np.ndarray]:
     """As `_trace_all`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
-    tiling = Tiling(camera, settings)
+    tiling = Tiling(camera, world.settings)
     size = math.ceil(tiling.count / 64)
     pixels = tiling.width * tiling.height
     parts = []
     for first in range(0, tiling.count, size):
         tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
-        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, settings, aovs, np.asarray(tiles, np.int32))))
+        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, aovs, np.asarray(tiles, np.int32))))
         progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
     return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)
-
-
-def _trace_tile(world: World, camera: Camera, settings: Settings, aovs: tuple[str, ...], tile: jax.Array):
-    dtype = camera.world_from_camera.dtype
-
-    def one(x: jax.Array, y: jax.Array):
-        image, exhausted = _pixel(world, camera, settings, x, y)
-        outputs = {"image": image}
-        if aovs:
-            outputs |= _observe(world, camera.ray(x + 0.5, y + 0.5), settings, aovs)
-        if "exhausted" in aovs:
-            outputs["exhausted"] = exhausted
-        return outputs
-
-    columns, rows = Tiling(camera, settings).pixels(tile)
-    return jax.vmap(one)(columns.astype(dtype), rows.astype(dtype))
-
-
-def _pixel(world: World, camera: Camera, settings: Settings, x: jax.Array, y: jax.Array):
-    """The mean over the pixel's samples, and how many walks ran out of steps."""
-    assert settings.samples is not None
-    side = math.isqrt(settings.samples)
-
-    def sample(k, sums):
-        dx, dy = sample_offset(k, side, x.dtype)
-        ray = stored(camera.ray(x + dx, y + dy), world.surfaces[0].sure)
-        light, exhausted = radiance(world, ray, settings)
-        return sums[0] + light, sums[1] + exhausted
-
-    sums = (jnp.zeros(3, x.dtype), jnp.zeros((), jnp.int32))
-    if side == 1:
-        return sample(jnp.zeros((), jnp.int32), sums)
-    total, exhausted = lax.fori_loop(0, side * side, sample, sums)
-    return total / (side * side), exhausted

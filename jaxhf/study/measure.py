@@ -70,10 +70,10 @@ def centre_hits(scene: Scene, settings: Settings) -> Int[np.ndarray, "n 5"]:
     parts = []
     for first in range(0, x.size, _CAST):
         part = np.minimum(np.arange(first, first + _CAST), x.size - 1)
-        vertex = jax.device_get(cast_camera(scene, x[part], y[part], settings))
-        found = vertex.index >= 0
-        place = np.stack([vertex.index, *vertex.hit.cell.T, vertex.hit.triangle], -1)
-        parts.append(np.concatenate([np.where(found[:, None], place, -1), vertex.hit.status[:, None]], -1))
+        hit = jax.device_get(cast_camera(scene, x[part], y[part], settings))
+        found = hit.object >= 0
+        place = np.stack([hit.object, *hit.cell.T, hit.triangle], -1)
+        parts.append(np.concatenate([np.where(found[:, None], place, -1), hit.status[:, None]], -1))
     return np.concatenate(parts)[: x.size].astype(np.int32)
 
 

@@ -18,7 +18,7 @@ from ..scene.light import Sky
 from ..scene.material import Mirror
 from ..scene.scene import Scene
 from ..scene.views import resized
-from ..trace.world import settle
+from ..trace.world import resolve_settings
 from .table import read_rows
 
 FINEST = 256  # samples a pixel of the reference
@@ -230,7 +230,7 @@ def _configurations(scene: Scene, knobs: frozenset[str], quick: bool, fits: bool
             return ()
         return _QUICK.get(knob, all_values) if quick else all_values
 
-    picture = Configuration("picture", settings=settle(Settings(), scene))
+    picture = Configuration("picture", settings=resolve_settings(Settings(), scene))
     yield picture
     absent = set() if any(isinstance(obj.material, Mirror) for obj in scene.objects) else {"max_depth"}
     if all(isinstance(light, Sky) for light in scene.lights):

@@ -2,16 +2,14 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 
 from ..core.affine import Affine
 from ..core.ray import Ray
 from ..core.types import Flag, Scalar
 from ..core.vector import dot, largest_component, unit
 from ..scene.cylinder import Cylinder
-from .hit import Hit, _orthogonal
+from .hit import Hit, orthogonal_tangents
 from .status import Status
-from .walk_start import Origin
 
 
 class Tube(eqx.Module):
@@ -22,11 +20,6 @@ class Tube(eqx.Module):
     z_max: Scalar
     world_from_object: Affine
     object_from_world: Affine
-
-    @property
-    def sure(self) -> Flag:
-        """True, but not to the compiler: see `stored`."""
-        return lax.stop_gradient(self.radius) >= 0
 
 
 def make_tube(cylinder: Cylinder, world_from_object: Affine | None) -> Tube:
@@ -69,8 +62,9 @@ def tube_distance(tube: Tube, ray: Ray, left: Flag | None) -> tuple[Scalar, Flag
     return jnp.where(found, t, 0), found
 
 
-def _tube_interaction(tube: Tube, ray: Ray, origin: Origin | None, active: Flag | None, count_steps: bool) -> Hit:
-    t, found = tube_distance(tube, ray, None if origin is None else origin.here)
+def cylinder_hit(tube: Tube, ray: Ray, left: Flag | None, number: int, active: Flag | None, count_steps: bool) -> Hit:
+    """The first hit of a world-frame ray on a cylinder; `left` as in `tube_distance`, `number` that of its object."""
+    t, found = tube_distance(tube, ray, left)
     found = found if active is None else found & active
     valid = largest_component(ray.d) > 0
     t = jnp.where(found, t, 0)
@@ -84,13 +78,14 @@ def _tube_interaction(tube: Tube, ray: Ray, origin: Origin | None, active: Flag 
     n = unit(tube.object_from_world.covector(jnp.stack([x, y, zero])))
     dp_du = tube.world_from_object.vector(jnp.stack([-y, x, zero])) * turn
     dp_dv = tube.world_from_object.vector(jnp.stack([zero, zero, height]))
-    dp_du, dp_dv = _orthogonal(dp_du, dp_dv, n)
+    dp_du, dp_dv = orthogonal_tangents(dp_du, dp_dv, n)
     bend = tube.object_from_world.covector(jnp.stack([-y, x, zero])) * turn
     scale = dot(n, tube.object_from_world.covector(jnp.stack([x, y, zero])))
     none = jnp.zeros((), jnp.int32)
     met = found & valid
     return Hit(
         status=jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID)).astype(jnp.int32),
+        object=jnp.where(met, number, -1).astype(jnp.int32),
         t=jnp.where(met, t, jnp.inf),
         p=p,
         n=n,

@@ -7,9 +7,9 @@ from jax import lax
 from jaxtyping import Float
 
 from ..core.affine import Affine
+from ..core.powers import floor_to_power_of_two
 from ..core.settings import NormalScheme
 from ..core.types import Flag, Index, Scalar
-from ..core.vector import power_of_two
 from ..scene.heightfield import Heightfield
 from .normals import vertex_normals
 from .pyramid import Pyramid, make_pyramid
@@ -23,8 +23,8 @@ class Grid(eqx.Module):
     power of two, so that the walk sees the same bits whatever the offset, and neither over- nor underflows. Where the
     frame lies (lowest height, scale) is held constant under differentiation, as any choice of it gives the same surface.
 
-    What rays look up lies in rows one after the other, as it is looked up: XLA adds a tile's derivatives to such an array in
-    place, and to one that is reshaped on the way by way of a whole array of them for every tile.
+    Heights and normals are flat arrays, row after row: XLA adds a tile's derivatives to a flat array in place, where for one
+    that is reshaped on the way it makes a whole array for every tile (480 against 128 to 154 ms at 1024² heights).
 
     Attributes:
       rows: heights; a hole is nan.
@@ -52,11 +52,6 @@ class Grid(eqx.Module):
         return self.rows.reshape(self.shape)
 
     @property
-    def sure(self) -> Flag:
-        """True, but not to the compiler: see `stored`."""
-        return lax.stop_gradient(self.z_top) >= 0
-
-    @property
     def cells(self) -> tuple[int, int]:
         """Cells along x and along y."""
         ny, nx = self.shape
@@ -79,7 +74,7 @@ def make_grid(
     finite = jnp.isfinite(heights)
     known = lax.stop_gradient(jnp.where(finite, heights, 0))
     largest = jnp.max(jnp.abs(known))
-    unit_height = power_of_two(jnp.where(largest > 0, largest, 1))
+    unit_height = floor_to_power_of_two(jnp.where(largest > 0, largest, 1))
     lowest = jnp.min(jnp.where(finite, known, jnp.inf), initial=jnp.inf)
     lowest = jnp.where(finite.any(), lowest, 0)
     z = jnp.where(finite, heights / unit_height - lowest / unit_height, jnp.nan)

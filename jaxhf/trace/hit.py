@@ -15,11 +15,12 @@ class Hit(eqx.Module):
 
     Attributes:
       status: see `Status`.
+      object: its number in the scene's `objects`; -1 unless `status` is HIT.
       t: the ray's parameter at the hit; infinite where there is none.
       p: the point, on the surface rather than on the ray.
       n: unit normal of the triangle, on the surface's +z side (a cylinder: outwards).
       ns: unit shading normal, interpolated between the vertices; `n` with flat shading.
-      uv: place in the footprint, 0..1 over the whole grid.
+      uv: position in the footprint, 0..1 over the whole grid.
       dp_du, dp_dv: tangents, orthogonal to `ns` and to each other (Gram-Schmidt in this order).
       dn_du, dn_dv: derivatives of `ns`.
       cell: (ix, iy).
@@ -29,6 +30,7 @@ class Hit(eqx.Module):
     """
 
     status: Index
+    object: Index
     t: Scalar
     p: Vector
     n: Vector
@@ -44,7 +46,8 @@ class Hit(eqx.Module):
     steps: Index | None = None
 
 
-def _orthogonal(per_u: Vector, per_v: Vector, ns: Vector) -> tuple[Vector, Vector]:
+def orthogonal_tangents(per_u: Vector, per_v: Vector, ns: Vector) -> tuple[Vector, Vector]:
+    """Tangents orthogonal to `ns` and to each other, from those of the surface (Gram-Schmidt in this order)."""
     dp_du = per_u - ns * dot(ns, per_u)
     along = unit(dp_du)
     return dp_du, per_v - ns * dot(ns, per_v) - along * dot(along, per_v)

@@ -1,4 +1,4 @@
-"""What stands where the ray meets a surface. Every derivative starts here.
+"""What stands where a ray meets a surface. Every derivative starts here.
 
 The walk has said which triangle; the hit is computed again from that triangle's plane in plain differentiable
 arithmetic, so the derivative costs no memory a step and works in forward and in reverse mode.
@@ -6,28 +6,140 @@ arithmetic, so the derivative costs no memory a step and works in forward and in
 
 import dataclasses
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 
 from ..core.masked import only_where
-from ..core.materialise import stored
+from ..core.materialise import materialise
+from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
-from ..core.settings import Settings
 from ..core.types import Flag, Scalar, Vector
-from ..core.vector import dot, finite, largest_component, power_of_two, unit
-from .cylinder import Tube, _tube_interaction, tube_distance
+from ..core.vector import dot, finite, largest_component, unit
+from .cylinder import Tube, cylinder_hit, tube_distance
 from .grid import Grid, triangle_plane
-from .hit import Hit, _orthogonal
-from .search import first_hit
+from .hit import Hit, orthogonal_tangents
+from .search import first_triangle
 from .status import Status
 from .triangle import plane_through, triangle_corners
-from .walk import CellHit
-from .walk_start import Departure, Origin
+from .walk import WalkResult
+from .walk_start import place_on_grid
+
+Surface = Grid | Tube
 
 
-def distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: CellHit) -> Scalar:
+def intersect(
+    surface: Surface,
+    number: int,
+    ray: Ray,
+    *,
+    max_steps: int | None,
+    leaving: Hit | None = None,
+    active: Flag | None = None,
+    count_steps: bool = False,
+) -> Hit:
+    """The first hit of a world-frame ray on one surface.
+
+    Args:
+      surface: a prepared shape.
+      number: of its object, for `Hit.object`.
+      ray: one that is not finite, or whose `d` is zero, ends as INVALID.
+      max_steps: see `first_triangle`.
+      leaving: the hit from which the ray starts, on this surface or on another one, see `first_triangle`; None for rays that
+        start in free space.
+      active: False spares the ray the search: it ends as a miss.
+      count_steps: whether to count the steps of the search.
+    """
+    valid = finite(ray.o) & finite(ray.d)
+    ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
+    if isinstance(surface, Tube):
+        left = None if leaving is None else leaving.object == number
+        return materialise(cylinder_hit(surface, ray, left, number, active, count_steps))
+    local, scale = _in_grid(surface, ray)
+    found = first_triangle(
+        surface, local, max_steps=max_steps, active=active, leaving=leaving, number=number, count_steps=count_steps
+    )
+    found = materialise(found)
+    met = found.status == int(Status.HIT)
+    hit = surface_hit(surface, local, found)
+    t = jnp.where(met, hit.t / scale, jnp.inf)
+    hit = materialise(dataclasses.replace(hit, t=t, status=found.status, steps=found.steps))
+    return dataclasses.replace(hit, object=jnp.where(met, number, -1).astype(jnp.int32))
+
+
+def blocked(
+    surface: Surface,
+    number: int,
+    ray: Ray,
+    leaving: Hit,
+    *,
+    max_steps: int | None,
+    active: Flag,
+    t_max: Scalar | None,
+) -> tuple[Flag, Flag]:
+    """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out; no derivative."""
+    if isinstance(surface, Tube):
+        t, found = lax.stop_gradient(tube_distance(surface, ray, leaving.object == number))
+        return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
+    local, scale = _in_grid(surface, ray)
+    t_max = None if t_max is None else t_max * scale
+    grid, local, t_max = lax.stop_gradient((surface, local, t_max))
+    found = first_triangle(grid, local, max_steps=max_steps, active=active, leaving=leaving, number=number, t_max=t_max)
+    met = found.status == int(Status.HIT)
+    if t_max is not None:
+        plane = triangle_plane(grid, found.ix, found.iy, found.upper)
+        met = met & (plane_distance(plane, local, found) < t_max)
+    return met, found.status == int(Status.EXHAUSTED)
+
+
+def leave(grid: Grid, number: int, hit: Hit, d: Vector) -> tuple[Ray, Hit]:
+    """The ray along `d` (world frame) from a hit on `grid`, on the side of its triangle to which `d` points, and that hit.
+
+    It starts at the hit's position in the footprint and at the surface's height there, as `hit.p` may be far from the grid's
+    own corner, and coarse. A ray in the plane of the triangle stays on the side that the hit was met from. A hit that is
+    none gives a ray that is not valid.
+    """
+    ahead = dot(unit(d), hit.n)
+    side = jnp.where(ahead == 0, hit.side, jnp.where(ahead > 0, 1, -1).astype(hit.side.dtype))
+    ix, iy, x, y = place_on_grid(grid, hit)
+    a, b, c = triangle_plane(grid, ix, iy, hit.triangle == 1)
+    u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
+    p = grid.world_from_grid.point(jnp.stack([x, y, c + a * u + b * v]))
+    leaving = dataclasses.replace(hit, side=side, object=jnp.full_like(hit.object, number))
+    return Ray(p, jnp.where(hit.status == int(Status.HIT), d, 0)), leaving
+
+
+def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
+    """The ray in the grid's frame, with a `d` of length around 1, and by how much its t is longer there.
+
+    The factor is a power of two, so that no bit changes; without it t would leave the range in which the walk's
+    distances can be told from infinite ones, where heights and cells differ by many orders of magnitude.
+    """
+    local = grid.grid_from_world.ray(ray)
+    size = largest_component(local.d)
+    scale = floor_to_power_of_two(jnp.where(size > 0, size, 1))
+    return materialise((Ray(local.o, local.d / scale), scale))
+
+
+def surface_hit(grid: Grid, ray: Ray, found: WalkResult) -> Hit:
+    """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray (grid frame).
+
+    Heights and normals at the vertices are fetched before the conditional, which in a reverse derivative would return the
+    derivative of all heights and normals once a tile.
+    """
+    nx, triangle = grid.shape[1], (found.ix, found.iy, found.upper)
+    heights = triangle_corners(grid.rows, nx, *triangle)
+    normals = None if grid.normals is None else triangle_corners(grid.normals, nx, *triangle)
+    if grid.perturbation is not None:
+        heights = _moved(heights, grid.perturbation.heights)
+        if normals is not None and grid.perturbation.normals is not None:
+            normals = _moved(normals, grid.perturbation.normals)
+    plane = plane_through(heights, found.upper)
+    met = found.status == int(Status.HIT)
+    return only_where(met, _interaction, grid, ray, found, plane, normals)
+
+
+def plane_distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: WalkResult) -> Scalar:
     """t at which `ray` (in the grid's frame) meets the plane of the triangle that was found, see `triangle_plane`.
 
     Plain arithmetic that is differentiable in the heights and in the ray. It starts at the cell, as the subtraction
@@ -49,121 +161,6 @@ def distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: CellHit) -> 
     return t + lax.stop_gradient(jnp.clip(t, found.t_near, found.t_far) - t)
 
 
-def occluded(
-    grid: Grid, ray: Ray, *, max_steps: int | None, active: Flag, departure: Departure | None, t_max: Scalar | None
-) -> tuple[Flag, Flag]:
-    """Whether `ray` (in the grid's frame) meets the surface before `t_max`, and whether its budget ran out."""
-    grid, ray, t_max = lax.stop_gradient((grid, ray, t_max))
-    found = first_hit(grid, ray, max_steps=max_steps, active=active, departure=departure, t_max=t_max)
-    blocked = found.status == int(Status.HIT)
-    if t_max is not None:
-        plane = triangle_plane(grid, found.ix, found.iy, found.upper)
-        blocked = blocked & (distance(plane, ray, found) < t_max)
-    return blocked, found.status == int(Status.EXHAUSTED)
-
-
-Surface = Grid | Tube
-
-
-def leave(grid: Grid, hit: Hit, d: Vector) -> tuple[Ray, Origin]:
-    """The ray along `d` (world frame) from a hit on `grid`, on the side of its triangle to which `d` points.
-
-    It starts at the hit's place in the footprint and at the surface's height there, as `hit.p` may be far from the grid's
-    own corner, and coarse. A ray in the plane of the triangle stays on the side that the hit was met from. A hit that is
-    none gives a ray that is not valid.
-    """
-    ahead = dot(unit(d), hit.n)
-    side = jnp.where(ahead == 0, hit.side, jnp.where(ahead > 0, 1, -1).astype(hit.side.dtype))
-    origin = Origin(eqx.tree_at(lambda hit: hit.side, hit, side), jnp.ones((), bool))
-    at = origin.departure(grid)
-    a, b, c = triangle_plane(grid, at.ix, at.iy, at.upper)
-    u, v = at.x - at.ix.astype(at.x.dtype), at.y - at.iy.astype(at.y.dtype)
-    p = grid.world_from_grid.point(jnp.stack([at.x, at.y, c + a * u + b * v]))
-    return Ray(p, jnp.where(hit.status == int(Status.HIT), d, 0)), origin
-
-
-def intersect(
-    surface: Surface,
-    ray: Ray,
-    settings: Settings,
-    origin: Origin | None = None,
-    active: Flag | None = None,
-    count_steps: bool = False,
-) -> Hit:
-    """The first hit of a world-frame ray on one surface.
-
-    Args:
-      surface: a prepared shape.
-      ray: one that is not finite, or whose `d` is zero, ends as INVALID.
-      settings: its max_steps counts here.
-      origin: None for rays that start in free space.
-      active: False spares the ray the search: it ends as a miss.
-      count_steps: whether to count the steps of the search.
-    """
-    valid = finite(ray.o) & finite(ray.d)
-    ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
-    if isinstance(surface, Tube):
-        return stored(_tube_interaction(surface, ray, origin, active, count_steps), surface.sure)
-    local, scale = _in_grid(surface, ray)
-    found = first_hit(
-        surface,
-        local,
-        max_steps=settings.max_steps,
-        active=active,
-        departure=None if origin is None else stored(origin.departure(surface), surface.sure),
-        count_steps=count_steps,
-    )
-    found = stored(found, surface.sure)
-    met = found.status == int(Status.HIT)
-    hit = surface_interaction(surface, local, found)
-    t = jnp.where(met, hit.t / scale, jnp.inf)
-    hit = dataclasses.replace(hit, t=t, status=found.status, steps=found.steps)
-    return stored(hit, surface.sure)
-
-
-def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
-    """The ray in the grid's frame, with a `d` of length around 1, and by how much its t is longer there.
-
-    The factor is a power of two, so that no bit changes; without it t would leave the range in which the walk's
-    distances can be told from infinite ones, where heights and cells differ by many orders of magnitude.
-    """
-    local = grid.grid_from_world.ray(ray)
-    size = largest_component(local.d)
-    scale = power_of_two(jnp.where(size > 0, size, 1))
-    return stored((Ray(local.o, local.d / scale), scale), grid.sure)
-
-
-def blocked(
-    surface: Surface, ray: Ray, settings: Settings, origin: Origin, active: Flag, t_max: Scalar | None
-) -> tuple[Flag, Flag]:
-    """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out; no derivative."""
-    if isinstance(surface, Tube):
-        t, found = lax.stop_gradient(tube_distance(surface, ray, origin.here))
-        return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
-    local, scale = _in_grid(surface, ray)
-    departure = stored(origin.departure(surface), surface.sure)
-    t_max = None if t_max is None else t_max * scale
-    return occluded(surface, local, max_steps=settings.max_steps, active=active, departure=departure, t_max=t_max)
-
-
-def surface_interaction(grid: Grid, ray: Ray, found: CellHit) -> Hit:
-    """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray (grid frame).
-
-    What stands at the vertices is fetched before the conditional, which in a reverse derivative would return the derivative
-    of all heights and normals once a tile.
-    """
-    nx, place = grid.shape[1], (found.ix, found.iy, found.upper)
-    heights = triangle_corners(grid.rows, nx, *place)
-    normals = None if grid.normals is None else triangle_corners(grid.normals, nx, *place)
-    if grid.perturbation is not None:
-        heights = _moved(heights, grid.perturbation.heights)
-        if normals is not None and grid.perturbation.normals is not None:
-            normals = _moved(normals, grid.perturbation.normals)
-    plane = plane_through(heights, found.upper)
-    met = found.status == int(Status.HIT)
-    return only_where(met, _interaction, grid, ray, found, plane, normals)
-
-
 def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     a, b, c = corners
     return a + by[0], b + by[1], c + by[2]
@@ -172,32 +169,33 @@ def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array) -> tu
 def _interaction(
     grid: Grid,
     ray: Ray,
-    found: CellHit,
+    found: WalkResult,
     plane: tuple[Scalar, Scalar, Scalar],
     normals: tuple[Vector, Vector, Vector] | None,
 ) -> Hit:
-    """As `surface_interaction`, from the triangle's plane and the normals at its vertices."""
-    t = distance(plane, ray, found)
+    """As `surface_hit`, from the triangle's plane and the normals at its vertices."""
+    t = plane_distance(plane, ray, found)
     dtype = t.dtype
-    place = ray(t)
-    u, v = place[0] - found.ix.astype(dtype), place[1] - found.iy.astype(dtype)
-    t, place, u, v, (a, b, c) = stored((t, place, u, v, plane), grid.sure)
-    p = grid.world_from_grid.point(jnp.stack([place[0], place[1], c + a * u + b * v]))
+    x, y, _ = ray(t)
+    u, v = x - found.ix.astype(dtype), y - found.iy.astype(dtype)
+    t, x, y, u, v, (a, b, c) = materialise((t, x, y, u, v, plane))
+    p = grid.world_from_grid.point(jnp.stack([x, y, c + a * u + b * v]))
     one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
     n = unit(grid.grid_from_world.covector(jnp.stack([-a, -b, one])))
     cells_x, cells_y = grid.cells
     per_u = grid.world_from_grid.vector(jnp.stack([one, zero, a])) * cells_x
     per_v = grid.world_from_grid.vector(jnp.stack([zero, one, b])) * cells_y
     ns, dn_du, dn_dv = _shading_normal(grid, found.upper, normals, u, v, n)
-    dp_du, dp_dv = _orthogonal(per_u, per_v, ns)
+    dp_du, dp_dv = orthogonal_tangents(per_u, per_v, ns)
     met = found.status == int(Status.HIT)
     return Hit(
         status=found.status,
+        object=jnp.full_like(found.status, -1),  # `intersect` knows it
         t=jnp.where(met, t, jnp.inf),
         p=p,
         n=n,
         ns=ns,
-        uv=jnp.stack([place[0] / cells_x, place[1] / cells_y]),
+        uv=jnp.stack([x / cells_x, y / cells_y]),
         dp_du=dp_du,
         dp_dv=dp_dv,
         dn_du=dn_du * cells_x,

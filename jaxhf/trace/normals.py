@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.materialise import stored
+from ..core.materialise import materialise
+from ..core.powers import floor_to_power_of_two
 from ..core.settings import NormalScheme
 from ..core.types import AnyArray
-from ..core.vector import power_of_two
 
 # The triangles round a vertex, counter-clockwise: each is spanned by two neighbouring offsets (ix, iy).
 _FANS = {
@@ -32,7 +32,7 @@ def vertex_normals(
     # Products of two huge heights would be larger than any number in single precision. Any unit will do, and a power of two
     # changes no bit.
     largest = jnp.max(jnp.abs(jnp.where(jnp.isfinite(heights), heights, 0)))
-    unit = power_of_two(jnp.maximum(largest * 2.0**-61, 1))
+    unit = floor_to_power_of_two(jnp.maximum(largest * 2.0**-61, 1))
     if scheme == "central":
         return _central(heights / unit, dx, dy, 1 / unit)
     weight = {"six": "area", "six-angle": "angle"}.get(scheme, "equal")
@@ -73,7 +73,6 @@ def _fan_mean(heights, dx, dy, fan, weight):
     at = _neighbours(heights)
     here, here_present = at(0, 0)
     total_x = total_y = total_z = jnp.zeros_like(here)
-    sure = jnp.sum(here_present, dtype=jnp.int32) >= 0
     for (ax, ay), (bx, by) in zip(fan, fan[1:] + fan[:1], strict=True):
         (a, a_present), (b, b_present) = at(ax, ay), at(bx, by)
         present = here_present & a_present & b_present
@@ -85,7 +84,7 @@ def _fan_mean(heights, dx, dy, fan, weight):
             share = 1 / length
             if weight == "angle":
                 share = share * jnp.atan2(length, ax * bx * dx * dx + ay * by * dy * dy + az * bz)
-            share = stored(share, sure)
+            share = materialise(share)
             x, y, z = x * share, y * share, z * share
         total_x, total_y, total_z = total_x + x, total_y + y, total_z + z
     # Zero, where there is no triangle; or less than any number, beside slopes that are larger than any.

@@ -1,4 +1,4 @@
-"""Bounds of the heights over square blocks of cells, at every size: a min-max quadtree, stored as a mip chain."""
+"""Bounds of the heights over square blocks of cells, at every size: a min-max quadtree in the form of a mip chain."""
 
 import equinox as eqx
 import jax
@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
 
+from ..core.powers import next_power_of_two
 from ..core.types import Flag, Index, Scalar
 
 
@@ -13,7 +14,7 @@ class Pyramid(eqx.Module):
     """For each block of 2^level x 2^level cells, the highest its surface reaches, and the lowest.
 
     After Tevs, Ihrke and Seidel (Maximum mipmaps for fast, accurate, and scalable dynamic height field rendering, I3D
-    2008), with both bounds. Which of the two can stop a ray depends on its side of the surface, so each is stored in a
+    2008), with both bounds. Which of the two can stop a ray depends on its side of the surface, so each is kept in a
     form in which a ray is clear of the block where it stays above the bound: the highest as it is, the lowest negated.
 
     Blocks are rounded outwards by 32 units in the last place of the largest height, more than a height on the ray or on
@@ -35,14 +36,9 @@ class Pyramid(eqx.Module):
         """That of the block of `level` which holds the cell (ix, iy), for a ray above or below the surface."""
         first_row = 2 * self.height - lax.shift_right_logical(jnp.full_like(level, 2 * self.height), level)
         row = first_row + lax.shift_right_logical(iy, level)
-        place = row * self.width + lax.shift_right_logical(ix, level)
-        place = place + jnp.where(above, 0, self.bounds.shape[0] // 2)
-        return self.bounds.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-
-def power_of_two(count: int) -> int:
-    """The least power of two that is at least 2 and `count`."""
-    return 1 << max(1, (count - 1).bit_length())
+        index = row * self.width + lax.shift_right_logical(ix, level)
+        index = index + jnp.where(above, 0, self.bounds.shape[0] // 2)
+        return self.bounds.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None) -> Pyramid:
@@ -54,7 +50,7 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None
       levels: how many above the finest; None: until a block spans the shorter side.
     """
     ny, nx = z.shape
-    width, height = power_of_two(nx - 1), power_of_two(ny - 1)
+    width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)
     most = min(width, height).bit_length() - 1
     levels = most if levels is None else min(levels, most)
     outwards = 32 * jnp.finfo(z.dtype).eps * z_top

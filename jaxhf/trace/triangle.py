@@ -11,14 +11,14 @@ from ..core.types import Flag, Index, Scalar
 
 
 class Corners(eqx.Module):
-    """What stands at the vertices 00, between and 11 of a triangle: heights, shape (3,); normals, (3, 3), or None."""
+    """Heights (3,) and normals (3, 3), or None, at the vertices of a triangle: 00, the one between (10 or 01), and 11."""
 
     heights: Float[jax.Array, "3"]
     normals: Float[jax.Array, "3 3"] | None
 
 
 def corners(rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index) -> tuple[jax.Array, ...]:
-    """What stands at the vertices 00, 10, 01, 11 of a cell that is in range; rows have nx vertices."""
+    """The values at the vertices 00, 10, 01, 11 of a cell that is in range, from a flat array whose rows have nx vertices."""
     first = iy * nx + ix
     return tuple(_at(rows, first + further) for further in (0, 1, nx, nx + 1))
 
@@ -26,19 +26,19 @@ def corners(rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: In
 def triangle_corners(
     rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index, upper: Flag
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """What stands at the vertices of a triangle of a cell in range: 00, that between (10, or 01 in the upper), and 11."""
-    first, between, last = triangle_places(nx, ix, iy, upper)
+    """The values at the vertices of a triangle of a cell in range: 00, the one between (10, or 01 in the upper), and 11."""
+    first, between, last = triangle_vertices(nx, ix, iy, upper)
     return _at(rows, first), _at(rows, between), _at(rows, last)
 
 
-def triangle_places(nx: int, ix: Index, iy: Index, upper: Flag) -> tuple[Index, Index, Index]:
-    """Where these vertices are in the rows."""
+def triangle_vertices(nx: int, ix: Index, iy: Index, upper: Flag) -> tuple[Index, Index, Index]:
+    """The numbers of these vertices, row by row."""
     first = iy * nx + ix
     return first, first + jnp.where(upper, nx, 1), first + nx + 1
 
 
-def _at(rows: Float[jax.Array, "vertices *rest"], place: Index) -> jax.Array:
-    return rows.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+def _at(rows: Float[jax.Array, "vertices *rest"], index: Index) -> jax.Array:
+    return rows.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def plane_through(heights: Any, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:

@@ -41,7 +41,7 @@ WALKING = int(Status.EXHAUSTED)  # what a walk that still goes on ends with when
 LEAVING = 3  # still in the triangle that the ray starts from
 
 
-class CellHit(eqx.Module):
+class WalkResult(eqx.Module):
     """Where a walk ended.
 
     Attributes:
@@ -63,7 +63,7 @@ class CellHit(eqx.Module):
     steps: Index | None
 
 
-def walking(state: UInt32[jax.Array, "*lanes"]) -> Bool[jax.Array, "*lanes"]:
+def walking(state: UInt32[jax.Array, "*batch"]) -> Bool[jax.Array, "*batch"]:
     """Whether the walk goes on; of one ray or of several."""
     return (state & 3) >= WALKING
 
@@ -252,7 +252,7 @@ class Walk(eqx.Module):
         along = lesser(greater(along, jnp.zeros_like(along)), jnp.ones_like(along))
         return t * self.dz - ((low - self.z_ray) + along * (high - low))
 
-    def finish(self, state: jax.Array, valid: Flag, steps: Index | None) -> CellHit:
+    def finish(self, state: jax.Array, valid: Flag, steps: Index | None) -> WalkResult:
         met = (state & 3) == HIT
         above, code, iy = self._fields(state)
         ix, iy = jnp.where(met, code >> 1, 0), jnp.where(met, iy, 0)
@@ -266,7 +266,7 @@ class Walk(eqx.Module):
         near, far = jnp.where(crosses & ~before, diagonal, near), jnp.where(crosses & before, diagonal, far)
         ended = jnp.where(walking(state), WALKING, (state & 3).astype(jnp.int32))
         flip_x, flip_y = self.flip
-        return CellHit(
+        return WalkResult(
             status=jnp.where(valid, ended, int(Status.INVALID)).astype(jnp.int32),
             ix=jnp.where(met, ix ^ flip_x, 0),
             iy=jnp.where(met, iy ^ flip_y, 0),

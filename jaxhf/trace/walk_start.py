@@ -1,9 +1,11 @@
-"""Where a ray's walk over a grid begins."""
+"""Where a ray's walk over a grid starts: at the border of the surface's box, or at the hit that the ray leaves."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 
+from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
 from ..core.vector import finite, lesser
@@ -12,11 +14,11 @@ from .hit import Hit
 from .walk import FAR, LEAVING, MISS, WALKING, Walk, reciprocal
 
 
-class Departure(eqx.Module):
-    """The place on a surface that a ray leaves, so that it cannot meet the same triangle again.
+class _SurfaceStart(eqx.Module):
+    """Where on this grid a ray starts from a hit.
 
     Attributes:
-      active: False for a ray that starts anywhere else.
+      active: False for a ray that starts anywhere else; the rest then means nothing.
       ix, iy, upper: the triangle.
       x, y: the point in grid coordinates.
       side: 1 where the ray leaves on the +z side, else -1.
@@ -31,46 +33,31 @@ class Departure(eqx.Module):
     side: Index
 
 
-class Origin(eqx.Module):
-    """The hit that a ray starts from, and on which surface that hit lies.
-
-    A ray that leaves a triangle cannot meet it again, and lies on a known side of it; knowing this replaces the usual
-    offset by an epsilon.
-    """
-
-    hit: Hit
-    here: Flag
-
-    def departure(self, grid: Grid) -> Departure:
-        """As the walk over `grid` takes it; in range also where the hit lies on another surface."""
-        cells_x, cells_y = grid.cells
-        cell = jnp.clip(self.hit.cell, 0, jnp.array([cells_x - 1, cells_y - 1], self.hit.cell.dtype))
-        return Departure(
-            active=self.here,
-            ix=cell[0],
-            iy=cell[1],
-            upper=self.hit.triangle == 1,
-            x=self.hit.uv[0] * cells_x,
-            y=self.hit.uv[1] * cells_y,
-            side=self.hit.side,
-        )
+def _surface_start(grid: Grid, leaving: Hit, number: int) -> _SurfaceStart:
+    ix, iy, x, y = place_on_grid(grid, leaving)
+    start = _SurfaceStart(leaving.object == number, ix, iy, leaving.triangle == 1, x, y, leaving.side)
+    return lax.stop_gradient(materialise(start))
 
 
-def begin(
-    grid: Grid,
-    ray: Ray,
-    departure: Departure | None,
-    t_max: Scalar | None,
-    active: Flag | None,
+def place_on_grid(grid: Grid, hit: Hit) -> tuple[Index, Index, Scalar, Scalar]:
+    """The cell of a hit, and its point in grid coordinates; in range also where the hit lies on another surface."""
+    cells_x, cells_y = grid.cells
+    cell = jnp.clip(hit.cell, 0, jnp.array([cells_x - 1, cells_y - 1], hit.cell.dtype))
+    return cell[0], cell[1], hit.uv[0] * cells_x, hit.uv[1] * cells_y
+
+
+def walk_start(
+    grid: Grid, ray: Ray, leaving: Hit | None, number: int, t_max: Scalar | None, active: Flag | None
 ) -> tuple[Walk, jax.Array, Flag]:
-    """A walk, the state in which it begins, and whether the ray is finite and has a direction.
+    """The constants of a ray's walk, the state in which it starts, and whether the ray is finite and has a direction.
 
     Args:
       grid: the surface.
       ray: in the grid's frame.
-      departure: for rays that leave this surface.
+      leaving: the hit from which the ray starts, see `first_triangle`; None for rays that start in free space.
+      number: of the grid's object, as in `Hit.object`.
       t_max: where to give up.
-      active: False: the walk does not begin at all.
+      active: False: the walk ends before its first step.
     """
     width, height = grid.pyramid.width, grid.pyramid.height
     assert 3 + width.bit_length() + (height - 1).bit_length() <= 32, "Heightfield checks that a walk's state fits"
@@ -84,8 +71,9 @@ def begin(
     x = jnp.clip(ray.o[0] + t_start * dx, 0, cells_x * inside)
     y = jnp.clip(ray.o[1] + t_start * dy, 0, cells_y * inside)
     z_ray = jnp.clip(ray.o[2] + t_start * dz, 0, grid.z_top)
-    if departure is not None:
-        away, at = departure.active, departure
+    start = None if leaving is None else _surface_start(grid, leaving, number)
+    if start is not None:
+        away, at = start.active, start
         a, b, c = triangle_plane(grid, at.ix, at.iy, at.upper)
         on_triangle = c + a * (at.x - at.ix.astype(x.dtype)) + b * (at.y - at.iy.astype(y.dtype))
         enters, t_start = enters | away, jnp.where(away, 0, t_start)
@@ -118,8 +106,8 @@ def begin(
         t_start=t_start,
         t_end=jnp.where(inv_z > 0, grid.z_top - z_ray, -z_ray) * inv_z,
         t_stop=jnp.full_like(x, jnp.inf),
-        ahead=None if departure is None else (departure.upper == begins_upper) & (rate != 0),
-        noise=None if departure is None else jnp.where(departure.active, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
+        ahead=None if start is None else (start.upper == begins_upper) & (rate != 0),
+        noise=None if start is None else jnp.where(start.active, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
     )
     t_stop = lesser(lesser(walk.distance_x(end_x), walk.distance_y(end_y)), walk.t_end)
     walk = eqx.tree_at(lambda walk: walk.t_stop, walk, t_stop if t_max is None else lesser(t_stop, t_max - t_start))
@@ -137,8 +125,8 @@ def begin(
     above = jnp.where(through_end, dz < 0, gap >= 0)
     going = enters if active is None else enters & active
     status = jnp.where(going, WALKING, MISS)
-    if departure is not None:
-        away, at = departure.active, departure
+    if start is not None:
+        away, at = start.active, start
         ix, iy = jnp.where(away, at.ix ^ flip_x, ix), jnp.where(away, at.iy ^ flip_y, iy)
         above = jnp.where(away, at.side > 0, above)
         status = jnp.where(going & away, LEAVING, status)
@@ -146,7 +134,7 @@ def begin(
 
 
 def _enter(grid: Grid, ray: Ray, inverse: tuple[Scalar, Scalar, Scalar], valid: Flag) -> tuple[Scalar, Flag, Flag]:
-    """Where the ray enters the surface's box, whether it does, and whether it comes through the floor or the ceiling.
+    """t at which the ray enters the surface's box, whether it does, and whether it comes through the floor or the ceiling.
 
     In the last case its side of the surface is known, whatever the rounding of the height there. The far distances are
     widened by the rounding of the operations behind them, so that no ray along a face is lost (Ize, Robust BVH ray

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.boundary import guiding as _lottery
+from jaxhf.boundary.guiding import make_distribution
 
 EDGES = jaxhf.Settings(samples=16, edge_samples=2000)
 INTERIOR = jaxhf.Settings(samples=16)
@@ -336,16 +336,16 @@ def test_whole_picture_against_central_differences(kind):
     assert max(errors.values()) < 0.12, errors  # 0.088 for the heights of the sheet, 0.067 for the sun, else 0.033
 
 
-def test_lottery_is_exact_in_single_precision():
+def test_distribution_is_exact_in_single_precision():
     """A million weights of which a few are large: a running sum in single precision would lose the small ones."""
     weights = np.full(2**20, 1e-9, np.float32)
     weights[::65536] = 1
-    lottery = _lottery.make_lottery(jnp.asarray(weights), jnp.asarray(1000, jnp.int32))
-    tickets = np.diff(np.asarray(lottery.cumulative, np.int64), prepend=0)
-    assert tickets.min() == 1
-    np.testing.assert_allclose(tickets[::65536], 2**30 / 16, rtol=2e-3)
-    assert 1000 * int(lottery.stratum) >= tickets.sum()
-    assert tickets.sum() < 2**31
+    guiding = make_distribution(jnp.asarray(weights), jnp.asarray(1000, jnp.int32))
+    integers = np.diff(np.asarray(guiding.cumulative, np.int64), prepend=0)
+    assert integers.min() == 1
+    np.testing.assert_allclose(integers[::65536], 2**30 / 16, rtol=2e-3)
+    assert 1000 * int(guiding.stratum) >= integers.sum()
+    assert integers.sum() < 2**31
 
 
 def test_refusals():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.boundary.sample import EdgePoint, deciding_vertices, picture_point
+from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
 from jaxhf.core.devices import local_mesh
 from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each
 from jaxhf.scene.localise import localise
@@ -90,7 +90,7 @@ def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(surface, rece
     settings = jaxhf.Settings(edge_samples=1)
     scene = localise(terrains("all"))
     world, camera = make_world(scene, settings), scene.camera
-    point = EdgePoint(
+    point = BoundarySample(
         valid=jnp.asarray(True), edge=jnp.int32(0), surface=jnp.int32(surface), light=jnp.int32(0),
         start=jnp.array([5, 6], jnp.int32), end=jnp.array([6, 7], jnp.int32), s=jnp.asarray(0.3), measure=jnp.asarray(1.0),
         receiver=jnp.int32(receiver), cell=jnp.array([2, 1], jnp.int32), upper=jnp.asarray(True), t=jnp.asarray(0.4),
@@ -101,17 +101,17 @@ def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(surface, rece
             world.surfaces[0],
             *(eqx.tree_at(lambda g: g.rows, g, r) for g, r in zip(world.surfaces[1:], rows, strict=True)),
         ]
-        return picture_point(eqx.tree_at(lambda w: w.surfaces, world, tuple(surfaces)), camera, settings, point, point.s)[0]
+        return picture_point(eqx.tree_at(lambda w: w.surfaces, world, tuple(surfaces)), camera, point, point.s)[0]
 
     expected = jnp.concatenate(
         jax.jit(jax.jacrev(by_rows))([grid.rows for grid in world.surfaces if isinstance(grid, Grid)]), axis=1
     )
 
     def by_five(perturbation):
-        return picture_point(world, camera, settings, point, point.s, perturbation=perturbation)[0]
+        return picture_point(world, camera, point, point.s, perturbation=perturbation)[0]
 
-    places = deciding_vertices(world, point)
-    found = jnp.zeros_like(expected).at[:, places].add(jax.jit(jax.jacrev(by_five))(jnp.zeros(5)))
+    vertices = deciding_vertices(world, point)
+    found = jnp.zeros_like(expected).at[:, vertices].add(jax.jit(jax.jacrev(by_five))(jnp.zeros(5)))
     assert np.count_nonzero(expected) == 10
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 

@@ -74,17 +74,17 @@ def _within_rounding(scene: jaxhf.Scene, ref: dict[str, np.ndarray], x: int, y: 
     exact = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), scene)
     dx, dy = np.meshgrid(np.linspace(-1e-3, 1e-3, 5), np.linspace(-1e-3, 1e-3, 5))
     around = cast_camera(exact, x + 0.5 + dx.ravel(), y + 0.5 + dy.ravel())
-    same_kind = kinds(scene)[np.asarray(around.index) + 1] == ref["kind"][y, x]
-    if (same_kind & (np.abs(np.asarray(around.hit.t) - ref["t"][y, x]) <= 1e-3 * ref["t"][y, x])).any():
+    same_kind = kinds(scene)[np.asarray(around.object) + 1] == ref["kind"][y, x]
+    if (same_kind & (np.abs(np.asarray(around.t) - ref["t"][y, x]) <= 1e-3 * ref["t"][y, x])).any():
         return True
     centre = jax.tree.map(lambda leaf: np.asarray(leaf)[12], around)
-    shape = scene.objects[centre.index].shape
+    shape = scene.objects[centre.object].shape
     if not isinstance(shape, jaxhf.Heightfield):
         return False
     ny, nx = shape.heights.shape
-    u, v = centre.hit.uv * (nx - 1, ny - 1) - centre.hit.cell
+    u, v = centre.uv * (nx - 1, ny - 1) - centre.cell
     to_border = min(u, v, 1 - u, 1 - v, abs(u - v))
-    return to_border < 1e-4 and centre.hit.t < ref["t"][y, x]
+    return to_border < 1e-4 and centre.t < ref["t"][y, x]
 
 
 @pytest.mark.parametrize("name", SCENES)

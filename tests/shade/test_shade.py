@@ -326,8 +326,8 @@ def test_mirrored_ray_never_enters_its_triangle():
     @jax.vmap
     def reflected(d, n, ns, side):
         hit = jaxhf.Hit(
-            status=whole, t=zero[0], p=zero, n=n, ns=ns, uv=zero[:2], dp_du=zero, dp_dv=zero, dn_du=zero, dn_dv=zero,
-            cell=jnp.zeros(2, jnp.int32), triangle=whole, side=side,
+            status=whole, object=whole, t=zero[0], p=zero, n=n, ns=ns, uv=zero[:2], dp_du=zero, dp_dv=zero, dn_du=zero,
+            dn_dv=zero, cell=jnp.zeros(2, jnp.int32), triangle=whole, side=side,
         )  # fmt: skip
         return _reflect(d, hit)
 

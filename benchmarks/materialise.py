@@ -1,6 +1,7 @@
-"""What `stored` is worth: frames with it, with nothing in its place, and with `lax.optimization_barrier`."""
+"""What `materialise` is worth: frames with it, with nothing in its place, and with `lax.optimization_barrier`."""
 
 import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,32 +9,33 @@ import jax
 from forward import report, scene, terrain
 
 import jaxhf
-from jaxhf.boundary import term as _boundaries
-from jaxhf.core import materialise as _store
 from jaxhf.core.devices import local_mesh
-from jaxhf.rendering import render as _render
+from jaxhf.core.materialise import materialise
+from jaxhf.rendering import render as rendering
 from jaxhf.scene.localise import localise
-from jaxhf.shade import lighting as _lighting
-from jaxhf.trace import intersect as _hit, normals as _normals, world as _world
-from jaxhf.trace.world import settle
+from jaxhf.trace.world import resolve_settings
 
-USERS = (_boundaries, _normals, _hit, _render, _lighting, _world)
 FORMS: dict[str, Callable] = {
-    "stored": _store.stored,
-    "nothing": lambda tree, sure: tree,
-    "optimization_barrier": lambda tree, sure: jax.lax.optimization_barrier(tree),
+    "materialise": materialise,
+    "nothing": lambda tree: tree,
+    "optimization_barrier": jax.lax.optimization_barrier,
 }
+USERS = [
+    module
+    for name, module in sys.modules.items()
+    if name.startswith("jaxhf.") and vars(module).get("materialise") is materialise
+]
 
 
 def compiled(base: jaxhf.Scene, settings: jaxhf.Settings, form: Callable) -> tuple[Callable[[], object], int]:
     """One frame as a function, and how many instructions its fused kernels hold."""
     for module in USERS:
-        vars(module)["stored"] = form
+        vars(module)["materialise"] = form
     jax.clear_caches()
     local = localise(base)
-    program = _render._trace_all.lower(local, settle(settings, base), (), local_mesh(), None).compile()
+    program = rendering._trace_all.lower(local, resolve_settings(settings, base), (), local_mesh(), None).compile()
     bodies = re.findall(r"^%?fused_computation\S* .*?\{\n(.*?)^\}", program.as_text() or "", re.M | re.S)
-    return lambda: jax.block_until_ready(program(local)), sum(body.count("\n") for body in bodies)
+    return lambda: jax.block_until_ready(program(local, None)), sum(body.count("\n") for body in bodies)
 
 
 def main() -> None:
