@@ -1,5 +1,7 @@
 """Strictness for every test: double precision is there, types do not promote by themselves, ranks neither."""
 
+import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +14,18 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 SEEDS = Path(__file__).parents[2] / "shared" / "pbrt"
 PEERS = Path(__file__).parents[2] / "shared" / "peers"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compiled programs are shared by all workers and by the processes that tests start, for the length of this run."""
+    if not hasattr(config, "workerinput") and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        folder = tempfile.TemporaryDirectory(prefix="jaxhf-tests-", ignore_cleanup_errors=True)
+        config.add_cleanup(folder.cleanup)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name  # workers and other processes inherit it
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    for name, value in (("jax_persistent_cache_min_compile_time_secs", 0.1), ("jax_persistent_cache_min_entry_size_bytes", -1)):
+        os.environ[name.upper()] = str(value)
+        jax.config.update(name, value)
 
 
 @pytest.fixture(autouse=True, scope="module")
