@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.extras import require_matplotlib
+from ..core.extras import import_extra
 from ..fitting.fit import Fit, fit
 from ..fitting.history import Step
 from ..io.files import require_writable_text, save_text
@@ -37,7 +37,7 @@ class Outputs:
             require_writable_heights(path)
         if self.report is not None:
             require_writable_text(self.report, ".html")
-            require_matplotlib("a report needs")
+            import_extra("matplotlib", "a report needs", "plot")
         if self.checkpoint.exists() and not self.resume:
             raise ValueError(
                 f"{self.checkpoint}: an interrupted fit left this checkpoint; --resume goes on from it, to begin anew remove it"

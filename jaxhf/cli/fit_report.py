@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..core.extras import require_matplotlib
+from ..core.extras import import_extra
 from ..fitting.fit import Fit
 from ..scene.heightfield import Heightfield
 
@@ -70,7 +70,7 @@ def _facts(found: Fit) -> list[tuple[str, str]]:
 
 
 def _figure(rows: int, columns: int, height: float) -> tuple[Any, np.ndarray]:
-    require_matplotlib("a report needs")
+    import_extra("matplotlib", "a report needs", "plot")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, height), layout="constrained")

@@ -324,7 +324,7 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _tradeoff(options: argparse.Namespace) -> None:
-    from ..core.extras import require_matplotlib
+    from ..core.extras import import_extra
     from ..study.pareto import front_lines, markdown, recommend
     from ..study.plan import plan
     from ..study.plots import save_plot
@@ -334,7 +334,7 @@ def _tradeoff(options: argparse.Namespace) -> None:
         value = getattr(options, name)
         if value is not None and not value > 0:
             raise ValueError(f"--{name} must be positive, it is {value}")
-    require_matplotlib("tradeoff draws with")
+    import_extra("matplotlib", "tradeoff draws with", "plot")
     sweep = plan(
         options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick,
         fits=options.fit,

@@ -1,9 +1,21 @@
-"""What all that draws needs."""
+"""Packages that only some tasks need."""
+
+import importlib
+from types import ModuleType
 
 
-def require_matplotlib(use: str) -> None:
-    """ValueError where matplotlib is not installed; `use` begins its message, as in "a report needs"."""
+def import_extra(package: str, use: str, extra: str) -> ModuleType:
+    """An optional package.
+
+    Args:
+      package: its name.
+      use: what needs it, with its verb, as in "a report needs".
+      extra: the extra of jaxhf that installs it.
+
+    Raises:
+      ValueError: it is not installed.
+    """
     try:
-        import matplotlib  # noqa: F401 - only whether it is there
+        return importlib.import_module(package)
     except ImportError as error:
-        raise ValueError(f"{use} matplotlib: pip install 'jaxhf[plot]'") from error
+        raise ValueError(f"{use} {package}: pip install 'jaxhf[{extra}]'") from error

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..core.extras import import_extra
 from .files import require_pixels
 from .georeference import WGS84, Ellipsoid, Place
 
@@ -30,7 +31,7 @@ class Raw(NamedTuple):
 
 
 def read_tiff(path: Path) -> Raw:
-    tifffile = require_tifffile("reading")
+    tifffile = import_tifffile("reading")
     with tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         require_pixels(page.imagelength, page.imagewidth)
@@ -54,13 +55,8 @@ def read_tiff(path: Path) -> Raw:
         return Raw(values, Place(), nodata, **factors)
 
 
-def require_tifffile(doing: str) -> Any:
-    """The package; ValueError where it is not installed."""
-    try:
-        import tifffile
-    except ImportError as error:
-        raise ValueError(f"{doing} .tif needs tifffile: pip install 'jaxhf[geo]'") from error
-    return tifffile
+def import_tifffile(doing: str) -> Any:
+    return import_extra("tifffile", f"{doing} .tif needs", "geo")
 
 
 def _gdal_nodata(text: str) -> float:

@@ -4,20 +4,21 @@ In memory every image is linear, shape (h, w, 3), top row first. Sizes that a fi
 length and against `MAX_PIXELS` before anything is decoded.
 """
 
+import contextlib
 import re
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as imageio
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 from PIL import Image
-from PIL.ImageFile import ImageFile
-from PIL.JpegImagePlugin import JpegImageFile
-from PIL.PngImagePlugin import PngImageFile
 
+from ..core.extras import import_extra
 from .files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_folder, require_pixels
-from .png import read_png, samples_16
+from .png import require_whole
 
 
 def load_image(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
@@ -35,7 +36,7 @@ def load_image(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
 
 
 def load_numbers(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
-    """As `load_image`, for an image whose values are not colours: those of .png and .jpg are shares of 255, or of 65535."""
+    """As `load_image`, for values that are no colours: .png and .jpg hold shares of 255, or of 65535 in 16-bit grey."""
     return _load(path, lambda encoded: encoded)
 
 
@@ -50,17 +51,26 @@ def _load(path: PathLike, decode: Callable[[np.ndarray], np.ndarray]) -> np.ndar
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
-def save_image(path: PathLike, image: Any) -> None:
+def save_image(path: PathLike, image: Any, *, transfer: str = "srgb") -> None:
     """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
 
-    Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8-bit sRGB of the values clipped to 0..1;
+    Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8 bits of the values clipped to 0..1;
     nan becomes 0. .exr and .pfm: float32. .npy: in the precision of `image`. The last three keep nan and inf. The file
     appears whole or not at all: what was there before stays until its successor is complete.
 
+    Args:
+      path: the file.
+      image: the radiance.
+      transfer: the bytes of a .png: "srgb", which viewers and `load_image` expect; "linear", 255 times the value, as in
+        GDAL's shaded maps. The other formats always hold the values as they are.
+
     Raises:
-      FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of floats.
+      FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of floats, or `transfer`
+        is another.
     """
     path = require_writable(path)
+    if transfer not in _TRANSFERS:
+        raise ValueError(f"transfer must be one of {', '.join(_TRANSFERS)}; it is {transfer!r}")
     pixels = np.asarray(image)
     if pixels.dtype.kind == "V":  # bfloat16 and its like, which .npy would store without their meaning
         pixels = pixels.astype(np.float32)
@@ -69,7 +79,7 @@ def save_image(path: PathLike, image: Any) -> None:
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
         raise ValueError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
     with replacing(path) as temporary:
-        _WRITERS[path.suffix.lower()](temporary, pixels)
+        _WRITERS[path.suffix.lower()](temporary, pixels, _TRANSFERS[transfer])
 
 
 def require_writable(path: PathLike) -> Path:
@@ -85,7 +95,7 @@ def require_writable(path: PathLike) -> Path:
     require_folder(path, "an image")
     if path.suffix.lower() == ".exr":
         with reading(path):
-            _openexr("writing")
+            import_extra("OpenEXR", "writing .exr needs", "exr")
     return path
 
 
@@ -102,37 +112,46 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
 # One reader a format: a path to shape (h, w, 3) or (h, w), float32 or, where values are encoded, uint8 or uint16.
 
 
-def _read_png(path: Path) -> np.ndarray:
-    png = read_png(path)
-    if png.depth == 16:
-        samples = samples_16(png)
-        return samples[:, :, :3] if png.channels > 2 else samples[:, :, 0]
-    return _read_pillow(path, PngImageFile)
+def read_png(path: Path) -> np.ndarray:
+    """What a .png stores: uint8 of shape (h, w, 3), or uint16 of shape (h, w) for 16-bit grey."""
+    data = path.read_bytes()
+    channels, depth = require_whole(data)
+    if depth < 16:
+        return _decoded(data, "RGBA")[:, :, :3]
+    if channels > 1:  # Pillow would cut them down to 8 bits
+        raise ValueError(f"a PNG of 16 bits must be grey, it has {channels} channels")
+    return _decoded(data)
 
 
-def _read_jpeg(path: Path) -> np.ndarray:
-    return _read_pillow(path, JpegImageFile)
+def _read_jpeg(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    data = path.read_bytes()
+    if not data.startswith(b"\xff\xd8\xff"):
+        raise ValueError("it is not a JPEG")
+    return _decoded(data, "RGB")
 
 
-def _read_pillow(path: Path, kind: type[ImageFile]) -> np.ndarray:
-    # The class is called directly: Image.open refuses 16384 x 16384 as an attack, by a limit for the whole process.
-    with path.open("rb") as file:
-        image = kind(file)
-        require_pixels(image.height, image.width)
-        image.info.pop("transparency", None)  # or convert warns that it will be lost
-        return np.asarray(image.convert("RGB"))
+def _decoded(data: bytes, mode: str | None = None) -> np.ndarray:
+    with _any_size():
+        require_pixels(*imageio.improps(data, index=0, plugin="pillow").shape[:2])
+        return imageio.imread(data, index=0, mode=mode, plugin="pillow", writeable_output=False)
 
 
-def _openexr(doing: str) -> Any:
-    try:
-        import OpenEXR
-    except ImportError as error:
-        raise ValueError(f"{doing} .exr needs OpenEXR: pip install 'jaxhf[exr]'") from error
-    return OpenEXR
+_LIMIT = threading.Lock()
+
+
+@contextlib.contextmanager
+def _any_size() -> Iterator[None]:
+    """Lifts Pillow's limit, which is one for the whole process and refuses 16384 x 16384: sizes are checked here."""
+    with _LIMIT:
+        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+        try:
+            yield
+        finally:
+            Image.MAX_IMAGE_PIXELS = limit
 
 
 def _read_exr(path: Path) -> np.ndarray:
-    exr = _openexr("reading")
+    exr = import_extra("OpenEXR", "reading .exr needs", "exr")
     try:
         with exr.File(str(path), separate_channels=True, header_only=True) as file:
             (x0, y0), (x1, y1) = file.header()["dataWindow"]
@@ -182,45 +201,46 @@ def _read_npy(path: Path) -> np.ndarray:
     return image.astype(np.float32)
 
 
-# One writer a format.
+# One writer a format; the last argument maps linear values in 0..1 to those that a .png holds.
 
 
-def _write_png(path: Path, pixels: np.ndarray) -> None:
+def _write_png(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> None:
     clipped = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
-    encoded = (srgb_from_linear(clipped) * 255 + 0.5).astype(np.uint8)
-    Image.fromarray(encoded).save(path, format="PNG")
+    with path.open("wb") as file:
+        imageio.imwrite(file, (encode(clipped) * 255 + 0.5).astype(np.uint8), plugin="pillow", extension=".png")
 
 
-def _write_exr(path: Path, pixels: np.ndarray) -> None:
-    exr = _openexr("writing")
+def _write_exr(path: Path, pixels: np.ndarray, _: Any) -> None:
+    exr = import_extra("OpenEXR", "writing .exr needs", "exr")
     planes = {"Y": pixels} if pixels.ndim == 2 else {name: pixels[:, :, c] for c, name in enumerate("RGB")}
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
     with exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, channels) as file:
         file.write(str(path))
 
 
-def _write_pfm(path: Path, pixels: np.ndarray) -> None:
+def _write_pfm(path: Path, pixels: np.ndarray, _: Any) -> None:
     h, w = pixels.shape[:2]
     header = f"{'PF' if pixels.ndim == 3 else 'Pf'}\n{w} {h}\n-1.0\n"
     path.write_bytes(header.encode() + pixels[::-1].astype("<f4").tobytes())
 
 
-def _write_npy(path: Path, pixels: np.ndarray) -> None:
+def _write_npy(path: Path, pixels: np.ndarray, _: Any) -> None:
     with path.open("wb") as file:  # np.save appends .npy to a name without it
         np.save(file, pixels)
 
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {
-    ".png": _read_png,
+    ".png": read_png,
     ".jpg": _read_jpeg,
     ".jpeg": _read_jpeg,
     ".exr": _read_exr,
     ".pfm": _read_pfm,
     ".npy": _read_npy,
 }
-_WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
+_WRITERS: dict[str, Callable[[Path, np.ndarray, Callable[[np.ndarray], np.ndarray]], None]] = {
     ".png": _write_png,
     ".exr": _write_exr,
     ".pfm": _write_pfm,
     ".npy": _write_npy,
 }
+_TRANSFERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"srgb": srgb_from_linear, "linear": np.asarray}

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .files import PathLike, by_ending, reading, replacing, require_folder
-from .geotiff import require_tifffile
+from .geotiff import import_tifffile
 from .terrain import Terrain
 
 # ModelPixelScale, ModelTiepoint, ModelTransformation and the three tags of GeoKeys: where a raster lies, on which Earth.
@@ -63,7 +63,7 @@ def require_writable_heights(path: PathLike) -> Path:
     require_folder(path, "heights")
     if path.suffix.lower() in (".tif", ".tiff"):
         with reading(path):
-            require_tifffile("writing")
+            import_tifffile("writing")
     return path
 
 
@@ -78,7 +78,7 @@ def _write_npz(path: Path, terrain: Terrain, _: Path | None) -> None:
 
 
 def _write_tiff(path: Path, terrain: Terrain, like: Path | None) -> None:
-    tifffile = require_tifffile("writing")
+    tifffile = import_tifffile("writing")
     tags = _own_place(terrain) if like is None else _place_of(tifffile, like, terrain.heights.shape)
     tifffile.imwrite(path, terrain.heights[::-1], photometric="minisblack", metadata=None, extratags=tags)
 

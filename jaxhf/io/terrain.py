@@ -12,10 +12,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..core.extras import import_extra
 from .files import PathLike, by_ending, read_npy, reading, require_file
 from .georeference import WGS84, Place
 from .geotiff import Raw, read_tiff
-from .png import read_png, samples_16
+from .images import read_png
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,11 +124,8 @@ def jacksboro() -> Terrain:
 
 def jacksboro_file() -> str:
     """Where matplotlib keeps that terrain."""
-    try:
-        from matplotlib import cbook
-    except ImportError as error:
-        raise ValueError("the Jacksboro terrain comes with matplotlib: pip install 'jaxhf[plot]'") from error
-    return str(cbook.get_sample_data("jacksboro_fault_dem.npz", asfileobj=False))
+    matplotlib = import_extra("matplotlib", "the Jacksboro terrain comes with", "plot")
+    return str(matplotlib.cbook.get_sample_data("jacksboro_fault_dem.npz", asfileobj=False))
 
 
 _GRID = ("dx", "dy", "x0", "y0")
@@ -190,10 +188,10 @@ def _read_npz(path: Path) -> Raw:
 
 
 def _read_png(path: Path) -> Raw:
-    png = read_png(path)
-    if png.depth != 16 or png.channels != 1:
-        raise ValueError(f"heights in a PNG must be 16-bit grey, it has {png.channels} channels of {png.depth} bits")
-    return Raw(samples_16(png)[::-1, :, 0])
+    values = read_png(path)
+    if values.dtype != np.uint16:
+        raise ValueError("heights in a PNG must be 16-bit grey, its samples have at most 8 bits")
+    return Raw(values[::-1])
 
 
 _READERS: dict[str, Callable[[Path], Raw]] = {

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..core.extras import require_matplotlib
+from ..core.extras import import_extra
 from ..io.files import replacing
 from .pareto import ERRORS, curves, front
 from .plan import Measured, Sweep
@@ -19,7 +19,7 @@ _LABELS = {
 
 def screenless_pyplot() -> Any:
     """matplotlib's pyplot, without a screen; ValueError where it is not installed."""
-    require_matplotlib("tradeoff draws with")
+    import_extra("matplotlib", "tradeoff draws with", "plot")
     import matplotlib
 
     matplotlib.use("agg")

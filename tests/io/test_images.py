@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from jaxhf.io.files import MAX_PIXELS
-from jaxhf.io.images import load_image, require_writable, save_image
+from jaxhf.io.images import load_image, load_numbers, require_writable, save_image
 
 
 @pytest.fixture
@@ -60,6 +60,17 @@ def test_png_holds_every_byte_of_srgb(tmp_path):
         np.testing.assert_array_equal(np.asarray(written)[:, :, 1], every)
 
 
+def test_linear_bytes_are_proportional_to_radiance(tmp_path):
+    image = np.array([[0.0, 1.0, 0.5, 0.002, -3.0, 9.0, np.nan]])
+    save_image(tmp_path / "x.png", image, transfer="linear")
+    with Image.open(tmp_path / "x.png") as written:
+        assert np.asarray(written).tolist() == [[0, 255, 128, 1, 0, 255, 0]]
+    save_image(tmp_path / "x.npy", image, transfer="linear")
+    np.testing.assert_array_equal(np.load(tmp_path / "x.npy"), image)
+    with pytest.raises(ValueError, match="transfer must be one of srgb, linear; it is 'gamma'"):
+        save_image(tmp_path / "y.png", image, transfer="gamma")
+
+
 def test_jax_arrays_and_every_dtype_are_written(tmp_path, image):
     save_image(tmp_path / "a.npy", jnp.asarray(image, jnp.float16))
     assert np.load(tmp_path / "a.npy").dtype == np.float16
@@ -88,29 +99,14 @@ def test_pfm_by_hand(tmp_path, order, scale):
     np.testing.assert_array_equal(load_image(tmp_path / "y.pfm")[:, :, 0], [[2], [1]])
 
 
-@pytest.mark.parametrize("channels", [1, 2, 3, 4])
-def test_16_bit_png_by_every_filter(tmp_path, channels):
-    """Five rows, filtered by the five filters of the specification, one byte after the other."""
-    h, w, step = 5, 6, 2 * channels
-    few = np.array([0, 1, 2, 255, 256, 258, 40000, 65535], np.uint16)  # so that the Paeth filter meets ties
-    samples = np.random.default_rng(channels).choice(few, (h, w, channels))
-    raw = samples.astype(">u2").tobytes()
-    stride, out = w * step, bytearray()
-
-    def byte(y, x):
-        return raw[y * stride + x] if y >= 0 and x >= 0 else 0
-
-    for y in range(h):
-        out.append(y)
-        for x in range(stride):
-            a, b, c = byte(y, x - step), byte(y - 1, x), byte(y - 1, x - step) if x >= step else 0
-            paeth = min((a, b, c), key=lambda value: abs(a + b - c - value))
-            out.append((byte(y, x) - (0, a, b, (a + b) // 2, paeth)[y]) % 256)
-    write_png(tmp_path / "x.png", (w, h, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0), bytes(out))
-    colour = samples[:, :, :3] if channels > 2 else np.repeat(samples[:, :, :1], 3, axis=2)
-    encoded = colour / 65535
-    expected = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    np.testing.assert_allclose(load_image(tmp_path / "x.png"), expected, rtol=1e-6)
+@pytest.mark.parametrize("interlaced", [0, 1])
+def test_16_bit_grey_keeps_every_bit(tmp_path, interlaced):
+    """Of 2 x 1 pixels: interlaced, they stand in the first and in the sixth pass."""
+    rows = b"\x00\x01\x02" + b"\x00\xff\xfe" if interlaced else b"\x00\x01\x02\xff\xfe"
+    write_png(tmp_path / "x.png", (2, 1, 16, 0, 0, 0, interlaced), rows)
+    np.testing.assert_allclose(load_numbers(tmp_path / "x.png")[0, :, 1], np.array([0x0102, 0xFFFE]) / 65535, rtol=1e-6)
+    encoded = np.array([0x0102 / 65535 / 12.92, ((0xFFFE / 65535 + 0.055) / 1.055) ** 2.4])
+    np.testing.assert_allclose(load_image(tmp_path / "x.png")[0, :, 1], encoded, rtol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "1", "RGB"])
@@ -206,8 +202,9 @@ BAD_FILES = [
     ("nothing.png", lambda path: write_png(path, (0, 4, 8, 0, 0, 0, 0), b""), "its size must be positive, it is 0 x 4"),
     ("bomb.png", lambda path: write_png(path, (60000, 60000, 8, 2, 0, 0, 0), b""), f"at most {MAX_PIXELS} pixels"),
     ("colour.png", lambda path: write_png(path, (1, 1, 8, 5, 0, 0, 0), bytes(2)), "no colour type 5 with 8 bits"),
-    ("filter.png", lambda path: write_png(path, (1, 1, 16, 0, 0, 0, 0), b"\x07ab"), "filters go from 0 to 4, it uses 7"),
-    ("adam7.png", lambda path: write_png(path, (1, 1, 16, 0, 0, 0, 1), b"\x00ab"), "interlaced 16-bit PNG is not read"),
+    ("filter.png", lambda path: write_png(path, (1, 1, 16, 0, 0, 0, 0), b"\x07ab"), "unrecognized data stream"),
+    ("rgb16.png", lambda path: write_png(path, (1, 1, 16, 2, 0, 0, 0), bytes(7)), "16 bits must be grey, it has 3 channels"),
+    ("alpha16.png", lambda path: write_png(path, (1, 1, 16, 4, 0, 0, 0), bytes(5)), "must be grey, it has 2 channels"),
     ("bit.png", flipped_bit, "the checksum of its part 'IDAT' is wrong"),
     ("cut.jpg", cut_jpeg, "truncated"),
     ("cut.exr", cut(0.6, "cut"), "it is cut off or damaged"),

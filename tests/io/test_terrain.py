@@ -291,7 +291,7 @@ BAD_FILES = [
     ),
     ("cut.npz", cut_npz, {}, "not a zip file"),
     ("lying.npz", lying_npz, {}, "its header declares 2048000000 bytes of data, 0 are there"),
-    ("byte.png", lambda path: Image.new("L", (2, 2)).save(path), {}, "must be 16-bit grey, it has 1 channels of 8 bits"),
+    ("byte.png", lambda path: Image.new("L", (2, 2)).save(path), {}, "must be 16-bit grey, its samples have at most 8 bits"),
     ("bomb.png", bomb_png, {}, f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000"),
     ("cut.tif", cut_tiff, {}, "it is cut off: its pixels end at byte"),
     ("text.tif", lambda path: path.write_text("no"), {}, "not a TIFF"),
