@@ -3,9 +3,10 @@ from .fitting.fit import Fit as Fit, fit as fit
 from .fitting.history import Step as Step, Stop as Stop
 from .io.errors import SceneError as SceneError
 from .io.images import load_image as load_image, save_image as save_image
+from .io.load_terrain import jacksboro as jacksboro, load_heights as load_heights
 from .io.save_terrain import save_heights as save_heights
 from .io.scenes import load_scene as load_scene
-from .io.terrain import Terrain as Terrain, jacksboro as jacksboro, load_heights as load_heights
+from .io.terrain import Terrain as Terrain
 from .rendering.aovs import AOVS as AOVS
 from .rendering.cast import cast as cast
 from .rendering.render import Prepared as Prepared, prepare as prepare, render as render

@@ -6,7 +6,6 @@ from jaxtyping import Float
 from ..core.types import AnyArray
 from ..io.images import linear_from_srgb
 from ..io.terrain import Terrain
-from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Sky
 from ..scene.material import Matte
 from ..scene.scene import Object, Scene
@@ -40,7 +39,7 @@ def hillshade_scene(
         raise ValueError(f"hillshade: sky must be 0 or more, it is {sky}")
     if terrain.nodata.all():
         raise ValueError("hillshade: there is no height in the terrain")
-    field = Heightfield(terrain.heights, terrain.dx, terrain.dy, terrain.x0, terrain.y0)
+    field = terrain.heightfield()
     lights = [Directional.from_angles(azimuth, altitude), *([Sky(sky)] if sky else [])]
     if width is None and height is None:
         width = terrain.heights.shape[1] - 1

@@ -155,7 +155,7 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _hillshade(options: argparse.Namespace) -> None:
-    from ..io.terrain import load_heights
+    from ..io.load_terrain import load_heights
     from .hillshade import hillshade_scene, printed
 
     def scene() -> "Scene":
@@ -182,8 +182,8 @@ def _draw(options: argparse.Namespace, load: "Callable[[], Scene]", tone: Callab
 def _convert(options: argparse.Namespace) -> None:
     from pathlib import Path
 
+    from ..io.load_terrain import load_heights
     from ..io.save_terrain import require_writable_heights, save_heights
-    from ..io.terrain import load_heights
     from .info import heightfield_line
 
     require_writable_heights(options.output)

@@ -4,33 +4,18 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..core.extras import import_extra
 from .files import require_pixels
-from .georeference import WGS84, Ellipsoid, Place
+from .georeference import WGS84, CoordinateSystem, Ellipsoid
+from .terrain import Terrain, heights_of
 
 
-class Raw(NamedTuple):
-    """Heights as a file stores them.
-
-    Attributes:
-      values: the south first.
-      place: what the file says about it.
-      nodata: the value that means that there is no height.
-      scale, offset: a height is value * scale + offset.
-    """
-
-    values: np.ndarray
-    place: Place = Place()
-    nodata: float | None = None
-    scale: float = 1.0
-    offset: float = 0.0
-
-
-def read_tiff(path: Path) -> Raw:
+def read_tiff(path: Path, nodata: float | None, overrules: bool) -> Terrain:
+    """The heights in a .tif, in its own coordinates; `nodata` counts where the file names none, or where it `overrules`."""
     tifffile = import_tifffile("reading")
     with tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
@@ -40,19 +25,20 @@ def read_tiff(path: Path) -> Raw:
         end = max((at + count for at, count in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
         if end > path.stat().st_size:
             raise ValueError(f"it is cut off: its pixels end at byte {end}, the file at {path.stat().st_size}")
-        nodata = _gdal_nodata(page.tags[42113].value) if 42113 in page.tags else None
+        tagged = _gdal_nodata(page.tags[42113].value) if 42113 in page.tags else None
+        nodata = tagged if nodata is None or (tagged is not None and not overrules) else nodata
         if nodata is not None and page.dtype.kind == "f":
             # tifffile fills absent tiles with it, but refuses the usual -3.4028235e+38, which rounds to below float32.
             with np.errstate(over="ignore"):
                 page.nodata = page.dtype.type(nodata)
         factors = _gdal_factors(page.tags[42112].value) if 42112 in page.tags else {}
-        values, keys = page.asarray()[::-1], page.geotiff_tags or {}
+        heights = heights_of(page.asarray()[::-1], nodata, **factors)
         scale, tie, matrix = (page.tags[code].value if code in page.tags else None for code in (33550, 33922, 34264))
         if scale is not None and tie is not None:
-            return Raw(values, _geo_place(scale, tie, keys, len(values)), nodata, **factors)
+            return _placed(heights, scale, tie, page.geotiff_tags or {})
         if scale is not None or tie is not None or matrix is not None:
             raise ValueError("its GeoTIFF tags must be ModelPixelScale with ModelTiepoint: rotated rasters are not read")
-        return Raw(values, Place(), nodata, **factors)
+        return Terrain(heights)
 
 
 def import_tifffile(doing: str) -> Any:
@@ -85,21 +71,22 @@ def _gdal_factors(text: str | bytes) -> dict[str, float]:
     return factors
 
 
-def _geo_place(scale: Sequence[float], tie: Sequence[float], keys: Mapping[str, Any], ny: int) -> Place:
-    """The place of a raster by its GeoTIFF tags (OGC 19-008r4, annex B.6).
+def _placed(heights: np.ndarray, scale: Sequence[float], tie: Sequence[float], keys: Mapping[str, Any]) -> Terrain:
+    """The heights where the GeoTIFF tags put them (OGC 19-008r4, annex B.6).
 
     The tie point (column, row, _, x, y, _) and the pixel's size place the raster's corners, or its pixels' centres where
     GTRasterTypeGeoKey is 2, PixelIsPoint.
     """
     (dx, dy), (column, row, _, x, y, _) = scale[:2], tie[:6]
     centre = 0.0 if keys.get("GTRasterTypeGeoKey") == 2 else 0.5
-    west, south = x + (centre - column) * dx, y - (ny - 1 + centre - row) * dy
+    west, south = x + (centre - column) * dx, y - (len(heights) - 1 + centre - row) * dy
     degrees = keys.get("GTModelTypeGeoKey") == 2  # geographic
     if degrees and keys.get("GeogAngularUnitsGeoKey", 9102) not in (0, 9102, 9122):  # undefined, or EPSG's codes of degrees
         raise ValueError(f"its coordinates must be in degrees, GeogAngularUnitsGeoKey is {int(keys['GeogAngularUnitsGeoKey'])}")
     code = keys.get("GeographicTypeGeoKey" if degrees else "ProjectedCSTypeGeoKey")
-    system = None if code is None or code == _USER_DEFINED else int(code)
-    return Place(float(dx), float(dy), float(west), float(south), degrees, _globe(keys) if degrees else None, system)
+    code = None if code is None or code == _USER_DEFINED else int(code)
+    crs = CoordinateSystem(degrees, _globe(keys) if degrees else None, code)
+    return Terrain(heights, float(dx), float(dy), float(west), float(south), crs)
 
 
 _USER_DEFINED = 32767

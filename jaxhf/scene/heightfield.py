@@ -18,7 +18,7 @@ def _heights(value: Any) -> jax.Array:
     try:
         heights = jnp.asarray(value)
     except TypeError as error:
-        whole = ": take its .heights, .dx, .dy, .x0 and .y0" if hasattr(value, "heights") else ""
+        whole = ": take its .heightfield()" if hasattr(value, "heightfield") else ""
         raise ValueError(
             f"Heightfield: heights must be an array of numbers, they are a {type(value).__name__}{whole}"
         ) from error

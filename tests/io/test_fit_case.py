@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 import jaxhf
-from jaxhf.io.georeference import Place, at_vertices
+from jaxhf.io.georeference import CoordinateSystem
+from jaxhf.io.resample import at_vertices
 from jaxhf.io.toml.fit import load_case
 
 SCENE = """[camera]
@@ -241,7 +242,7 @@ def test_a_prior_covers_the_terrain(folder):
     with pytest.raises(jaxhf.SceneError, match="whose y goes from 4100000 to 4100060; its own goes from 4100011 to 4100071"):
         case(folder, with_prior("tile.npz", "north.npz"))
     with pytest.raises(ValueError, match=r"it must have the terrain's coordinates, EPSG:32617; it has EPSG:32616"):
-        at_vertices(np.zeros((2, 2)), Place(*TILE, system=32616), Place(*TILE, system=32617), (2, 2))
+        at_vertices(*(jaxhf.Terrain(np.zeros((2, 2)), *TILE, CoordinateSystem(code=code)) for code in (32616, 32617)))
 
 
 def test_a_hole_in_a_prior_is_an_error_where_the_terrain_is(folder):

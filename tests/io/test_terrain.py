@@ -14,8 +14,9 @@ from PIL import Image
 
 from jaxhf.io.files import MAX_PIXELS
 from jaxhf.io.georeference import metres_per_degree
+from jaxhf.io.load_terrain import jacksboro, load_heights
 from jaxhf.io.save_terrain import save_heights
-from jaxhf.io.terrain import Terrain, jacksboro, load_heights
+from jaxhf.io.terrain import Terrain
 
 # What a file with the north first holds: two rows, the northern one 1 2 3.
 NORTH_FIRST = np.array([[1, 2, 3], [4, 5, 6]], np.uint16)
@@ -345,6 +346,17 @@ def test_a_missing_file_is_named(tmp_path):
 def test_terrain_checks_itself():
     with pytest.raises(ValueError, match="dy must be positive and finite, it is -1"):
         Terrain(np.zeros((2, 2)), dy=-1.0)
+
+
+def test_a_terrain_becomes_a_heightfield():
+    terrain = Terrain(np.array([[1, np.nan, 3], [4, 5, 1e39]]), 30.0, 20.5, 500000.25, 4.1e6)
+    field = terrain.heightfield()
+    np.testing.assert_array_equal(field.heights, terrain.heights)
+    assert field.heights.dtype == np.float64
+    assert placed(field) == placed(terrain)
+    with pytest.raises(ValueError, match=r"heights must fit into float32, the largest is 1e\+39"):
+        terrain.heightfield(np.float32)
+    assert Terrain(np.ones((2, 2))).heightfield(np.float32).heights.dtype == np.float32
 
 
 @pytest.mark.parametrize("ending", [".npy", ".npz", ".tif"])

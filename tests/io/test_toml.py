@@ -12,9 +12,9 @@ from PIL import Image
 
 from jaxhf import Cylinder, Directional, Heightfield, ImageTexture, Matte, Mirror, Orthographic, Perspective, Point, Sky
 from jaxhf.io.errors import SceneError
+from jaxhf.io.load_terrain import load_heights
 from jaxhf.io.procedural import grid
 from jaxhf.io.scenes import load_scene
-from jaxhf.io.terrain import load_heights
 from jaxhf.io.toml import tables as _toml_tables
 from jaxhf.io.toml.fit import load_case
 from jaxhf.io.toml.lines import line_numbers

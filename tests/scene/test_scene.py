@@ -79,7 +79,7 @@ BAD = [
     (field(np.zeros((2, 2), complex)), "Heightfield: heights must be float32, float64 or whole numbers, they are complex128"),
     (
         field(jaxhf.Terrain(GRID)),
-        "Heightfield: heights must be an array of numbers, they are a Terrain: take its .heights, .dx, .dy, .x0 and .y0",
+        "Heightfield: heights must be an array of numbers, they are a Terrain: take its .heightfield()",
     ),
     (field("high"), "Heightfield: heights must be an array of numbers, they are a str"),
     (placed(np.zeros((4, 4))), "Object: world_from_object must be affine (last row 0 0 0 1), its last row is [0.0, 0"),

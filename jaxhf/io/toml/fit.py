@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_origin, get_type_hints
 
 import numpy as np
 from jaxtyping import Float32
@@ -17,11 +17,12 @@ from ...scene.heightfield import Heightfield
 from ...scene.light import Light
 from ...scene.scene import Object, Scene
 from ..files import PathLike, by_ending, require_file, require_precision
+from ..georeference import CoordinateSystem
 from ..images import load_image, load_numbers
 from ..pbrt.reader import load_pbrt
-from ..terrain import jacksboro_file
+from ..terrain import Terrain
 from .checks import Part
-from .known import Sought, known_deviations, known_heights, sought_heightfield
+from .priors import Sought, known_deviations, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene
 from .tables import SCENE, Key, Keys
 from .values import flag, number, number_list, number_or_word, table, tables, whole, whole_or_word, word
@@ -58,10 +59,10 @@ _FIT: Keys = {
     "levels": Key(number_list, None),
     "uncertainty": Key(whole_or_word, None),
 }
+_WHOLE_OR_FLAG = {int: whole, int | None: whole, bool: flag}
 _SETTINGS: Keys = {
-    **{name: Key(word, None) for name in ("traversal", "shading", "normals")},
-    "shadows": Key(flag, None),
-    **{name: Key(whole, None) for name in ("samples", "max_steps", "max_depth", "edge_samples", "chunk")},
+    name: Key(word if get_origin(hint) is Literal else _WHOLE_OR_FLAG[hint], None)
+    for name, hint in get_type_hints(Settings).items()
 }
 
 
@@ -107,7 +108,6 @@ class _Base(NamedTuple):
     lights: tuple[Light, ...]
     samples: int
     camera: Callable[[tuple[int, ...]], Camera] | None
-    like: Path | None
     sought: Sought
 
 
@@ -155,7 +155,7 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
             place = (chosen if given["noise"] is None else picture).at("noise")
             raise place.error(f"{place.name} must be positive, it is {noises[-1]:g}")
     return Case(
-        tuple(scenes), tuple(targets), tuple(weights), tuple(noises), settings, options, tuple(names), base.like, part
+        tuple(scenes), tuple(targets), tuple(weights), tuple(noises), settings, options, tuple(names), base.sought.like, part
     )  # fmt: skip
 
 
@@ -177,7 +177,8 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
         other = open_toml(path)
         return _toml_base(other, read_scene(other), dtype)
     scene = load_pbrt(path, dtype)
-    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, None, _sought(part, [], scene.objects))
+    sought = _sought(part, [{}] * len(scene.objects), [(item, None) for item in scene.objects])
+    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, sought)
 
 
 def _toml_base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
@@ -185,21 +186,26 @@ def _toml_base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     camera = None if values["camera"] is None else partial(_sized, part.at("camera", table=values["camera"]))
     lights = read_lights(part, values["lights"])
     sought = _sought(part, values["objects"], objects)
-    return _Base(tuple(objects), tuple(lights), values["samples"], camera, _like(sought), sought)
+    return _Base(tuple(item for item, _ in objects), tuple(lights), values["samples"], camera, sought)
 
 
-def _sought(part: Part, tables: list[dict[str, Any]], objects: Sequence[Object]) -> Sought:
-    """The first heightfield; it has a table in TOML only."""
-    shape = next((obj.shape.heights.shape for obj in objects if isinstance(obj.shape, Heightfield)), ())
-    item = next((item for item in tables if item["shape"] == "heightfield"), {})
-    path = named_file(part, item["file"]) if "file" in item else None
-    return sought_heightfield(item, shape, Path(jacksboro_file()) if item.get("source") == "jacksboro" else path)
+def _sought(part: Part, tables: Sequence[dict[str, Any]], objects: Sequence[tuple[Object, Terrain | None]]) -> Sought:
+    """The first heightfield; each object has a table of `tables`, which is empty where it is not from TOML."""
+    for keys, (item, stored) in zip(tables, objects, strict=True):
+        if isinstance(item.shape, Heightfield):
+            given = {name: float(keys[name]) for name in ("dx", "dy", "x0", "y0") if name in keys}
+            placed = _placed(item.shape, given) if stored is None else stored.in_metres(**given)
+            path = named_file(part, keys["file"]) if "file" in keys else None
+            nodata = float(keys["nodata"]) if "nodata" in keys else None
+            return Sought(placed, stored, path, bool(given), float(keys.get("z_scale", 1)), nodata)
+    return Sought()
 
 
-def _like(sought: Sought) -> Path | None:
-    """The GeoTIFF of the first heightfield, unless the scene puts it elsewhere."""
-    on_map = sought.path is not None and sought.path.suffix.lower() in (".tif", ".tiff") and not sought.given
-    return sought.path if on_map else None
+def _placed(field: Heightfield, given: dict[str, float]) -> Terrain:
+    """Heights of no file: where they lie is known if their table says it, where dx may count for dy, or dy for dx."""
+    known = {"x0", "y0"} <= given.keys() and not given.keys().isdisjoint(("dx", "dy"))
+    crs = CoordinateSystem() if known else None
+    return Terrain(np.asarray(field.heights), field.dx, field.dy, field.x0, field.y0, crs)
 
 
 def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any:

@@ -1,6 +1,6 @@
 """Reads scenes in TOML; `docs/scene-files.md` describes them, `scenes/` holds examples.
 
-Which keys there are stands in `_toml_tables.py`; any other key, a value of another type and a file outside the scene's folder
+Which keys there are stands in `tables.py`; any other key, a value of another type and a file outside the scene's folder
 are errors.
 """
 
@@ -22,7 +22,8 @@ from ...scene.texture import ImageTexture
 from .. import procedural
 from ..errors import SceneError, nearest, resolve_inside
 from ..images import load_image
-from ..terrain import jacksboro_file, load_heights
+from ..load_terrain import jacksboro_file, read_terrain
+from ..terrain import Terrain, fitted
 from .checks import Part
 from .lines import line_numbers
 from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, ORIGINS, PLACE, SCENE, TEXTURES, Key, Keys
@@ -44,7 +45,7 @@ def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
     parts = {
         "camera": read_camera(part.at("camera", table=values["camera"])),
         "lights": read_lights(part, values["lights"]),
-        "objects": read_objects(part, values, np.dtype(dtype)),
+        "objects": [item for item, _ in read_objects(part, values, np.dtype(dtype))],
     }
     return part.made(Scene, samples=values["samples"], **parts)
 
@@ -81,8 +82,8 @@ def read_lights(part: Part, tables: list[dict[str, Any]]) -> list[Light]:
     return [_variant(part.at("lights", k, table=table), "type", LIGHTS) for k, table in enumerate(tables)]
 
 
-def read_objects(part: Part, values: dict[str, Any], dtype: np.dtype) -> list[Object]:
-    """The objects of a scene, with its textures."""
+def read_objects(part: Part, values: dict[str, Any], dtype: np.dtype) -> list[tuple[Object, Terrain | None]]:
+    """The objects of a scene with its textures; beside those from a terrain file, this file in its own coordinates."""
     textures = {name: _texture(part.at("textures", name, table=table)) for name, table in values["textures"].items()}
     return [_object(part.at("objects", k, table=table), textures, dtype) for k, table in enumerate(values["objects"])]
 
@@ -107,7 +108,7 @@ def named_file(part: Part, name: str) -> Path:
     return resolve_inside(part.path.parent, part.path.parent, name)
 
 
-def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> Object:
+def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> tuple[Object, Terrain | None]:
     is_field = part.choice("shape", ("heightfield", "cylinder")) == "heightfield"
     make_material, material_keys = MATERIALS[part.choice("material", MATERIALS, "matte")]
     common: Keys = {**PLACE, **material_keys}
@@ -116,8 +117,11 @@ def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> O
     world = _world_from_object(part, values)
     material = part.made(make_material, **{name: _painted(part.at(name), values[name], textures) for name in material_keys})
     shape_values = {name: values[name] for name in shape_keys}
-    shape = part.made(_heightfield, part, shape_values, dtype) if is_field else part.made(Cylinder, **shape_values)
-    return Object(shape, material, world)
+    if is_field:
+        shape, stored = part.made(_heightfield, part, shape_values, dtype)
+    else:
+        shape, stored = part.made(Cylinder, **shape_values), None
+    return Object(shape, material, world), stored
 
 
 def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
@@ -146,29 +150,19 @@ def _field_keys(part: Part, common: Keys) -> Keys:
     return {**ORIGINS[origin], **GRID, **source}
 
 
-def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> Heightfield:
-    source = values.get("source")
-    if "file" in values or source == "jacksboro":
-        return _loaded(part.at("source" if source else "file"), values, dtype)
+def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> tuple[Heightfield, Terrain | None]:
     if values["z_scale"] == 0:
         raise ValueError("z_scale must not be zero, it is 0")
+    source = values.get("source")
+    grid = {name: values[name] for name in ("dx", "dy", "x0", "y0") if values[name] is not None}
+    if "file" in values or source == "jacksboro":
+
+        def load() -> tuple[Terrain, Terrain]:
+            path = named_file(part, values["file"]) if "file" in values else jacksboro_file()
+            stored = read_terrain(path, values["z_scale"], values.get("nodata"))
+            return stored.in_metres(**grid), stored
+
+        terrain, stored = part.at("source" if source else "file").made(load)
+        return terrain.heightfield(dtype), stored
     heights = procedural.HEIGHTS[source](**{name: values[name] for name in HEIGHTS[source]}) if source else values["heights"]
-    place = {name: values[name] for name in ("dx", "dy", "x0", "y0") if values[name] is not None}
-    return Heightfield(_fitted(heights * values["z_scale"], dtype), **place)
-
-
-def _loaded(part: Part, values: dict[str, Any], dtype: np.dtype) -> Heightfield:
-    def load():
-        path = named_file(part, values["file"]) if "file" in values else jacksboro_file()
-        return load_heights(path, nodata=values.get("nodata"), **{name: values[name] for name in GRID})
-
-    terrain = part.made(load)
-    return Heightfield(_fitted(terrain.heights, dtype), terrain.dx, terrain.dy, terrain.x0, terrain.y0)
-
-
-def _fitted(heights: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        fitted = heights.astype(dtype)
-    if np.isinf(fitted).any():  # it would count as a hole
-        raise ValueError(f"heights must fit into {dtype}, the largest is {np.nanmax(np.abs(heights)):.3g}")
-    return fitted
+    return Heightfield(fitted(heights * values["z_scale"], dtype), **grid), None

@@ -1,0 +1,145 @@
+"""Terrain files to heights with their spacing and origin.
+
+Whatever the file's order, in memory row 0 is the southernmost: `heights[iy, ix]` has iy growing to the north.
+"""
+
+import dataclasses
+import math
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ..core.extras import import_extra
+from .files import PathLike, by_ending, read_npy, reading, require_file
+from .georeference import WGS84, CoordinateSystem
+from .geotiff import read_tiff
+from .images import read_png
+from .terrain import Terrain, heights_of
+
+
+def load_heights(
+    path: PathLike,
+    *,
+    dx: float | None = None,
+    dy: float | None = None,
+    x0: float | None = None,
+    y0: float | None = None,
+    z_scale: float = 1.0,
+    nodata: float | None = None,
+) -> Terrain:
+    """Reads heights from a file.
+
+    - .npy: shape (ny, nx), in jaxhf's order (row 0 in the south), spacing 1.
+    - .npz: the array `heights`, or the only one, in jaxhf's order, with dx, dy, x0, y0 where the file has them. Or an
+      array `elevation` as in matplotlib's `jacksboro_fault_dem.npz`: north row first, bounds and spacing in degrees.
+    - .png: 16-bit grey, north row first, spacing 1; a height is the stored whole number.
+    - .tif, .tiff (needs tifffile): one band of numbers, north row first, placed by its GeoTIFF tags. A height stands at
+      its pixel's centre: half a pixel inside the raster's corner where the tags say PixelIsArea. GDAL's scale and
+      offset are applied.
+
+    Degrees become metres at the mean latitude, with vertex (0, 0) at the origin: on the ellipsoid whose axes the GeoTIFF
+    gives, else on WGS84. nan and inf are holes, as is what the file's GDAL_NODATA tag names.
+
+    Args:
+      path: the file.
+      dx, dy, x0, y0: overrule what the file says.
+      z_scale: heights are multiplied by it.
+      nodata: a stored value, before any scale, that means that there is no height; overrules the file's tag.
+
+    Raises:
+      FileNotFoundError: no file is there.
+      ValueError: the ending is not known, the file is not a whole grid of heights, or its degrees are on a globe of unknown
+        size (not the Earth, and without axes) and dx or dy is not given.
+    """
+    terrain = read_terrain(path, z_scale, nodata)
+    given = {"dx": dx, "dy": dy, "x0": x0, "y0": y0}
+    with reading(Path(path)):
+        return terrain.in_metres(**{name: value for name, value in given.items() if value is not None})
+
+
+def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = None, nodata_overrules: bool = True) -> Terrain:
+    """As `load_heights`, but in the file's own coordinates, which may be degrees.
+
+    Without `nodata_overrules`, `nodata` counts only where the file names no such value.
+    """
+    path = require_file(path)
+    reader = by_ending(_READERS, path, "read heights from")
+    with reading(path):
+        if not math.isfinite(z_scale) or z_scale == 0:
+            raise ValueError(f"z_scale must be finite and not zero, it is {z_scale}")
+        terrain = reader(path, nodata, nodata_overrules)
+        with np.errstate(over="ignore"):
+            scaled = terrain.heights * terrain.heights.dtype.type(z_scale)
+        if np.isinf(scaled).any():
+            raise ValueError(f"heights times z_scale must fit into {scaled.dtype}, z_scale is {z_scale}")
+        return dataclasses.replace(terrain, heights=scaled)
+
+
+def jacksboro() -> Terrain:
+    """The valley of the Jacksboro fault in Tennessee: 344 x 403 heights in metres, about 74 m by 92 m apart.
+
+    Its origin is the south-western vertex. ValueError where matplotlib, with which the data come, is not installed.
+    """
+    return load_heights(jacksboro_file())
+
+
+def jacksboro_file() -> str:
+    """Where matplotlib keeps that terrain."""
+    matplotlib = import_extra("matplotlib", "the Jacksboro terrain comes with", "plot")
+    return str(matplotlib.cbook.get_sample_data("jacksboro_fault_dem.npz", asfileobj=False))
+
+
+# One reader a format: its path, the value that means that there is no height, and whether that overrules the file's own.
+
+
+def _read_npy(path: Path, nodata: float | None, _: bool) -> Terrain:
+    with path.open("rb") as file:
+        return Terrain(heights_of(read_npy(file, path.stat().st_size), nodata))
+
+
+def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
+    with zipfile.ZipFile(path) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+
+        def array(name: str) -> np.ndarray:
+            with archive.open(members[name]) as file:
+                return read_npy(file, members[name].file_size)
+
+        def number(name: str) -> float:
+            value = array(name)
+            if value.size != 1:
+                raise ValueError(f"its {name} must be one number, its shape is {value.shape}")
+            return float(value.item())
+
+        if "heights" in members or len(members) == 1:
+            name = "heights" if "heights" in members else next(iter(members))
+            place = {key: number(key) for key in ("dx", "dy", "x0", "y0") if key in members}
+            return Terrain(heights_of(array(name), nodata), **place, crs=CoordinateSystem() if len(place) == 4 else None)
+        if "elevation" not in members:
+            raise ValueError(f"it must hold an array 'heights', or only one, it holds {', '.join(sorted(members))}")
+        missing = {"dx", "dy", "xmin", "ymin", "ymax"} - members.keys()
+        if missing:
+            raise ValueError(f"beside 'elevation' it must hold {', '.join(sorted(missing))}")
+        heights = heights_of(array("elevation")[::-1], nodata)
+        south = min(number("ymin"), number("ymax"))  # matplotlib's file has them swapped
+        dx, dy = number("dx"), number("dy")
+        crs = CoordinateSystem(degrees=True, globe=WGS84)
+        return Terrain(heights, dx, dy, number("xmin") + dx / 2, south + dy / 2, crs)
+
+
+def _read_png(path: Path, nodata: float | None, _: bool) -> Terrain:
+    values = read_png(path)
+    if values.dtype != np.uint16:
+        raise ValueError("heights in a PNG must be 16-bit grey, its samples have at most 8 bits")
+    return Terrain(heights_of(values[::-1], nodata))
+
+
+_READERS: dict[str, Callable[[Path, float | None, bool], Terrain]] = {
+    ".npy": _read_npy,
+    ".npz": _read_npz,
+    ".png": _read_png,
+    ".tif": read_tiff,
+    ".tiff": read_tiff,
+}

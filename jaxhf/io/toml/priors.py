@@ -1,0 +1,77 @@
+"""Heights that a fit file knows beforehand: terrain files, resampled to the vertices of the terrain that is sought."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from ..load_terrain import read_terrain
+from ..resample import at_vertices
+from ..terrain import Terrain
+
+
+@dataclasses.dataclass(frozen=True)
+class Sought:
+    """The heightfield that a fit recovers, as far as other files of heights depend on it.
+
+    Attributes:
+      placed: where the scene puts it; None: the scene has no heightfield.
+      stored: its file, in that file's coordinates; None: there is none.
+      path: that file.
+      moved: whether its table has any of dx, dy, x0 and y0.
+      z_scale, nodata: of its table, or their defaults.
+    """
+
+    placed: Terrain | None = None
+    stored: Terrain | None = None
+    path: Path | None = None
+    moved: bool = False
+    z_scale: float = 1.0
+    nodata: float | None = None
+
+    @property
+    def like(self) -> Path | None:
+        """The GeoTIFF whose place on the map the heights have; None: there is none."""
+        return self.path if self.path and not self.moved and self.path.suffix.lower() in (".tif", ".tiff") else None
+
+    def grid(self, path: Path, other: Terrain) -> Terrain | None:
+        """The grid to compare with that of `other`, the file `path`.
+
+        It is that of the terrain's own file where both name the same coordinates or are the same file, as the scene may have
+        moved or scaled it; else the scene's.
+        """
+        own, crs = self.stored and self.stored.crs, other.crs
+        if own is None or crs is None or own.degrees != crs.degrees:
+            return self.placed
+        same = own.degrees or path == self.path or (own.code is not None and own.code == crs.code)
+        return self.stored if same else self.placed
+
+
+def known_heights(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
+    """Heights as `start` and `prior` of `fit` take them.
+
+    Where both files say where they lie, those at the vertices sought; else the file's own, which `fit` lays over the
+    terrain from corner to corner.
+
+    Raises:
+      FileNotFoundError, ValueError: as `load_heights`; or the file does not cover the terrain, or has holes in it.
+    """
+    terrain = read_terrain(path, sought.z_scale, sought.nodata, nodata_overrules=False)
+    heights, grid = terrain.heights, sought.grid(path, terrain)
+    if terrain.crs is not None and grid is not None and grid.crs is not None:
+        if terrain.crs.degrees and not grid.crs.degrees:
+            raise ValueError("it must lie in the coordinates of the terrain, it lies in degrees")
+        heights = at_vertices(terrain, grid)
+    holes = np.argwhere(np.isnan(heights))
+    if len(holes):
+        iy, ix = holes[0].tolist()
+        raise ValueError(
+            f"it must have a height everywhere, {len(holes)} of {heights.size} are holes; the first is row {iy} column {ix}"
+        )
+    return heights
+
+
+def known_deviations(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
+    """Standard deviations of such heights; they have no sign."""
+    return known_heights(dataclasses.replace(sought, z_scale=abs(sought.z_scale)), path)
