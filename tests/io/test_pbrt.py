@@ -10,7 +10,7 @@ import pytest
 
 from jaxhf import Cylinder, Directional, Matte, Mirror, Point
 from jaxhf.io.errors import SceneError
-from jaxhf.io.pbrt import reader as _pbrt
+from jaxhf.io.pbrt import reader
 from jaxhf.io.pbrt.reader import load_pbrt
 
 SEED_SCENES = Path(__file__).parents[3] / "shared" / "pbrt" / "scenes"
@@ -260,7 +260,7 @@ def test_texture_wins_over_colour_and_is_not_flipped(tmp_path):
 
 def test_an_unused_texture_is_not_opened(tmp_path, monkeypatch):
     write(tmp_path, "not an image", "a.npy")
-    monkeypatch.setattr(_pbrt, "load_image", lambda path: pytest.fail(f"opened {path}"))
+    monkeypatch.setattr(reader, "load_image", lambda path: pytest.fail(f"opened {path}"))
     load_world(tmp_path, f'Texture "t" "color" "imagemap" "string filename" "a.npy"\n{FIELD}')
 
 

@@ -15,7 +15,7 @@ from jaxhf.io.errors import SceneError
 from jaxhf.io.load_terrain import load_heights
 from jaxhf.io.procedural import grid
 from jaxhf.io.scenes import load_scene
-from jaxhf.io.toml import tables as _toml_tables
+from jaxhf.io.toml import tables
 from jaxhf.io.toml.fit import load_case
 from jaxhf.io.toml.lines import line_numbers
 from jaxhf.io.toml.values import STEPS
@@ -461,7 +461,7 @@ def words(table):
             yield from words(inner) if isinstance(inner, Mapping) else ()
 
 
-TABLES = {name: set(words(t)) for name, t in vars(_toml_tables).items() if name.isupper() and isinstance(t, Mapping)}
+TABLES = {name: set(words(t)) for name, t in vars(tables).items() if name.isupper() and isinstance(t, Mapping)}
 
 
 @pytest.mark.parametrize("word", sorted({"type", "image", *STEPS}.union(*TABLES.values())))

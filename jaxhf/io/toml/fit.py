@@ -25,7 +25,7 @@ from .checks import Part
 from .priors import Sought, known_deviations, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene
 from .tables import SCENE, Key, Keys
-from .values import flag, number, number_list, number_or_word, table, tables, whole, whole_or_word, word
+from .values import flag, number, number_list, or_word, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
 _CASE: Keys = {
@@ -48,7 +48,7 @@ _PICTURE: Keys = {
 # Those of `fit` and of `Settings`, whose defaults they have and who check their values.
 _FIT: Keys = {
     "noise": Key(number, 0.01),
-    **{name: Key(number_or_word, None) for name in ("start", "prior", "prior_std")},
+    **{name: Key(or_word(number), None) for name in ("start", "prior", "prior_std")},
     **{
         name: Key(number, None)
         for name in ("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", "loss_scale", "tolerance")
@@ -57,7 +57,7 @@ _FIT: Keys = {
     **{name: Key(flag, None) for name in ("exposures", "offsets")},
     **{name: Key(whole, None) for name in ("max_steps", "inner_steps", "checkpoint_every")},
     "levels": Key(number_list, None),
-    "uncertainty": Key(whole_or_word, None),
+    "uncertainty": Key(or_word(whole), None),
 }
 _WHOLE_OR_FLAG = {int: whole, int | None: whole, bool: flag}
 _SETTINGS: Keys = {

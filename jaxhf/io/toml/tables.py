@@ -11,11 +11,11 @@ from ...scene.material import Material, Matte, Mirror
 from .. import procedural
 from .values import (
     colour,
-    colour_or_name,
     grid,
     matrix,
     number,
     numbers,
+    or_word,
     size,
     steps,
     table,
@@ -80,7 +80,7 @@ LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
     "sky": (Sky, {"radiance": Key(colour)}),
 }
 MATERIALS: dict[str, tuple[Callable[..., Material], Keys]] = {
-    "matte": (Matte, {"albedo": Key(colour_or_name, 0.7)}),
+    "matte": (Matte, {"albedo": Key(or_word(colour, ", or the name of a texture"), 0.7)}),
     "mirror": (Mirror, {"reflectance": Key(colour, 0.9)}),
 }
 

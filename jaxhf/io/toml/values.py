@@ -35,19 +35,16 @@ def flag(value: Any) -> bool:
     return value
 
 
-def number_or_word(value: Any) -> float | str:
-    if isinstance(value, str):
-        return value
-    try:
-        return number(value)
-    except ValueError:
-        raise ValueError("a finite number or a string") from None
+def or_word(kind: Callable[[Any], Any], tail: str = " or a string") -> Callable[[Any], Any]:
+    """A string, or what `kind` takes; `tail` goes behind what that must be."""
 
+    def either(value: Any) -> Any:
+        try:
+            return value if isinstance(value, str) else kind(value)
+        except ValueError as error:
+            raise ValueError(f"{error}{tail}") from None
 
-def whole_or_word(value: Any) -> int | str:
-    if not (_is_whole(value) or isinstance(value, str)):
-        raise ValueError("a whole number or a string")
-    return value
+    return either
 
 
 def number_list(value: Any) -> list[float]:
@@ -60,7 +57,7 @@ def numbers(count: int) -> Callable[[Any], list[float]]:
     def kind(value: Any) -> list[float]:
         if not _is_list(value, count, _is_number):
             raise ValueError(f"a list of {count} finite numbers")
-        return [float(item) for item in value]
+        return number_list(value)
 
     return kind
 
@@ -77,7 +74,7 @@ def factors(value: Any) -> list[float]:
         return [float(value)] * 3
     if not _is_list(value, 3, _is_number):
         raise ValueError("a finite number or a list of 3")
-    return [float(item) for item in value]
+    return number_list(value)
 
 
 def colour(value: Any) -> list[float]:
@@ -85,15 +82,6 @@ def colour(value: Any) -> list[float]:
     if min(found) < 0:
         raise ValueError("0 or more")
     return found
-
-
-def colour_or_name(value: Any) -> list[float] | str:
-    if isinstance(value, str):
-        return value
-    try:
-        return colour(value)
-    except ValueError as error:
-        raise ValueError(f"{error}, or the name of a texture") from None
 
 
 def grid(value: Any) -> Float[np.ndarray, "ny nx"]:
