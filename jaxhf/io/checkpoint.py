@@ -1,4 +1,4 @@
-"""Where a long fit stands, in a file that is whole or not there, and that says so when it was damaged."""
+"""Checkpoints of a fit: one file, written whole or not at all, with a checksum."""
 
 import hashlib
 import io
@@ -14,7 +14,7 @@ _MAGIC = b"jaxhf checkpoint 1\n"
 
 
 def save_checkpoint(path: PathLike, facts: dict[str, Any], arrays: Any) -> None:
-    """Writes facts (what JSON can hold) and a pytree's arrays.
+    """Writes a checkpoint: facts (what JSON can hold) and a pytree's arrays.
 
     A kill at any moment leaves the old file or the new one, which takes the old one's place in one step, when it is whole.
     """

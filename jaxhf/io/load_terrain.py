@@ -115,8 +115,8 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
 
         if "heights" in members or len(members) == 1:
             name = "heights" if "heights" in members else next(iter(members))
-            place = {key: number(key) for key in ("dx", "dy", "x0", "y0") if key in members}
-            return Terrain(heights_of(array(name), nodata), **place, crs=CoordinateSystem() if len(place) == 4 else None)
+            grid = {key: number(key) for key in ("dx", "dy", "x0", "y0") if key in members}
+            return Terrain(heights_of(array(name), nodata), **grid, crs=CoordinateSystem() if len(grid) == 4 else None)
         if "elevation" not in members:
             raise ValueError(f"it must hold an array 'heights', or only one, it holds {', '.join(sorted(members))}")
         missing = {"dx", "dy", "xmin", "ymin", "ymax"} - members.keys()

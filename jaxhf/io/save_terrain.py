@@ -11,8 +11,8 @@ from .files import PathLike, by_ending, reading, replacing, require_folder
 from .geotiff import import_tifffile
 from .terrain import Terrain
 
-# ModelPixelScale, ModelTiepoint, ModelTransformation and the three tags of GeoKeys: where a raster lies, on which Earth.
-_PLACE_TAGS = (33550, 33922, 34264, 34735, 34736, 34737)
+# ModelPixelScale, ModelTiepoint, ModelTransformation and the three tags of GeoKeys: the georeference.
+_GEOREFERENCE_TAGS = (33550, 33922, 34264, 34735, 34736, 34737)
 
 
 def save_heights(path: PathLike, terrain: Terrain | ArrayLike, like: PathLike | None = None) -> None:
@@ -24,7 +24,7 @@ def save_heights(path: PathLike, terrain: Terrain | ArrayLike, like: PathLike | 
     Args:
       path: the file.
       terrain: the heights; nan and inf are kept. For .npy, which holds no more, floats of shape (ny, nx) will do.
-      like: a GeoTIFF of the same shape, whose place on the map a .tif takes over tag by tag.
+      like: a GeoTIFF of the same shape, whose georeference a .tif takes over tag by tag.
 
     Raises:
       FileNotFoundError, PermissionError, ValueError: as `require_writable_heights`; or `terrain` is neither, or `like` has
@@ -79,11 +79,11 @@ def _write_npz(path: Path, terrain: Terrain, _: Path | None) -> None:
 
 def _write_tiff(path: Path, terrain: Terrain, like: Path | None) -> None:
     tifffile = import_tifffile("writing")
-    tags = _own_place(terrain) if like is None else _place_of(tifffile, like, terrain.heights.shape)
+    tags = _own_tags(terrain) if like is None else _tags_of(tifffile, like, terrain.heights.shape)
     tifffile.imwrite(path, terrain.heights[::-1], photometric="minisblack", metadata=None, extratags=tags)
 
 
-def _own_place(terrain: Terrain) -> list[tuple[Any, ...]]:
+def _own_tags(terrain: Terrain) -> list[tuple[Any, ...]]:
     ny, _ = terrain.heights.shape
     scale, tie = (terrain.dx, terrain.dy, 0.0), (0.0, 0.0, 0.0, terrain.x0, terrain.y0 + (ny - 1) * terrain.dy, 0.0)
     # GTModelType 32767: coordinates of the user's own; GTRasterType 2, PixelIsPoint: a vertex is a pixel's centre.
@@ -91,14 +91,14 @@ def _own_place(terrain: Terrain) -> list[tuple[Any, ...]]:
     return [(33550, "d", 3, scale, True), (33922, "d", 6, tie, True), (34735, "H", len(keys), keys, True)]
 
 
-def _place_of(tifffile: Any, like: Path, shape: tuple[int, ...]) -> list[tuple[Any, ...]]:
+def _tags_of(tifffile: Any, like: Path, shape: tuple[int, ...]) -> list[tuple[Any, ...]]:
     with tifffile.TiffFile(like) as file:
         page = file.pages[0]
         if (page.imagelength, page.imagewidth) != shape:
             raise ValueError(
                 f"{like}: it must have the shape of the heights, {shape}; it has {(page.imagelength, page.imagewidth)}"
             )
-        found = [page.tags[code] for code in _PLACE_TAGS if code in page.tags]
+        found = [page.tags[code] for code in _GEOREFERENCE_TAGS if code in page.tags]
         return [(tag.code, int(tag.dtype), tag.count, tag.value, True) for tag in found]
 
 

@@ -1,4 +1,4 @@
-"""Heights on the host, with what is known about where they lie."""
+"""Heights on the host, with their spacing, origin and reference system."""
 
 import dataclasses
 import math
@@ -58,7 +58,7 @@ class Terrain:
 
     def in_metres(self, **given: float) -> "Terrain":
         """The terrain with degrees turned into metres from vertex (0, 0), and then with `given` for its dx, dy, x0 and y0."""
-        crs, place = self.crs, {"dx": self.dx, "dy": self.dy, "x0": self.x0, "y0": self.y0}
+        crs, grid = self.crs, {"dx": self.dx, "dy": self.dy, "x0": self.x0, "y0": self.y0}
         if crs is not None and crs.degrees:
             if not (-360 <= self.x0 <= 360 and -90 <= self.y0 <= 90):
                 corner = f"the south-western corner is at longitude {self.x0}, latitude {self.y0}"
@@ -67,10 +67,10 @@ class Terrain:
                 raise ValueError("its degrees are on a globe of unknown size: dx and dy must be given, in metres")
             middle = self.y0 + (len(self.heights) - 1) / 2 * self.dy
             along_x, along_y = metres_per_degree(middle, crs.globe or WGS84)
-            crs, place = CoordinateSystem(), {"dx": self.dx * along_x, "dy": self.dy * along_y, "x0": 0.0, "y0": 0.0}
-        if place.keys() <= given.keys():
+            crs, grid = CoordinateSystem(), {"dx": self.dx * along_x, "dy": self.dy * along_y, "x0": 0.0, "y0": 0.0}
+        if grid.keys() <= given.keys():
             crs = crs or CoordinateSystem()
-        return dataclasses.replace(self, **{name: float(value) for name, value in {**place, **given}.items()}, crs=crs)
+        return dataclasses.replace(self, **{name: float(value) for name, value in {**grid, **given}.items()}, crs=crs)
 
 
 def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, offset: float = 0.0) -> Float[np.ndarray, "ny nx"]:

@@ -466,7 +466,7 @@ TABLES = {name: set(words(t)) for name, t in vars(tables).items() if name.isuppe
 
 @pytest.mark.parametrize("word", sorted({"type", "image", *STEPS}.union(*TABLES.values())))
 def test_the_page_on_scene_files_explains_every_key(word):
-    assert {"SCENE", "CAMERAS", "HEIGHTS", "PLACE"} <= TABLES.keys()
+    assert {"SCENE", "CAMERAS", "HEIGHTS", "OBJECT"} <= TABLES.keys()
     assert re.search(rf"^\|.*`{word}`.*\|", PAGE, re.MULTILINE)
 
 

@@ -74,7 +74,7 @@ class Case:
       scenes, targets, weights, noise, settings: as `fit` takes them; a grey picture has shape (h, w).
       options: further arguments of `fit`, those that the file gives.
       names: the pictures' files, as written.
-      like: the GeoTIFF whose place on the map the heights have; None: there is none.
+      like: the GeoTIFF whose georeference the heights have; None: there is none.
       part: the file, for errors.
     """
 
@@ -202,7 +202,7 @@ def _sought(part: Part, tables: Sequence[dict[str, Any]], objects: Sequence[tupl
 
 
 def _placed(field: Heightfield, given: dict[str, float]) -> Terrain:
-    """Heights of no file: where they lie is known if their table says it, where dx may count for dy, or dy for dx."""
+    """Heights that come from no file, with a `crs` if their table gives x0, y0 and the cell size."""
     known = {"x0", "y0"} <= given.keys() and not given.keys().isdisjoint(("dx", "dy"))
     crs = CoordinateSystem() if known else None
     return Terrain(np.asarray(field.heights), field.dx, field.dy, field.x0, field.y0, crs)

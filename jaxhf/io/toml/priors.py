@@ -1,4 +1,4 @@
-"""Heights that a fit file knows beforehand: terrain files, resampled to the vertices of the terrain that is sought."""
+"""Start and prior heights of a fit file: terrain files, resampled to the vertices of the terrain that is sought."""
 
 import dataclasses
 from pathlib import Path
@@ -32,14 +32,14 @@ class Sought:
 
     @property
     def like(self) -> Path | None:
-        """The GeoTIFF whose place on the map the heights have; None: there is none."""
+        """The GeoTIFF whose georeference the heights have; None: there is none."""
         return self.path if self.path and not self.moved and self.path.suffix.lower() in (".tif", ".tiff") else None
 
     def grid(self, path: Path, other: Terrain) -> Terrain | None:
-        """The grid to compare with that of `other`, the file `path`.
+        """The sought grid in coordinates that can be compared with those of `other`, which is the file `path`.
 
-        It is that of the terrain's own file where both name the same coordinates or are the same file, as the scene may have
-        moved or scaled it; else the scene's.
+        They are those of the terrain's own file if both files are in degrees, name the same system, or are one file: the
+        scene may have moved or scaled the terrain. Else they are the scene's.
         """
         own, crs = self.stored and self.stored.crs, other.crs
         if own is None or crs is None or own.degrees != crs.degrees:
@@ -51,8 +51,8 @@ class Sought:
 def known_heights(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
     """Heights as `start` and `prior` of `fit` take them.
 
-    Where both files say where they lie, those at the vertices sought; else the file's own, which `fit` lays over the
-    terrain from corner to corner.
+    If the file and the terrain both have a `crs`: its heights, resampled to the terrain's vertices. Else the heights of the
+    file as they are, which `fit` stretches over the terrain from corner to corner.
 
     Raises:
       FileNotFoundError, ValueError: as `load_heights`; or the file does not cover the terrain, or has holes in it.

@@ -26,7 +26,7 @@ from ..load_terrain import jacksboro_file, read_terrain
 from ..terrain import Terrain, fitted
 from .checks import Part
 from .lines import line_numbers
-from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, ORIGINS, PLACE, SCENE, TEXTURES, Key, Keys
+from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, OBJECT, ORIGINS, SCENE, TEXTURES, Key, Keys
 from .values import word
 
 
@@ -111,7 +111,7 @@ def named_file(part: Part, name: str) -> Path:
 def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> tuple[Object, Terrain | None]:
     is_field = part.choice("shape", ("heightfield", "cylinder")) == "heightfield"
     make_material, material_keys = MATERIALS[part.choice("material", MATERIALS, "matte")]
-    common: Keys = {**PLACE, **material_keys}
+    common: Keys = {**OBJECT, **material_keys}
     shape_keys = _field_keys(part, common) if is_field else CYLINDER
     values = part.read({**common, **shape_keys})
     world = _world_from_object(part, values)

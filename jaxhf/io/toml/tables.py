@@ -111,7 +111,7 @@ ORIGINS: dict[str, Keys] = {  # where a heightfield comes from
 }
 GRID: Keys = {**{name: Key(number, None) for name in ("dx", "dy", "x0", "y0")}, "z_scale": Key(number, 1.0)}
 CYLINDER: Keys = {"radius": Key(number, 1.0), "z_min": Key(number, -1.0), "z_max": Key(number, 1.0)}
-PLACE: Keys = {
+OBJECT: Keys = {
     "shape": Key(word),
     "material": Key(word, "matte"),
     "transform": Key(steps, None),
