@@ -154,3 +154,21 @@ def test_every_leaf_pixel_by_pixel(name):
         assert np.mean(size > 1e-4) > 0.1, where  # or all could be zero
         np.testing.assert_allclose(exact[smooth], numeric[smooth], rtol=1e-6, atol=1e-9, err_msg=where)
         np.testing.assert_allclose(np.vdot(gradients[k], changes[k]), np.vdot(weights, exact), rtol=1e-10, err_msg=where)
+
+
+def test_a_miss_has_no_derivative():
+    scene = jax.tree.map(jnp.asarray, parallel())
+    shift = jnp.zeros((4, 4)).at[0, 3].set(0.5)
+    scene = eqx.tree_at(lambda scene: scene.camera.world_from_camera, scene, scene.camera.world_from_camera + shift)
+    image, aovs = jaxhf.render(scene, SETTINGS, aovs=("status",))
+    missed = np.asarray(aovs["status"]) == jaxhf.Status.MISS
+    assert 0.2 < missed.mean() < 0.8
+    ones = jax.tree.map(jnp.ones_like, scene)
+    change = np.asarray(forward(scene, eqx.tree_at(lambda scene: scene.lights[1].radiance, ones, jnp.zeros(3)), SETTINGS))
+    assert np.isfinite(change).all()
+    np.testing.assert_array_equal(change[missed], 0)
+    assert np.all(change[~missed] != 0)
+    gradient = reverse(scene, jnp.where(missed[..., None], jnp.ones_like(image), 0), SETTINGS)
+    for path, leaf in jax.tree.leaves_with_path(gradient):
+        name = jax.tree_util.keystr(path)
+        np.testing.assert_array_equal(leaf, missed.sum() if name.endswith("lights[1].radiance") else 0, name)

@@ -1,4 +1,4 @@
-"""The picture as a whole: where its pixels look, what its AOVs hold, its bits, and its derivative pixel by pixel."""
+"""The picture as a whole: where its pixels look, what its AOVs hold, and its bits."""
 
 import functools
 from typing import Any
@@ -156,12 +156,6 @@ def test_orthographic_camera_straight_down(width, height):
 # Bits.
 
 
-def test_repeated_runs_give_the_same_bits():
-    first, _ = rendered(np.float32)
-    again, _ = jaxhf.render(scene(dtype=np.float32), aovs=jaxhf.AOVS)
-    np.testing.assert_array_equal(first, again)
-
-
 def test_an_offset_costs_no_bit():
     """At 5e6 float32 has steps of 0.5, half of this terrain."""
     image, aovs = rendered(np.float32)
@@ -284,11 +278,6 @@ def test_holes_show_the_background_and_cast_no_shadow(hole):
 # Transformations of JAX.
 
 
-def test_jit():
-    image = jax.jit(lambda scene: jaxhf.render(scene))(scene())
-    np.testing.assert_allclose(image, rendered(np.float64)[0], rtol=ROUNDING)
-
-
 def test_vmap_of_gradients_equals_a_loop():
     many = jnp.stack([jnp.asarray(terrain(seed)) for seed in range(3)])
     target = jnp.asarray(np.random.default_rng(2).uniform(size=(HEIGHT, WIDTH, 3)))
@@ -321,99 +310,3 @@ def test_with_heights_keeps_shape_and_precision():
     with pytest.raises(ValueError, match=r"heights must keep their shape \(9, 9\), theirs is \(9, 8\)"):
         scene().with_heights(np.zeros((9, 8)))
     assert scene(dtype=np.float32).with_heights(terrain()).heights.dtype == np.float32
-
-
-# Derivatives.
-
-Parameters = dict[str, jax.Array]
-
-
-def turned(degrees, offset, stretch=(1.0, 1.0, 1.0)):
-    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) * stretch
-    matrix[:3, 3] = offset
-    return matrix
-
-
-INSIDE = jaxhf.Perspective.look_at((0.3, -0.2, 0.8), (0.5, 0.45, 0.1), fov=24).world_from_camera
-BEYOND = jaxhf.Perspective.look_at((0.3, -0.2, 0.8), (0.4, 1.2, 0.1), fov=24).world_from_camera
-
-
-def parameters(camera) -> Parameters:
-    values = {
-        "heights": terrain(),
-        "albedo": np.array([0.3, 0.5, 0.7]),
-        "towards": np.array([-0.3, 0.2, 0.9]),
-        "camera": np.asarray(camera),
-        "world": turned(10, (-0.1, -0.1, 0.05), (1.3, 1.4, 0.8)),
-    }
-    return {name: jnp.asarray(value) for name, value in values.items()}
-
-
-@jax.jit
-def picture(parameters: Parameters) -> tuple[jax.Array, dict[str, jax.Array]]:
-    field, material = jaxhf.Heightfield(parameters["heights"]), jaxhf.Matte(parameters["albedo"])
-    lights = [jaxhf.Directional(parameters["towards"], (2, 3, 4)), jaxhf.Point((0.4, 0.3, 1.5), 2.0), jaxhf.Sky(SKY)]
-    return jaxhf.render(
-        jaxhf.Scene(
-            [jaxhf.Object(field, material, parameters["world"])],
-            jaxhf.Perspective(parameters["camera"], 24.0, width=16, height=16),
-            lights,
-        ),
-        PLAIN,
-        aovs=("cell", "status"),
-    )
-
-
-@jax.jit
-def forward(at: Parameters, change: Parameters) -> jax.Array:
-    return jax.jvp(lambda at: picture(at)[0], (at,), (change,))[1]
-
-
-@jax.jit
-def reverse(at: Parameters, weights: jax.Array) -> Parameters:
-    return jax.vjp(lambda at: picture(at)[0], at)[1](weights)[0]
-
-
-@pytest.mark.parametrize("name", ["heights", "albedo", "towards", "camera", "world"])
-def test_derivative_pixel_by_pixel(name):
-    """Inside a triangle, forward and reverse mode against a central difference.
-
-    Its error is 1e-12 times a third derivative, and 1e-16 / 1e-6 by rounding: 1e-8 beside values around 1.
-    """
-    eps, at = 1e-6, parameters(INSIDE)
-    rng = np.random.default_rng(7)
-    change = {key: jnp.zeros_like(value) for key, value in at.items()}
-    direction = rng.normal(size=at[name].shape)
-    if at[name].shape == (4, 4):
-        direction[3] = 0  # the last row of an affine matrix stays
-    change[name] = jnp.asarray(direction)
-    up, down = (picture({**at, name: at[name] + sign * eps * change[name]}) for sign in (1, -1))
-    image, aovs = picture(at)
-    assert np.all(aovs["status"] == jaxhf.Status.HIT)
-    same = np.all((up[1]["cell"] == aovs["cell"]) & (down[1]["cell"] == aovs["cell"]), axis=-1)
-    assert same.mean() > 0.98
-    numeric = (np.asarray(up[0]) - np.asarray(down[0])) / (2 * eps)
-    exact = np.asarray(forward(at, change))
-    np.testing.assert_allclose(exact[same], numeric[same], rtol=1e-6, atol=1e-8)
-    assert np.median(np.abs(numeric)) > 1e-2  # or both could be zero
-
-    weights = rng.normal(size=image.shape)
-    gradient = reverse(at, jnp.asarray(weights))
-    assert all(np.isfinite(leaf).all() for leaf in gradient.values())
-    np.testing.assert_allclose(np.vdot(gradient[name], direction), np.vdot(weights, exact), rtol=1e-10)
-
-
-def test_a_miss_has_no_derivative():
-    at = parameters(BEYOND)
-    image, aovs = picture(at)
-    missed = np.asarray(aovs["status"]) == jaxhf.Status.MISS
-    assert 0.2 < missed.mean() < 0.8
-    change = forward(at, {name: jnp.ones_like(value) for name, value in at.items()})
-    assert np.isfinite(change).all()
-    np.testing.assert_array_equal(np.asarray(change)[missed], 0)
-    assert np.all(np.asarray(change)[~missed] != 0)
-    gradient = reverse(at, jnp.where(missed[..., None], jnp.ones_like(image), 0))
-    for name, leaf in gradient.items():
-        np.testing.assert_array_equal(leaf, 0, name)
