@@ -1,3 +1,4 @@
+from .core.errors import ArgumentError as ArgumentError
 from .core.settings import Settings as Settings
 from .fitting.fit import Fit as Fit, fit as fit
 from .fitting.history import Step as Step, Stop as Stop

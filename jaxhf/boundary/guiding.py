@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
+from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..core.types import Index
 from ..core.vector import unit
@@ -104,7 +105,7 @@ def make_lottery(weights: Float[jax.Array, " edges"], draws: Index) -> Lottery:
     """Every edge with a weight gets a ticket at least."""
     count = weights.shape[0]
     if count >= _TICKETS // 2:
-        raise ValueError(f"Settings: edge_samples works for fewer than {_TICKETS // 2} edges, the scene has {count}")
+        raise ArgumentError("Settings", "edge_samples", f"works for fewer than {_TICKETS // 2} edges, the scene has {count}")
     total = jnp.sum(weights)
     tickets = jnp.ceil(weights / jnp.where(total > 0, total, 1) * (_TICKETS - count)).astype(jnp.int32)
     cumulative = jnp.cumsum(tickets, dtype=jnp.int32)

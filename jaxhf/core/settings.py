@@ -4,6 +4,8 @@ import dataclasses
 import math
 from typing import Literal, get_args
 
+from .errors import ArgumentError
+
 Traversal = Literal["pyramid", "dda"]
 Shading = Literal["smooth", "flat"]
 NormalScheme = Literal["central", "four", "six", "six-angle", "six-equal"]
@@ -58,14 +60,16 @@ class Settings:
     def __post_init__(self):
         for name, kind in (("traversal", Traversal), ("shading", Shading), ("normals", NormalScheme)):
             if getattr(self, name) not in get_args(kind):
-                raise ValueError(f"Settings: {name} must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}")
+                raise ArgumentError(
+                    "Settings", name, f"must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}"
+                )
         if not isinstance(self.shadows, bool):
-            raise ValueError(f"Settings: shadows must be True or False, it is {self.shadows!r}")
+            raise ArgumentError("Settings", "shadows", f"must be True or False, it is {self.shadows!r}")
         for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("edge_samples", 0), ("chunk", 64)):
             value = getattr(self, name)
             if value is None and name in ("max_steps", "samples"):
                 continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ValueError(f"Settings: {name} must be a whole number from {least} on, it is {value!r}")
+                raise ArgumentError("Settings", name, f"must be a whole number from {least} on, it is {value!r}")
         if self.samples is not None and math.isqrt(self.samples) ** 2 != self.samples:
-            raise ValueError(f"Settings: samples must be a square number (1, 4, 9, ...), it is {self.samples}")
+            raise ArgumentError("Settings", "samples", f"must be a square number (1, 4, 9, ...), it is {self.samples}")

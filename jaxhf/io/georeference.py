@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from .errors import FileError
+
 
 class Ellipsoid(NamedTuple):
     """A globe: its equatorial radius in metres, and the share by which the polar one is shorter."""
@@ -65,9 +67,9 @@ class Place(NamedTuple):
             return self._replace(**given)
         (south, dy), (west, dx) = self.sides
         if not (-360 <= west <= 360 and -90 <= south <= 90):
-            raise ValueError(f"degrees must lie on a globe, the south-western corner is at longitude {west}, latitude {south}")
+            raise FileError(f"degrees must lie on a globe, the south-western corner is at longitude {west}, latitude {south}")
         if self.globe is None and not {"dx", "dy"} <= given.keys():
-            raise ValueError("its degrees are on a globe of unknown size: dx and dy must be given, in metres")
+            raise FileError("its degrees are on a globe of unknown size: dx and dy must be given, in metres")
         along_x, along_y = metres_per_degree(south + (rows - 1) / 2 * dy, self.globe or WGS84)
         return Place(dx * along_x, dy * along_y, 0.0, 0.0)._replace(**given)
 
@@ -87,10 +89,10 @@ def at_vertices(
       shape: the other grid's.
 
     Raises:
-      ValueError: the other grid goes further, or its coordinates are of another system.
+      FileError: the other grid goes further, or its coordinates are of another system.
     """
     if None not in (place.system, wanted.system) and place.system != wanted.system:
-        raise ValueError(f"it must have the terrain's coordinates, EPSG:{wanted.system}; it has EPSG:{place.system}")
+        raise FileError(f"it must have the terrain's coordinates, EPSG:{wanted.system}; it has EPSG:{place.system}")
     turns = 0
     if place.degrees:  # longitudes may count from -180 or from 0
         turns = round((_middle(wanted.sides[1], shape[1]) - _middle(place.sides[1], heights.shape[1])) / 360)
@@ -103,7 +105,7 @@ def at_vertices(
         at = np.where(np.abs(at - vertex) < 1e-6, vertex, at)  # without a share in the next one, which may be a hole
         if at[0] < -0.5 or at[-1] > count - 0.5:
             last, others_last = first + (count - 1) * step, other + (others - 1) * other_step
-            raise ValueError(
+            raise FileError(
                 f"it must cover the terrain, whose {names[axis]} goes from {other:.10g} to {others_last:.10g}; "
                 f"its own goes from {first:.10g} to {last:.10g}"
             )

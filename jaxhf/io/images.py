@@ -16,6 +16,7 @@ from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
+from .errors import FileError
 from .files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_folder, require_pixels
 from .png import read_png, samples_16
 
@@ -65,9 +66,9 @@ def save_image(path: PathLike, image: Any) -> None:
     if pixels.dtype.kind == "V":  # bfloat16 and its like, which .npy would store without their meaning
         pixels = pixels.astype(np.float32)
     if pixels.dtype.kind != "f":
-        raise ValueError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
+        raise FileError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
-        raise ValueError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
+        raise FileError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
     with replacing(path) as temporary:
         _WRITERS[path.suffix.lower()](temporary, pixels)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..core.errors import ArgumentError, UserError
 from .files import PathLike, by_ending, read_npy, reading, require_file
 from .georeference import WGS84, Place
 from .geotiff import Raw, read_tiff
@@ -36,12 +37,12 @@ class Terrain:
 
     def __post_init__(self):
         if self.heights.ndim != 2 or min(self.heights.shape) < 2:
-            raise ValueError(f"heights must have shape (ny, nx) of at least 2x2, theirs is {self.heights.shape}")
+            raise ArgumentError("", "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {self.heights.shape}")
         for name in ("dx", "dy", "x0", "y0"):
             value = getattr(self, name)
             if not math.isfinite(value) or (name in ("dx", "dy") and value <= 0):
                 rule = "positive and finite" if name in ("dx", "dy") else "finite"
-                raise ValueError(f"{name} must be {rule}, it is {value}")
+                raise ArgumentError("", name, f"must be {rule}, it is {value}")
 
     @property
     def nodata(self) -> Bool[np.ndarray, "ny nx"]:
@@ -116,7 +117,7 @@ def load_placed(
 def jacksboro() -> Terrain:
     """The valley of the Jacksboro fault in Tennessee: 344 x 403 heights in metres, about 74 m by 92 m apart.
 
-    Its origin is the south-western vertex. ValueError where matplotlib, with which the data come, is not installed.
+    Its origin is the south-western vertex. UserError where matplotlib, with which the data come, is not installed.
     """
     return load_heights(jacksboro_file())
 
@@ -126,7 +127,7 @@ def jacksboro_file() -> str:
     try:
         from matplotlib import cbook
     except ImportError as error:
-        raise ValueError("the Jacksboro terrain comes with matplotlib: pip install 'jaxhf[plot]'") from error
+        raise UserError("the Jacksboro terrain comes with matplotlib: pip install 'jaxhf[plot]'") from error
     return str(cbook.get_sample_data("jacksboro_fault_dem.npz", asfileobj=False))
 
 

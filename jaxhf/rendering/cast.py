@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
+from ..core.errors import ArgumentError
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import float_leaf
@@ -69,10 +70,12 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings
     dtype = heightfield.heights.dtype
     corner = np.array([heightfield.x0, heightfield.y0, 0.0])
     if (o is None) == (leaving is None):
-        raise ValueError("cast: rays start at o or at the hits that they are leaving, and one of the two must be None")
+        raise ArgumentError(
+            "cast", "o", ": rays start at o or at the hits that they are leaving, and one of the two must be None"
+        )
     for name, value in (("o", o), ("d", d)):
         if value is not None and np.shape(value)[-1:] != (3,):
-            raise ValueError(f"cast: {name} must have shape (..., 3), its shape is {np.shape(value)}")
+            raise ArgumentError("cast", name, f"must have shape (..., 3), its shape is {np.shape(value)}")
     if leaving is not None:
         start, axes = leaving, leaving.t.ndim
     elif isinstance(o, jax.Array):

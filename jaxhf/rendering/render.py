@@ -18,6 +18,7 @@ from ..boundary.guiding import sources
 from ..boundary.term import moving_boundaries
 from ..core.autodiff import with_tangent
 from ..core.devices import local_mesh, map_over, on_every_device
+from ..core.errors import ArgumentError
 from ..core.materialise import stored
 from ..core.sampling import sample_offset
 from ..core.settings import Settings
@@ -93,14 +94,16 @@ def render(
     aovs = tuple(aovs)
     for name in aovs:
         if name not in AOVS:
-            raise ValueError(f"render: aovs must be among {', '.join(AOVS)}; one is {name!r}")
+            raise ArgumentError("render", "aovs", f"must be among {', '.join(AOVS)}; one is {name!r}")
     if not isinstance(scene, Prepared) and progress is not None:
         scene, settings = prepare(scene, settings, mesh=mesh), Settings()
     if isinstance(scene, Prepared):
         if mesh is not None and mesh != scene.mesh:
-            raise ValueError(f"render: the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
+            raise ArgumentError("render", "mesh", f": the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
         if settings != Settings() and settle(settings, scene.scene) != scene.settings:
-            raise ValueError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
+            raise ArgumentError(
+                "render", "settings", f": the scene was prepared with {scene.settings}, it cannot be rendered with {settings}"
+            )
         settings, world, mesh = scene.settings, scene._world, scene.mesh
         camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:

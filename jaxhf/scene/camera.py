@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.affine import Affine, affine, require_invertible
+from ..core.errors import ArgumentError
 from ..core.ray import Ray
 from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
 from ..core.vector import unit
@@ -54,9 +55,9 @@ class Perspective(eqx.Module):
 
     def __check_init__(self):
         _check_camera(self)
-        require_number("Perspective: fov", self.fov)
+        require_number("Perspective", "fov", self.fov)
         if isinstance(self.fov, np.ndarray) and not 0 < self.fov < 180:
-            raise ValueError(f"Perspective: fov must lie between 0 and 180 degrees, it is {self.fov}")
+            raise ArgumentError("Perspective", "fov", f"must lie between 0 and 180 degrees, it is {self.fov}")
 
     @classmethod
     def look_at(
@@ -98,9 +99,9 @@ class Orthographic(eqx.Module):
 
     def __check_init__(self):
         _check_camera(self)
-        require_number("Orthographic: extent", self.extent)
+        require_number("Orthographic", "extent", self.extent)
         if isinstance(self.extent, np.ndarray) and not 0 < self.extent < np.inf:
-            raise ValueError(f"Orthographic: extent must be positive and finite, it is {self.extent}")
+            raise ArgumentError("Orthographic", "extent", f"must be positive and finite, it is {self.extent}")
 
     @classmethod
     def look_at(
@@ -159,8 +160,8 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
     leaves = {"eye": eye, "target": target, "up": up}
     for name, leaf in leaves.items():
         if leaf.shape != (3,):
-            raise ValueError(f"look_at: {name} must hold three numbers, its shape is {leaf.shape}")
-        require_finite(f"look_at: {name}", leaf)
+            raise ArgumentError("look_at", name, f"must hold three numbers, its shape is {leaf.shape}")
+        require_finite("look_at", name, leaf)
     host = all(isinstance(leaf, np.ndarray) for leaf in leaves.values())
     xp = np if host else jnp
 
@@ -168,11 +169,13 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
         return v / xp.sqrt((v * v).sum())
 
     if host and not (target - eye).any():
-        raise ValueError(f"look_at: target must differ from eye, both are {eye.tolist()}")
+        raise ArgumentError("look_at", "target", f"must differ from eye, both are {eye.tolist()}")
     forward = direction(target - eye)
     right = xp.cross(forward, up)
     if host and not np.linalg.norm(right) > 1e-9 * np.linalg.norm(up):
-        raise ValueError(f"look_at: up must not point along the view, it is {up.tolist()} for the view {forward.tolist()}")
+        raise ArgumentError(
+            "look_at", "up", f"must not point along the view, it is {up.tolist()} for the view {forward.tolist()}"
+        )
     right = direction(right)
     columns = xp.stack([right, xp.cross(right, forward), forward, eye], axis=1)
     return xp.concatenate([columns, xp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=columns.dtype)])
@@ -180,8 +183,8 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
 
 def _check_camera(camera: Camera) -> None:
     kind = type(camera).__name__
-    require_invertible(f"{kind}: world_from_camera", camera.world_from_camera)
+    require_invertible(kind, "world_from_camera", camera.world_from_camera)
     for side in ("width", "height"):
         value = getattr(camera, side)
         if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{kind}: {side} must be a whole number of pixels from 1 on, it is {value!r}")
+            raise ArgumentError(kind, side, f"must be a whole number of pixels from 1 on, it is {value!r}")

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ..core.errors import ArgumentError
 from ..core.types import VectorLeaf, float_leaf, require_finite, rgb_leaf
 
 
@@ -22,10 +23,10 @@ class Directional(eqx.Module):
     radiance: VectorLeaf = eqx.field(converter=rgb_leaf, default=np.pi)
 
     def __check_init__(self):
-        _require_vector("Directional: towards", self.towards)
-        _require_vector("Directional: radiance", self.radiance)
+        _require_vector("Directional", "towards", self.towards)
+        _require_vector("Directional", "radiance", self.radiance)
         if isinstance(self.towards, np.ndarray) and not self.towards.any():
-            raise ValueError("Directional: towards must not be zero, it is [0, 0, 0]")
+            raise ArgumentError("Directional", "towards", "must not be zero, it is [0, 0, 0]")
 
     @classmethod
     def from_angles(cls, azimuth: Any = 315.0, altitude: Any = 45.0, radiance: Any = np.pi) -> "Directional":
@@ -54,8 +55,8 @@ class Point(eqx.Module):
     intensity: VectorLeaf = eqx.field(converter=rgb_leaf, default=1.0)
 
     def __check_init__(self):
-        _require_vector("Point: p", self.p)
-        _require_vector("Point: intensity", self.intensity)
+        _require_vector("Point", "p", self.p)
+        _require_vector("Point", "intensity", self.intensity)
 
 
 class Sky(eqx.Module):
@@ -72,13 +73,13 @@ class Sky(eqx.Module):
     radiance: VectorLeaf = eqx.field(converter=rgb_leaf)
 
     def __check_init__(self):
-        _require_vector("Sky: radiance", self.radiance)
+        _require_vector("Sky", "radiance", self.radiance)
 
 
 Light = Directional | Point | Sky
 
 
-def _require_vector(place: str, leaf: VectorLeaf) -> None:
+def _require_vector(owner: str, name: str, leaf: VectorLeaf) -> None:
     if leaf.shape != (3,):
-        raise ValueError(f"{place} must hold three numbers, its shape is {leaf.shape}")
-    require_finite(place, leaf)
+        raise ArgumentError(owner, name, f"must hold three numbers, its shape is {leaf.shape}")
+    require_finite(owner, name, leaf)

@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Float
 
+from ..core.errors import ArgumentError
 from ..core.types import AnyArray, require_finite, rgb_leaf
 from .texture import ImageTexture
 
@@ -25,8 +26,8 @@ class Matte(eqx.Module):
     def __check_init__(self):
         if not isinstance(self.albedo, ImageTexture):
             if self.albedo.shape != (3,):
-                raise ValueError(f"Matte: albedo must be one number or three, its shape is {self.albedo.shape}")
-            require_finite("Matte: albedo", self.albedo)
+                raise ArgumentError("Matte", "albedo", f"must be one number or three, its shape is {self.albedo.shape}")
+            require_finite("Matte", "albedo", self.albedo)
 
 
 class Mirror(eqx.Module):
@@ -40,8 +41,8 @@ class Mirror(eqx.Module):
 
     def __check_init__(self):
         if self.reflectance.shape != (3,):
-            raise ValueError(f"Mirror: reflectance must be one number or three, its shape is {self.reflectance.shape}")
-        require_finite("Mirror: reflectance", self.reflectance)
+            raise ArgumentError("Mirror", "reflectance", f"must be one number or three, its shape is {self.reflectance.shape}")
+        require_finite("Mirror", "reflectance", self.reflectance)
 
 
 Material = Matte | Mirror

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from ..core.affine import require_invertible
+from ..core.errors import ArgumentError, UserError
 from ..core.types import AnyArray, MatrixLeaf, float_leaf
 from .camera import Camera
 from .cylinder import Cylinder
@@ -35,11 +36,11 @@ class Object(eqx.Module):
         self.material = Matte(0.7) if material is None else material
         self.world_from_object = None if world_from_object is None else float_leaf(world_from_object)
         if not isinstance(shape, Shape):
-            raise ValueError(f"Object: shape must be a Heightfield or a Cylinder, it is {type(shape).__name__}")
+            raise ArgumentError("Object", "shape", f"must be a Heightfield or a Cylinder, it is {type(shape).__name__}")
         if not isinstance(self.material, Material):
-            raise ValueError(f"Object: material must be Matte or Mirror, it is {type(self.material).__name__}")
+            raise ArgumentError("Object", "material", f"must be Matte or Mirror, it is {type(self.material).__name__}")
         if self.world_from_object is not None:
-            require_invertible("Object: world_from_object", self.world_from_object)
+            require_invertible("Object", "world_from_object", self.world_from_object)
 
 
 class Scene(eqx.Module):
@@ -59,7 +60,7 @@ class Scene(eqx.Module):
 
     def __check_init__(self):
         if not self.objects:
-            raise ValueError("Scene: objects must hold at least one Object, it is empty")
+            raise ArgumentError("Scene", "objects", "must hold at least one Object, it is empty")
         for place, values, kinds in (
             ("objects", self.objects, Object),
             ("camera", (self.camera,), Camera),
@@ -67,11 +68,11 @@ class Scene(eqx.Module):
         ):
             for value in values:
                 if not isinstance(value, kinds):
-                    raise ValueError(f"Scene: {place} does not take a {type(value).__name__}")
+                    raise ArgumentError("Scene", place, f"does not take a {type(value).__name__}")
         if sum(isinstance(light, Sky) for light in self.lights) > 1:
-            raise ValueError("Scene: lights may hold one Sky, they hold more")
+            raise ArgumentError("Scene", "lights", "may hold one Sky, they hold more")
         if not isinstance(self.samples, int) or self.samples < 1:
-            raise ValueError(f"Scene: samples must be a whole number from 1 on, it is {self.samples!r}")
+            raise ArgumentError("Scene", "samples", f"must be a whole number from 1 on, it is {self.samples!r}")
 
     @property
     def heightfields(self) -> tuple[Heightfield, ...]:
@@ -82,7 +83,7 @@ class Scene(eqx.Module):
     def heights(self) -> Float[AnyArray, "ny nx"]:
         """The heights of the first heightfield, shape (ny, nx); ValueError where the scene has none."""
         if not self.heightfields:
-            raise ValueError("Scene: there is no heightfield among its objects")
+            raise UserError("Scene: there is no heightfield among its objects")
         return self.heightfields[0].heights
 
     def with_heights(self, heights: Any) -> "Scene":
@@ -90,5 +91,5 @@ class Scene(eqx.Module):
         old = self.heights
         new = jnp.asarray(heights, old.dtype)
         if new.shape != old.shape:
-            raise ValueError(f"with_heights: heights must keep their shape {old.shape}, theirs is {new.shape}")
+            raise ArgumentError("with_heights", "heights", f"must keep their shape {old.shape}, theirs is {new.shape}")
         return eqx.tree_at(lambda scene: scene.heightfields[0].heights, self, new)

@@ -18,7 +18,7 @@ _LABELS = {
 
 
 def screenless_pyplot() -> Any:
-    """matplotlib's pyplot, without a screen; ValueError where it is not installed."""
+    """matplotlib's pyplot, without a screen; UserError where it is not installed."""
     require_matplotlib("tradeoff draws with")
     import matplotlib
 

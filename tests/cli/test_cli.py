@@ -131,6 +131,26 @@ def test_info():
     assert lines[4].startswith("light 1: Sky, radiance (0.05, 0.07, 0.1)")
 
 
+def test_our_own_bug_keeps_its_traceback(tmp_path):
+    """Only what is known for the user's mistake becomes one line."""
+    script = """
+import sys
+import jaxhf.rendering.render
+from jaxhf.cli.main import main
+
+def broken(*_, **__):
+    raise ValueError("a bug")
+
+jaxhf.rendering.render.render = broken
+sys.exit(main(sys.argv[1:]))
+"""
+    run = python("-c", script, "render", SCENE, "-o", tmp_path / "out.png")
+    assert run.returncode == 1
+    lines = run.stderr.splitlines()
+    assert (lines[0], lines[-1]) == ("Traceback (most recent call last):", "ValueError: a bug")
+    assert "in broken" in run.stderr
+
+
 @pytest.mark.parametrize("error", [MemoryError("8 GiB"), RuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
 def test_no_memory_is_an_error_in_one_line(monkeypatch, capsys, error):
     def fail(*_):

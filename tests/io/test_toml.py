@@ -296,6 +296,8 @@ MISTAKES = [
     (texture('source = "checker"\nsize = [2, 2]\nfirst = -1'), 13, "textures.t.first must be 0 or more, it is -1"),
     (f"{CAMERA}{FIELD}[[pictures]]\n", 10, "'pictures' makes this a fit file, for `jaxhf fit`"),
     (f"{CAMERA}{FIELD}[fit]\nnoise = 1\n", 10, "'fit' makes this a fit file, for `jaxhf fit`"),
+    (field('source = "fractal"\nsize = [5, 5]\nseed = -1'), 10, "objects[0].seed must be non-negative, it is -1"),
+    (field('file = "a\\u0000.npy"'), 8, "objects[0].file: 'a\\x00.npy' is no file's name"),
     (field('source = "fractal"\nsize = 5'), 9, "objects[0].size must be a list of 2 whole numbers, rows and columns, it is 5"),
     (field('source = "fractal"\nsize = [5.0, 5]'), 9, "objects[0].size must be a list of 2 whole numbers"),
     (field("file = 3"), 8, "objects[0].file must be a string, it is 3"),

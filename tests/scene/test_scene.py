@@ -162,8 +162,9 @@ BAD = [
 def test_bad_input_is_refused(make, message):
     jaxtyping.config.update("jaxtyping_disable", True)  # as a user has it: nobody checks the annotations
     try:
-        with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        with pytest.raises(jaxhf.ArgumentError, match=f"^{re.escape(message)}") as refused:
             make()
+        assert refused.value.argument == message.partition(": ")[2].partition(" ")[0]
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
 

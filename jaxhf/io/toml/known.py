@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..errors import FileError
 from ..georeference import Place, at_vertices
 from ..terrain import load_placed
 
@@ -35,19 +36,19 @@ def known_heights(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
     terrain from corner to corner.
 
     Raises:
-      FileNotFoundError, ValueError: as `load_heights`; or the file does not cover the terrain, or has holes in it.
+      FileNotFoundError, FileError: as `load_heights`; or the file does not cover the terrain, or has holes in it.
     """
     cell = {"dx": 1.0, "dy": 1.0}  # in the scene's unit, which does not count here: degrees may be on any globe
     terrain, place = load_placed(path, cell, sought.z_scale, sought.nodata, nodata_overrules=False)
     heights, wanted = terrain.heights, _wanted(sought, path, place)
     if place.known and wanted.known:
         if place.degrees and not wanted.degrees:
-            raise ValueError("it must lie in the coordinates of the terrain, it lies in degrees")
+            raise FileError("it must lie in the coordinates of the terrain, it lies in degrees")
         heights = at_vertices(heights, place, wanted, sought.shape)
     holes = np.argwhere(np.isnan(heights))
     if len(holes):
         iy, ix = holes[0].tolist()
-        raise ValueError(
+        raise FileError(
             f"it must have a height everywhere, {len(holes)} of {heights.size} are holes; the first is row {iy} column {ix}"
         )
     return heights

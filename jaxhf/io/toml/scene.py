@@ -1,6 +1,6 @@
 """Reads scenes in TOML; `docs/scene-files.md` describes them, `scenes/` holds examples.
 
-Which keys there are stands in `_toml_tables.py`; any other key, a value of another type and a file outside the scene's folder
+Which keys there are stands in `tables.py`; any other key, a value of another type and a file outside the scene's folder
 are errors.
 """
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ...core.affine import require_invertible
+from ...core.errors import ArgumentError
 from ...scene.camera import Camera
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
@@ -126,8 +127,7 @@ def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
         return None
     if len(given) > 1:
         raise part.at("matrix").error(f"{part.name} must have transform or matrix, it has both")
-    place = part.at(given[0])
-    place.made(require_invertible, place.name, values[given[0]])
+    part.made(require_invertible, "", given[0], values[given[0]])
     return values[given[0]]
 
 
@@ -151,7 +151,7 @@ def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> Heightf
     if "file" in values or source == "jacksboro":
         return _loaded(part.at("source" if source else "file"), values, dtype)
     if values["z_scale"] == 0:
-        raise ValueError("z_scale must not be zero, it is 0")
+        raise ArgumentError("", "z_scale", "must not be zero, it is 0")
     heights = procedural.HEIGHTS[source](**{name: values[name] for name in HEIGHTS[source]}) if source else values["heights"]
     place = {name: values[name] for name in ("dx", "dy", "x0", "y0") if values[name] is not None}
     return Heightfield(_fitted(heights * values["z_scale"], dtype), **place)
@@ -170,5 +170,5 @@ def _fitted(heights: np.ndarray, dtype: np.dtype) -> np.ndarray:
     with np.errstate(over="ignore"):
         fitted = heights.astype(dtype)
     if np.isinf(fitted).any():  # it would count as a hole
-        raise ValueError(f"heights must fit into {dtype}, the largest is {np.nanmax(np.abs(heights)):.3g}")
+        raise ArgumentError("", "heights", f"must fit into {dtype}, the largest is {np.nanmax(np.abs(heights)):.3g}")
     return fitted

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+from ...core.errors import ArgumentError
 from ...scene.camera import Camera, Orthographic, Perspective
 from ...scene.light import Directional, Light, Point, Sky
 from ...scene.material import Material, Matte, Mirror
@@ -40,7 +41,7 @@ def _directional(towards, azimuth, altitude, radiance) -> Directional:
     if towards is None:
         return Directional.from_angles(315.0 if azimuth is None else azimuth, 45.0 if altitude is None else altitude, radiance)
     if azimuth is not None or altitude is not None:
-        raise ValueError("towards must stand without azimuth and altitude, it says the same")
+        raise ArgumentError("", "towards", "must stand without azimuth and altitude, it says the same")
     return Directional(towards, radiance)
 
 
