@@ -1,5 +1,6 @@
 """Where the light comes from."""
 
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -15,32 +16,38 @@ class Directional(eqx.Module):
 
     Attributes:
       towards: the vector from the scene towards the light, world frame; its length does not matter.
-      radiance: the irradiance on a surface that faces the light, one number or (r, g, b): with pi, a white matte
-        surface that faces the light has radiance 1.
+      irradiance: of a surface that faces the light, one number or (r, g, b); None: pi, under which a white matte surface
+        that faces the light has radiance 1.
+      radiance: what the argument `irradiance` was called until 0.1; gives a DeprecationWarning.
     """
 
-    towards: VectorLeaf = eqx.field(converter=float_leaf)
-    radiance: VectorLeaf = eqx.field(converter=rgb_leaf, default=np.pi)
+    towards: VectorLeaf
+    irradiance: VectorLeaf
 
-    def __check_init__(self):
+    def __init__(self, towards: Any, irradiance: Any = None, *, radiance: Any = None):
+        self.towards = float_leaf(towards)
+        self.irradiance = rgb_leaf(_chosen(irradiance, radiance, 5))  # two frames between are Equinox's
         _require_vector("Directional", "towards", self.towards)
-        _require_vector("Directional", "radiance", self.radiance)
+        _require_vector("Directional", "irradiance", self.irradiance)
         if isinstance(self.towards, np.ndarray) and not self.towards.any():
             raise ArgumentError("Directional", "towards", "must not be zero, it is [0, 0, 0]")
 
     @classmethod
-    def from_angles(cls, azimuth: Any = 315.0, altitude: Any = 45.0, radiance: Any = np.pi) -> "Directional":
-        """Light as cartographers give it: x is east, y north, z up.
+    def from_angles(
+        cls, azimuth: Any = 315.0, altitude: Any = 45.0, irradiance: Any = None, *, radiance: Any = None
+    ) -> "Directional":
+        """Light from a compass direction, as cartographers give it: x is east, y north, z up.
 
         Args:
-          azimuth: where the light stands, degrees clockwise from north.
+          azimuth: the direction in which the light stands, degrees clockwise from north.
           altitude: its height above the horizon, degrees.
-          radiance: as the attribute.
+          irradiance, radiance: as for the class.
         """
         azimuth, altitude = float_leaf(azimuth), float_leaf(altitude)
         xp = np if isinstance(azimuth, np.ndarray) and isinstance(altitude, np.ndarray) else jnp
         a, h = xp.deg2rad(azimuth), xp.deg2rad(altitude)
-        return cls(xp.stack([xp.sin(a) * xp.cos(h), xp.cos(a) * xp.cos(h), xp.sin(h)]), radiance)
+        towards = xp.stack([xp.sin(a) * xp.cos(h), xp.cos(a) * xp.cos(h), xp.sin(h)])
+        return cls(towards, _chosen(irradiance, radiance, 3))
 
 
 class Point(eqx.Module):
@@ -77,6 +84,16 @@ class Sky(eqx.Module):
 
 
 Light = Directional | Point | Sky
+
+
+def _chosen(irradiance: Any, radiance: Any, stacklevel: int) -> Any:
+    """The irradiance of a directional light, whichever of its two names it was given by."""
+    if radiance is None:
+        return np.pi if irradiance is None else irradiance
+    if irradiance is not None:
+        raise ArgumentError("Directional", "radiance", "must stand without irradiance, whose old name it is")
+    warnings.warn("Directional: radiance is now called irradiance", DeprecationWarning, stacklevel=stacklevel)
+    return radiance
 
 
 def _require_vector(owner: str, name: str, leaf: VectorLeaf) -> None:

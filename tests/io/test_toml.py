@@ -158,7 +158,14 @@ def test_directional_lights(tmp_path, text, towards):
     (light,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "directional"\n{text}\n{FIELD}').lights
     assert isinstance(light, Directional)
     np.testing.assert_allclose(light.towards, towards, atol=1e-15)
-    np.testing.assert_array_equal(light.radiance, (np.pi,) * 3)
+    np.testing.assert_array_equal(light.irradiance, (np.pi,) * 3)
+
+
+def test_the_old_name_of_irradiance(tmp_path):
+    with pytest.warns(DeprecationWarning, match=r"scene\.toml:8: lights\[0\]\.radiance is now called irradiance$"):
+        (light,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "directional"\nradiance = [1, 2, 3]\n{FIELD}').lights
+    assert isinstance(light, Directional)
+    np.testing.assert_array_equal(light.irradiance, (1, 2, 3))
 
 
 def test_the_last_transform_acts_first(tmp_path):
@@ -292,6 +299,8 @@ MISTAKES = [
     (surface('material = "mirror"\nreflectance = [1, -0.5, 1]'), 11, "reflectance must be 0 or more, it is [1, -0.5, 1]"),
     (light('type = "sky"\nradiance = -3'), 12, "lights[0].radiance must be 0 or more, it is -3"),
     (light('type = "directional"\nradiance = -3'), 12, "lights[0].radiance must be 0 or more, it is -3"),
+    (light('type = "directional"\nirradiance = -3'), 12, "lights[0].irradiance must be 0 or more, it is -3"),
+    (light('type = "directional"\nirradiance = 3\nradiance = 3'), 13, "lights[0].radiance must stand without irradiance"),
     (light('type = "point"\nposition = [0, 0, 1]\nintensity = -3'), 13, "lights[0].intensity must be 0 or more, it is -3"),
     (texture('source = "checker"\nsize = [2, 2]\nfirst = -1'), 13, "textures.t.first must be 0 or more, it is -1"),
     (f"{CAMERA}{FIELD}[[pictures]]\n", 10, "'pictures' makes this a fit file, for `jaxhf fit`"),

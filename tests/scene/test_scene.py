@@ -104,7 +104,7 @@ BAD = [
     (directional([0, NAN, 1]), "Directional: towards must be finite, it is [ 0., nan,  1.]"),
     (directional([1, 2]), "Directional: towards must hold three numbers, its shape is (2,)"),
     (directional(1), "Directional: towards must hold three numbers, its shape is ()"),
-    (directional([0, 0, 1], [1, 2]), "Directional: radiance must hold three numbers, its shape is (2,)"),
+    (directional([0, 0, 1], [1, 2]), "Directional: irradiance must hold three numbers, its shape is (2,)"),
     (lambda: jaxhf.Directional.from_angles(NAN), "Directional: towards must be finite, it is "),
     (lambda: jaxhf.Point([1, 2]), "Point: p must hold three numbers, its shape is (2,)"),
     (lambda: jaxhf.Point([1, 2, INF]), "Point: p must be finite, it is [ 1.,  2., inf]"),
@@ -169,6 +169,17 @@ def test_bad_input_is_refused(make, message):
         jaxtyping.config.update("jaxtyping_disable", False)
 
 
+@pytest.mark.parametrize("make", [lambda **more: jaxhf.Directional((0, 0, 1), **more), jaxhf.Directional.from_angles])
+def test_the_old_name_of_irradiance(make):
+    with pytest.warns(DeprecationWarning, match="radiance is now called irradiance"):
+        light = make(radiance=(1, 2, 3))
+    np.testing.assert_array_equal(light.irradiance, (1, 2, 3))
+    with pytest.raises(jaxhf.ArgumentError, match="radiance must stand without irradiance") as refused:
+        make(radiance=1, irradiance=1)
+    assert refused.value.argument == "radiance"
+    assert dataclasses.replace(light, towards=(0, 1, 0)).irradiance is light.irradiance
+
+
 def test_settings_are_frozen_and_hashable():
     one = jaxhf.Settings(shadows=False)
     assert {one: "found"}[jaxhf.Settings(shadows=False)] == "found"
@@ -218,7 +229,7 @@ def test_whole_numbers_in_jax_become_floats(dtype):
     """Whatever moves them later would lose its fractions."""
     three, square = jnp.array([0, 0, 1], dtype), jnp.eye(4).astype(dtype)
     leaves: tuple[Any, ...] = (
-        jaxhf.Point(three, three).p, jaxhf.Point(three, three).intensity, jaxhf.Directional(three, three).radiance,
+        jaxhf.Point(three, three).p, jaxhf.Point(three, three).intensity, jaxhf.Directional(three, three).irradiance,
         jaxhf.Matte(three).albedo, jaxhf.Matte(jnp.array(1, dtype)).albedo, jaxhf.Cylinder(jnp.array(1, dtype)).radius,
         jaxhf.Object(FIELD, None, square).world_from_object, jaxhf.Perspective(square).world_from_camera,
     )  # fmt: skip

@@ -6,6 +6,7 @@ are errors.
 
 import re
 import tomllib
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from ...core.errors import ArgumentError
 from ...scene.camera import Camera
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
-from ...scene.light import Light
+from ...scene.light import Directional, Light
 from ...scene.scene import Object, Scene
 from ...scene.texture import ImageTexture
 from .. import procedural
@@ -79,7 +80,15 @@ def read_camera(part: Part) -> Camera:
 
 def read_lights(part: Part, tables: list[dict[str, Any]]) -> list[Light]:
     """The lights in the list `lights` of `part`."""
-    return [_variant(part.at("lights", k, table=table), "type", LIGHTS) for k, table in enumerate(tables)]
+    return [_light(part.at("lights", k, table=table)) for k, table in enumerate(tables)]
+
+
+def _light(part: Part) -> Light:
+    light = _variant(part, "type", LIGHTS)
+    if isinstance(light, Directional) and "radiance" in part.table:
+        old = part.at("radiance")
+        warnings.warn(str(old.error(f"{old.name} is now called irradiance")), DeprecationWarning, stacklevel=2)
+    return light
 
 
 def read_objects(part: Part, values: dict[str, Any], dtype: np.dtype) -> list[Object]:
