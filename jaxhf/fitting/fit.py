@@ -67,7 +67,7 @@ def fit(
     scenes: Sequence[Scene],
     targets: Sequence[Any],
     *,
-    settings: Settings = Settings(),
+    settings: Settings | None = None,
     weights: Sequence[Any] | None = None,
     noise: Any = 0.01,
     start: Any = None,
@@ -107,7 +107,7 @@ def fit(
       scenes: one a picture. Their first heightfields share shape, precision, spacing and origin, and are what is sought.
       targets: linear radiance, shape (h, w), (h, w, 1) or (h, w, 3) as the scene's camera says, top row first. One without or
         with one channel is compared with the mean over a picture's channels.
-      settings: how to render.
+      settings: how to render; None: `Settings()`.
       weights: for each picture None or a map (h, w) or (h, w, c), from 0 (masked: the target may be nan there)
         on; it divides the noise.
       noise: standard deviation of a target's values at weight 1, radiance; one number or one for each picture.
@@ -154,7 +154,7 @@ def fit(
       FileNotFoundError, PermissionError: the checkpoint's folder is not there or cannot be written to, before as well.
       KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
-    scenes, targets = tuple(scenes), tuple(targets)
+    scenes, targets, settings = tuple(scenes), tuple(targets), settings or Settings()
     asked = Asked(
         weights, noise, prior, prior_std, prior_length, prior_exponent, smoothness, albedo, albedo_smoothness, exposures,
         offsets, loss, loss_scale,

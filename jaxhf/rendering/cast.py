@@ -16,7 +16,7 @@ from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import float_leaf
 from ..scene.heightfield import Heightfield
-from ..scene.localise import localise
+from ..scene.localise import anchor, localise
 from ..scene.scene import Scene
 from ..trace.grid import Grid
 from ..trace.hit import Hit
@@ -25,17 +25,18 @@ from ..trace.world import Vertex, first_vertex, make_surface, make_world
 
 
 def cast_camera(
-    scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings = Settings()
+    scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings | None = None
 ) -> Vertex:
     """The first hits of the camera's rays through the points (x, y) of the picture, in pixels from its top left corner.
 
     Returns:
-      A `Vertex` whose leaves have a leading axis n: the hits, with `p` relative to the terrain's corner, and the number of
-      the object that each is on, -1 for none.
+      A `Vertex` whose leaves have a leading axis n: the hits, with `p` in the world's frame, and the number of the object
+      that each is on, -1 for none.
     """
     local = localise(scene)
     dtype = local.camera.world_from_camera.dtype
-    return _cast_camera(local, jnp.asarray(x, dtype), jnp.asarray(y, dtype), settings)
+    vertex = _cast_camera(local, jnp.asarray(x, dtype), jnp.asarray(y, dtype), settings or Settings())
+    return eqx.tree_at(lambda vertex: vertex.hit, vertex, _moved(vertex.hit, anchor(scene)))
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
@@ -48,7 +49,7 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
     return jax.vmap(one)(x, y)
 
 
-def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings(), *, leaving: Hit | None = None) -> Hit:
+def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings | None = None, *, leaving: Hit | None = None) -> Hit:
     """Where rays meet a heightfield; differentiable in the heights, in `o`, in `d` and in `leaving`.
 
     Args:
@@ -91,10 +92,13 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings
 
     starts = jax.tree.map(lambda leaf: in_a_row(leaf, leaf.shape[axes:]), start)
     field = Heightfield(heightfield.heights, heightfield.dx, heightfield.dy)
-    hit = _cast(field, starts, in_a_row(d, (3,)), settings)
-    offset = jnp.asarray(corner, dtype)
-    hit = eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(offset, hit.p.shape))
-    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), hit)
+    hit = _cast(field, starts, in_a_row(d, (3,)), settings or Settings())
+    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), _moved(hit, corner))
+
+
+def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
+    """Hits with a leading axis, their points moved by `offset`."""
+    return eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(jnp.asarray(offset, hit.p.dtype), hit.p.shape))
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))

@@ -50,18 +50,18 @@ class Prepared(eqx.Module):
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, camera=camera))
 
 
-def prepare(scene: Scene, settings: Settings = Settings(), *, mesh: Mesh | None = None) -> Prepared:
+def prepare(scene: Scene, settings: Settings | None = None, *, mesh: Mesh | None = None) -> Prepared:
     """Takes the normals and the bounds of the heights once, for many pictures of the same terrain in the same light.
 
     The arguments are those of `render`.
     """
-    settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
+    settings, mesh = settle(settings or Settings(), scene), local_mesh() if mesh is None else mesh
     return Prepared(scene, settings, mesh, _make_world(on_every_device(localise(scene), mesh), settings=settings))
 
 
 def render(
     scene: Scene | Prepared,
-    settings: Settings = Settings(),
+    settings: Settings | None = None,
     *,
     aovs: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
@@ -77,7 +77,7 @@ def render(
     Args:
       scene: what to see. Values that are NumPy or Python numbers keep double precision until the origin has been moved to
         the terrain; the rest is computed in the precision of the (first) heightfield's heights.
-      settings: the knobs; those of a `Prepared` scene stay what they are.
+      settings: the knobs; None: `Settings()`, or those of a `Prepared` scene, which can be rendered with no others.
       aovs: names out of `AOVS`.
       progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
       key: of JAX's random numbers, for what is sampled: the points on edges, if the settings ask for them. The same key
@@ -96,11 +96,11 @@ def render(
         if name not in AOVS:
             raise ArgumentError("render", "aovs", f"must be among {', '.join(AOVS)}; one is {name!r}")
     if not isinstance(scene, Prepared) and progress is not None:
-        scene, settings = prepare(scene, settings, mesh=mesh), Settings()
+        scene, settings = prepare(scene, settings, mesh=mesh), None
     if isinstance(scene, Prepared):
         if mesh is not None and mesh != scene.mesh:
             raise ArgumentError("render", "mesh", f": the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
-        if settings != Settings() and settle(settings, scene.scene) != scene.settings:
+        if settings is not None and settle(settings, scene.scene) != scene.settings:
             raise ArgumentError(
                 "render", "settings", f": the scene was prepared with {scene.settings}, it cannot be rendered with {settings}"
             )
@@ -111,7 +111,7 @@ def render(
         else:
             outputs = _trace_in_parts(world, camera, settings, aovs, mesh, progress)
     else:
-        settings, mesh = settle(settings, scene), local_mesh() if mesh is None else mesh
+        settings, mesh = settle(settings or Settings(), scene), local_mesh() if mesh is None else mesh
         local = on_every_device(localise(scene), mesh)
         outputs = _trace_all(local, settings, aovs, mesh, settled_key(key, settings, mesh))
     image = outputs.pop("image")
