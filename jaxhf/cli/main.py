@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..core.errors import UserError
+from ..core.version import __version__
 
 if TYPE_CHECKING:
     from ..core.settings import Settings
@@ -44,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jaxhf", description="Renders heightfields, and recovers them from pictures.")
+    parser.add_argument("--version", action="version", version=f"jaxhf {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     render = commands.add_parser("render", help="render a scene to a picture", description="Render a scene to a picture.")

@@ -47,7 +47,7 @@ class Prepared(eqx.Module):
 
     def with_camera(self, camera: Camera) -> "Prepared":
         """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
-        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, camera=camera))
+        return dataclasses.replace(self, scene=self.scene.with_camera(camera))
 
 
 def prepare(scene: Scene, settings: Settings | None = None, *, mesh: Mesh | None = None) -> Prepared:

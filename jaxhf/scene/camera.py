@@ -13,6 +13,7 @@ from ..core.errors import ArgumentError
 from ..core.ray import Ray
 from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
 from ..core.vector import unit
+from .show import known, numbers
 
 
 class Projection(eqx.Module):
@@ -82,6 +83,9 @@ class Perspective(eqx.Module):
         """The eye, and that it is at a place."""
         return affine(jnp.asarray(self.world_from_camera)).offset, True
 
+    def __repr__(self) -> str:
+        return _shown(self, f"fov={numbers(self.fov)}")
+
 
 class Orthographic(eqx.Module):
     """Parallel rays.
@@ -128,8 +132,20 @@ class Orthographic(eqx.Module):
         """The direction towards the eye, and that it is infinitely far away."""
         return -affine(jnp.asarray(self.world_from_camera)).linear[:, 2], False
 
+    def __repr__(self) -> str:
+        return _shown(self, f"extent={numbers(self.extent)}")
+
 
 Camera = Perspective | Orthographic
+
+
+def _shown(camera: Camera, lens: str) -> str:
+    matrix = known(camera.world_from_camera)
+    if matrix is None or matrix.shape != (4, 4):
+        place = f"world_from_camera={numbers(camera.world_from_camera)}"
+    else:
+        place = f"eye={numbers(matrix[:3, 3])}, looking={numbers(matrix[:3, 2])}"
+    return f"{type(camera).__name__}({place}, {lens}, {camera.width} x {camera.height})"
 
 
 def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:

@@ -5,6 +5,7 @@ import numpy as np
 
 from ..core.errors import ArgumentError
 from ..core.types import ScalarLeaf, float_leaf, require_finite, require_number
+from .show import fields
 
 
 class Cylinder(eqx.Module):
@@ -29,3 +30,6 @@ class Cylinder(eqx.Module):
             raise ArgumentError("Cylinder", "z_min", f"must lie below z_max, they are {self.z_min} and {self.z_max}")
         require_finite("Cylinder", "z_min", self.z_min)
         require_finite("Cylinder", "z_max", self.z_max)
+
+    def __repr__(self) -> str:
+        return fields(self)

@@ -6,10 +6,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..core.types import AnyArray
+from .show import known, number, numbers
 
 # So that a walk's state fits into 32 bits; each side of the grid counts as the next power of two.
 MOST_CELLS = 2**28
@@ -73,3 +75,13 @@ class Heightfield(eqx.Module):
         for name in ("x0", "y0"):
             if not math.isfinite(getattr(self, name)):
                 raise ArgumentError("Heightfield", name, f"must be finite, it is {getattr(self, name)}")
+
+    def __repr__(self) -> str:
+        heights = known(self.heights)
+        size, span = numbers(self.heights), ""
+        if heights is not None and heights.ndim == 2:
+            finite = heights[np.isfinite(heights)]
+            lowest, highest = (finite.min(), finite.max()) if finite.size else (np.nan, np.nan)
+            size, span = f"{len(heights)} x {heights.shape[1]}", f", heights {number(lowest)} .. {number(highest)}"
+        place = ", ".join(f"{name}={number(getattr(self, name))}" for name in ("dx", "dy", "x0", "y0"))
+        return f"Heightfield({size}, {place}{span})"

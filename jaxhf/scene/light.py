@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core.errors import ArgumentError
 from ..core.types import VectorLeaf, float_leaf, require_finite, rgb_leaf
+from .show import fields
 
 
 class Directional(eqx.Module):
@@ -31,6 +32,9 @@ class Directional(eqx.Module):
         _require_vector("Directional", "irradiance", self.irradiance)
         if isinstance(self.towards, np.ndarray) and not self.towards.any():
             raise ArgumentError("Directional", "towards", "must not be zero, it is [0, 0, 0]")
+
+    def __repr__(self) -> str:
+        return fields(self)
 
     @classmethod
     def from_angles(
@@ -65,6 +69,9 @@ class Point(eqx.Module):
         _require_vector("Point", "p", self.p)
         _require_vector("Point", "intensity", self.intensity)
 
+    def __repr__(self) -> str:
+        return fields(self)
+
 
 class Sky(eqx.Module):
     """A sky of one colour: the background of the picture, and diffuse light from the upper half space.
@@ -81,6 +88,9 @@ class Sky(eqx.Module):
 
     def __check_init__(self):
         _require_vector("Sky", "radiance", self.radiance)
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 Light = Directional | Point | Sky

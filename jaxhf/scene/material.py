@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..core.types import AnyArray, require_finite, rgb_leaf
+from .show import fields
 from .texture import ImageTexture
 
 
@@ -29,6 +30,9 @@ class Matte(eqx.Module):
                 raise ArgumentError("Matte", "albedo", f"must be one number or three, its shape is {self.albedo.shape}")
             require_finite("Matte", "albedo", self.albedo)
 
+    def __repr__(self) -> str:
+        return fields(self)
+
 
 class Mirror(eqx.Module):
     """A perfect mirror with two sides.
@@ -43,6 +47,9 @@ class Mirror(eqx.Module):
         if self.reflectance.shape != (3,):
             raise ArgumentError("Mirror", "reflectance", f"must be one number or three, its shape is {self.reflectance.shape}")
         require_finite("Mirror", "reflectance", self.reflectance)
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 Material = Matte | Mirror

@@ -1,5 +1,7 @@
 """What is in the picture."""
 
+import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +16,7 @@ from .cylinder import Cylinder
 from .heightfield import Heightfield
 from .light import Light, Sky
 from .material import Material, Matte
+from .show import numbers
 
 Shape = Heightfield | Cylinder
 
@@ -41,6 +44,10 @@ class Object(eqx.Module):
             raise ArgumentError("Object", "material", f"must be Matte or Mirror, it is {type(self.material).__name__}")
         if self.world_from_object is not None:
             require_invertible("Object", "world_from_object", self.world_from_object)
+
+    def __repr__(self) -> str:
+        place = "" if self.world_from_object is None else f", world_from_object={numbers(self.world_from_object)}"
+        return f"Object({self.shape!r}, {self.material!r}{place})"
 
 
 class Scene(eqx.Module):
@@ -85,6 +92,17 @@ class Scene(eqx.Module):
         if not self.heightfields:
             raise UserError("Scene: there is no heightfield among its objects")
         return self.heightfields[0].heights
+
+    def __repr__(self) -> str:
+        return f"Scene(objects={self.objects!r}, camera={self.camera!r}, lights={self.lights!r}, samples={self.samples})"
+
+    def with_camera(self, camera: Camera) -> "Scene":
+        """The same scene seen by another camera; nothing is compiled again if its picture has the same size."""
+        return dataclasses.replace(self, camera=camera)
+
+    def with_lights(self, lights: Iterable[Light]) -> "Scene":
+        """The same scene in another light; nothing is compiled again if these are as many lights of the same types."""
+        return dataclasses.replace(self, lights=lights)
 
     def with_heights(self, heights: Any) -> "Scene":
         """The same scene over other heights of the same shape and precision; nothing is compiled again."""

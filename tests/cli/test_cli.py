@@ -1,5 +1,6 @@
 """The command line as a user runs it: its own process, single precision, what it prints and how it ends."""
 
+import importlib.metadata
 import importlib.util
 import re
 import subprocess
@@ -58,6 +59,14 @@ def test_help_does_not_import_jax(arguments):
     run = python("-c", script, *arguments)
     assert run.returncode == 0
     assert run.stdout.splitlines()[-1] == "False"
+
+
+def test_version():
+    """Without JAX, by `import jaxhf` too."""
+    run = jaxhf_command("--version")
+    assert (run.returncode, run.stdout) == (0, f"jaxhf {importlib.metadata.version('jaxhf')}\n")
+    run = python("-c", "import sys, jaxhf; print(jaxhf.__version__, 'jax' in sys.modules)")
+    assert run.stdout == f"{importlib.metadata.version('jaxhf')} False\n"
 
 
 def test_render(tmp_path):
