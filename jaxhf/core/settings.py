@@ -1,4 +1,4 @@
-"""Every knob that trades accuracy for speed."""
+"""The settings of the renderer: what trades accuracy for speed."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ NormalScheme = Literal["central", "four", "six", "six-angle", "six-equal"]
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How a scene is rendered: frozen and hashable, so that it can be a static argument of a compiled function.
+    """How a scene is rendered. Frozen and hashable, so that it can be a static argument of a compiled function.
 
     Attributes:
       traversal: "pyramid", a walk that passes over blocks of cells of all sizes by their bounds (Tevs et al. 2008);
@@ -22,13 +22,13 @@ class Settings:
         out of it ends with `Status.EXHAUSTED`, which `render` shows black and the AOVs "status" and "exhausted" report.
       shading: "smooth", interpolated normals; "flat", the triangle's own.
       normals: at the vertices, see `vertex_normals`.
-      shadows: whether light is blocked by what stands before it.
+      shadows: whether surfaces between a light and a point keep its light off.
       samples: rays a pixel, a square number: the centres of a regular n x n grid. None: what the scene says, rounded up
         to a square.
-      max_depth: how often a ray may be mirrored before the rest counts as black.
-      edge_samples: points on edges of the terrain, in all, at which the derivative of moving silhouettes and shadow
-        boundaries is taken, and about as many samples more for it in the pixels where these are seen, see
-        docs/gradients.md; 0: the derivative that each sample has by itself, no more. The picture is the same.
+      max_depth: how often a ray may be mirrored; what it would meet after that counts as black.
+      edge_samples: for derivatives alone: how many points are drawn on the terrain's edges, in all, to take the derivative of
+        moving silhouettes and shadow boundaries, with about as many additional samples in the pixels where these are seen,
+        see docs/gradients.md. 0: only the derivative of each sample's radiance. The picture is the same.
       chunk: rays that are traced together; rounded down to a square of 8 x 8, 16 x 16, ... pixels.
     """
 

@@ -1,4 +1,4 @@
-"""From a place in the picture to a ray in the world."""
+"""Cameras: from a point of the picture to a ray in the world, and back."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ class Projection(eqx.Module):
         return self.linear[:, 0] * p[0] + self.linear[:, 1] * p[1] + self.linear[:, 2] * p[2] + self.offset
 
     def of(self, world: Affine) -> "Projection":
-        """The same for points in another frame, from which `world` leads to the world's."""
+        """The same projection for points in another frame; `world` maps that frame to the world's."""
         columns = [
             self.linear[:, 0] * world.linear[0, k]
             + self.linear[:, 1] * world.linear[1, k]
@@ -41,7 +41,7 @@ class Projection(eqx.Module):
 
 
 class Perspective(eqx.Module):
-    """A pinhole.
+    """A pinhole camera.
 
     Attributes:
       world_from_camera: 4x4; camera space is +x right, +y up, +z forward (the handedness of pbrt).
@@ -75,12 +75,12 @@ class Perspective(eqx.Module):
         return Ray(world.offset, unit(world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))))
 
     def film_from_world(self) -> Projection:
-        """The inverse of `ray`: where in the picture a point is seen."""
+        """The projection of points in the world to pixels, the inverse of `ray`."""
         camera = affine(jnp.asarray(self.world_from_camera)).inverse()
         return _film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
 
     def viewpoint(self) -> tuple[Vector, bool]:
-        """The eye, and that it is at a place."""
+        """The position of the eye, and True: it is a point."""
         return affine(jnp.asarray(self.world_from_camera)).offset, True
 
     def __repr__(self) -> str:
@@ -88,7 +88,7 @@ class Perspective(eqx.Module):
 
 
 class Orthographic(eqx.Module):
-    """Parallel rays.
+    """A camera whose rays are parallel.
 
     Attributes:
       world_from_camera: as for `Perspective`; rays start in the camera's plane z = 0.
@@ -123,13 +123,13 @@ class Orthographic(eqx.Module):
         return Ray(origin, unit(world.linear[:, 2]))
 
     def film_from_world(self) -> Projection:
-        """The inverse of `ray`: where in the picture a point is seen."""
+        """The projection of points in the world to pixels, the inverse of `ray`."""
         camera = affine(jnp.asarray(self.world_from_camera)).inverse()
         half = jnp.asarray(self.extent) / 2
         return _film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
 
     def viewpoint(self) -> tuple[Vector, bool]:
-        """The direction towards the eye, and that it is infinitely far away."""
+        """The direction towards the eye, and False: it is infinitely far away."""
         return -affine(jnp.asarray(self.world_from_camera)).linear[:, 2], False
 
     def __repr__(self) -> str:
@@ -142,20 +142,20 @@ Camera = Perspective | Orthographic
 def _shown(camera: Camera, lens: str) -> str:
     matrix = known(camera.world_from_camera)
     if matrix is None or matrix.shape != (4, 4):
-        place = f"world_from_camera={numbers(camera.world_from_camera)}"
+        pose = f"world_from_camera={numbers(camera.world_from_camera)}"
     else:
-        place = f"eye={numbers(matrix[:3, 3])}, looking={numbers(matrix[:3, 2])}"
-    return f"{type(camera).__name__}({place}, {lens}, {camera.width} x {camera.height})"
+        pose = f"eye={numbers(matrix[:3, 3])}, looking={numbers(matrix[:3, 2])}"
+    return f"{type(camera).__name__}({pose}, {lens}, {camera.width} x {camera.height})"
 
 
 def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
-    """Pixels to the screen on which the shorter side runs from -1 to 1, x right, y up."""
+    """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
     short = min(camera.width, camera.height)
     return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
 
 
 def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
-    """`_screen` undone: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
+    """The inverse of `_screen`: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
     scale = min(camera.width, camera.height) / (2 * half)
     linear, offset = camera_from_world.linear, camera_from_world.offset
     return Projection(

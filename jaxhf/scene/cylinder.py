@@ -1,4 +1,4 @@
-"""An open cylinder, such as carries the sky of the seed scenes."""
+"""An open cylinder, on which pbrt scenes paint their sky."""
 
 import equinox as eqx
 import numpy as np
@@ -9,7 +9,7 @@ from .show import fields
 
 
 class Cylinder(eqx.Module):
-    """A full circle about the z axis of its frame, without caps; seen from both sides.
+    """A cylinder about the z axis of its object's frame, without caps; seen from both sides.
 
     (u, v): u = phi / 2 pi with phi = atan2(y, x) in [0, 2 pi), v runs from z_min to z_max (pbrt-v2, `Shape "cylinder"`).
 

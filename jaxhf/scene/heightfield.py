@@ -83,5 +83,5 @@ class Heightfield(eqx.Module):
             finite = heights[np.isfinite(heights)]
             lowest, highest = (finite.min(), finite.max()) if finite.size else (np.nan, np.nan)
             size, span = f"{len(heights)} x {heights.shape[1]}", f", heights {number(lowest)} .. {number(highest)}"
-        place = ", ".join(f"{name}={number(getattr(self, name))}" for name in ("dx", "dy", "x0", "y0"))
-        return f"Heightfield({size}, {place}{span})"
+        grid = ", ".join(f"{name}={number(getattr(self, name))}" for name in ("dx", "dy", "x0", "y0"))
+        return f"Heightfield({size}, {grid}{span})"

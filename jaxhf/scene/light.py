@@ -1,4 +1,4 @@
-"""Where the light comes from."""
+"""Lights."""
 
 import warnings
 from typing import Any
@@ -74,11 +74,11 @@ class Point(eqx.Module):
 
 
 class Sky(eqx.Module):
-    """A sky of one colour: the background of the picture, and diffuse light from the upper half space.
+    """A sky of one colour: the background of the picture, and diffuse light from the upper hemisphere.
 
     A surface tilted by beta against the horizontal sees the share (1 + cos beta) / 2 of the sky, the isotropic sky of
     Liu and Jordan (The interrelationship and characteristic distribution of direct, diffuse and total solar radiation,
-    Solar Energy 4(3), 1960). Terrain in front of the sky is not taken into account: that would have to be sampled.
+    Solar Energy 4(3), 1960). It is not shadowed by other terrain, which would have to be sampled.
 
     Attributes:
       radiance: one number or (r, g, b).

@@ -60,7 +60,7 @@ def _in_precision(leaf: Any, dtype: Any) -> Any:
 
 
 def _grid_corner(shape: Shape) -> np.ndarray:
-    """Where a heightfield's vertex (0, 0) stands, at height 0, in its object's frame."""
+    """The position of a heightfield's vertex (0, 0) at height 0, in its object's frame."""
     return np.array([shape.x0, shape.y0, 0.0]) if isinstance(shape, Heightfield) else np.zeros(3)
 
 

@@ -1,4 +1,4 @@
-"""What a surface does with light."""
+"""Materials: how a surface reflects light."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""What is in the picture."""
+"""Scenes: objects, a camera and lights."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -22,7 +22,7 @@ Shape = Heightfield | Cylinder
 
 
 class Object(eqx.Module):
-    """A shape, what it is made of, and where it stands.
+    """A shape with its material and its transform.
 
     Attributes:
       shape: a `Heightfield` or a `Cylinder`.
@@ -46,12 +46,12 @@ class Object(eqx.Module):
             require_invertible("Object", "world_from_object", self.world_from_object)
 
     def __repr__(self) -> str:
-        place = "" if self.world_from_object is None else f", world_from_object={numbers(self.world_from_object)}"
-        return f"Object({self.shape!r}, {self.material!r}{place})"
+        pose = "" if self.world_from_object is None else f", world_from_object={numbers(self.world_from_object)}"
+        return f"Object({self.shape!r}, {self.material!r}{pose})"
 
 
 class Scene(eqx.Module):
-    """Objects, seen by a camera, in light.
+    """Objects, the camera that sees them, and the lights.
 
     Attributes:
       objects: at least one `Object`.
@@ -68,14 +68,14 @@ class Scene(eqx.Module):
     def __check_init__(self):
         if not self.objects:
             raise ArgumentError("Scene", "objects", "must hold at least one Object, it is empty")
-        for place, values, kinds in (
+        for name, values, kinds in (
             ("objects", self.objects, Object),
             ("camera", (self.camera,), Camera),
             ("lights", self.lights, Light),
         ):
             for value in values:
                 if not isinstance(value, kinds):
-                    raise ArgumentError("Scene", place, f"does not take a {type(value).__name__}")
+                    raise ArgumentError("Scene", name, f"does not take a {type(value).__name__}")
         if sum(isinstance(light, Sky) for light in self.lights) > 1:
             raise ArgumentError("Scene", "lights", "may hold one Sky, they hold more")
         if not isinstance(self.samples, int) or self.samples < 1:

@@ -1,4 +1,4 @@
-"""Images as colours on a surface."""
+"""Textures: images spread over a surface."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from ..core.types import AnyArray, Point2, Vector, float_leaf
 
 
 class ImageTexture(eqx.Module):
-    """An image spread over (u, v) in 0..1 and repeated beyond, looked up bilinearly.
+    """An image spread over (u, v) in 0..1 and repeated outside, looked up bilinearly.
 
     Attributes:
       texels: linear colours, shape (h, w, 3): row 0 is v = 0, u runs along a row, texel centres lie at half steps.
