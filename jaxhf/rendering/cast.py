@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, UserError
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import float_leaf
@@ -71,9 +71,7 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings | None = N
     dtype = heightfield.heights.dtype
     corner = np.array([heightfield.x0, heightfield.y0, 0.0])
     if (o is None) == (leaving is None):
-        raise ArgumentError(
-            "cast", "o", ": rays start at o or at the hits that they are leaving, and one of the two must be None"
-        )
+        raise UserError("cast: rays start at o or at the hits that they are leaving, and one of the two must be None")
     for name, value in (("o", o), ("d", d)):
         if value is not None and np.shape(value)[-1:] != (3,):
             raise ArgumentError("cast", name, f"must have shape (..., 3), its shape is {np.shape(value)}")

@@ -18,7 +18,7 @@ from ..boundary.guiding import sources
 from ..boundary.term import moving_boundaries
 from ..core.autodiff import with_tangent
 from ..core.devices import local_mesh, map_over, on_every_device
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, UserError
 from ..core.materialise import stored
 from ..core.sampling import sample_offset
 from ..core.settings import Settings
@@ -99,11 +99,9 @@ def render(
         scene, settings = prepare(scene, settings, mesh=mesh), None
     if isinstance(scene, Prepared):
         if mesh is not None and mesh != scene.mesh:
-            raise ArgumentError("render", "mesh", f": the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
+            raise UserError(f"render: the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
         if settings is not None and settle(settings, scene.scene) != scene.settings:
-            raise ArgumentError(
-                "render", "settings", f": the scene was prepared with {scene.settings}, it cannot be rendered with {settings}"
-            )
+            raise UserError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
         settings, world, mesh = scene.settings, scene._world, scene.mesh
         camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:
