@@ -1,4 +1,6 @@
+from .core.errors import ArgumentError as ArgumentError
 from .core.settings import Settings as Settings
+from .core.version import __version__ as __version__
 from .fitting.fit import Fit as Fit, fit as fit
 from .fitting.history import Step as Step, Stop as Stop
 from .io.errors import SceneError as SceneError

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
+from ..core.errors import ArgumentError
 from ..core.settings import Shading
 from ..core.types import Index
 from ..core.vector import unit
@@ -106,7 +107,9 @@ def make_distribution(weights: Float[jax.Array, " edges"], draws: Index) -> Guid
     """The distribution in proportion to `weights`, in as many strata as there are draws; no positive weight becomes zero."""
     count = weights.shape[0]
     if count >= _TOTAL_WEIGHT // 2:
-        raise ValueError(f"Settings: edge_samples works for fewer than {_TOTAL_WEIGHT // 2} edges, the scene has {count}")
+        raise ArgumentError(
+            "Settings", "edge_samples", f"works for fewer than {_TOTAL_WEIGHT // 2} edges, the scene has {count}"
+        )
     total = jnp.sum(weights)
     integers = jnp.ceil(weights / jnp.where(total > 0, total, 1) * (_TOTAL_WEIGHT - count)).astype(jnp.int32)
     cumulative = jnp.cumsum(integers, dtype=jnp.int32)

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from ..core.errors import ArgumentError
 from ..core.extras import import_extra
 from ..fitting.fit import Fit, fit
 from ..fitting.history import Step
+from ..io.errors import FileError
 from ..io.files import require_writable_text, save_text
 from ..io.images import save_image
 from ..io.save_terrain import require_writable_heights, save_heights
@@ -39,7 +41,7 @@ class Outputs:
             require_writable_text(self.report, ".html")
             import_extra("matplotlib", "a report needs", "plot")
         if self.checkpoint.exists() and not self.resume:
-            raise ValueError(
+            raise FileError(
                 f"{self.checkpoint}: an interrupted fit left this checkpoint; --resume goes on from it, to begin anew remove it"
             )
 
@@ -75,7 +77,7 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
         if not outputs.checkpoint.exists():
             raise
         raise KeyboardInterrupt(f"interrupted; the same command with --resume goes on from {outputs.checkpoint}") from None
-    except ValueError as error:
+    except ArgumentError as error:
         raise case.located(error) from error
     _write(path, case, found, outputs)
     outputs.checkpoint.unlink(missing_ok=True)

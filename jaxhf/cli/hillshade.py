@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from ..core.errors import ArgumentError, UserError
 from ..core.types import AnyArray
 from ..io.images import linear_from_srgb
 from ..io.terrain import Terrain
@@ -34,11 +35,11 @@ def hillshade_scene(
       ValueError: the light is not above the horizon, the sky is not 0 or more, or there is no height.
     """
     if not 0 < altitude <= 90:
-        raise ValueError(f"hillshade: altitude must be above 0 and at most 90 degrees, it is {altitude}")
+        raise ArgumentError("hillshade", "altitude", f"must be above 0 and at most 90 degrees, it is {altitude}")
     if not 0 <= sky < np.inf:
-        raise ValueError(f"hillshade: sky must be 0 or more, it is {sky}")
+        raise ArgumentError("hillshade", "sky", f"must be 0 or more, it is {sky}")
     if terrain.nodata.all():
-        raise ValueError("hillshade: there is no height in the terrain")
+        raise UserError("hillshade: there is no height in the terrain")
     field = terrain.heightfield()
     lights = [Directional.from_angles(azimuth, altitude), *([Sky(sky)] if sky else [])]
     if width is None and height is None:

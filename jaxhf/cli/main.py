@@ -8,6 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from ..core.errors import UserError
+from ..core.version import __version__
+
 if TYPE_CHECKING:
     from ..core.settings import Settings
     from ..scene.scene import Scene
@@ -26,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interruption:
         print(f"\njaxhf: {str(interruption) or 'interrupted'}", file=sys.stderr)
         return 130
-    except (ValueError, OSError) as error:
+    except (UserError, OSError) as error:
         print(f"jaxhf: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     except (MemoryError, RuntimeError) as error:
@@ -42,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jaxhf", description="Renders heightfields, and recovers them from pictures.")
+    parser.add_argument("--version", action="version", version=f"jaxhf {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
 
     render = commands.add_parser("render", help="render a scene to a picture", description="Render a scene to a picture.")
@@ -211,7 +215,7 @@ def _set_up_jax(precision: str, devices: int | None) -> None:
     from ..core.machine import default_devices
 
     if devices is not None and devices < 1:
-        raise ValueError(f"--devices must be a whole number from 1 on, it is {devices}")
+        raise UserError(f"--devices must be a whole number from 1 on, it is {devices}")
     jax.config.update("jax_enable_x64", precision == "float64")
     jax.config.update("jax_num_cpu_devices", devices or default_devices())
 
@@ -234,7 +238,7 @@ def _load(path: str, precision: str) -> "Scene":
 def _require_size(width: int | None, height: int | None) -> None:
     for name, value in (("width", width), ("height", height)):
         if value is not None and value < 1:
-            raise ValueError(f"--{name} must be a whole number of pixels from 1 on, it is {value}")
+            raise UserError(f"--{name} must be a whole number of pixels from 1 on, it is {value}")
 
 
 def _resized(scene: "Scene", width: int | None, height: int | None) -> "Scene":
@@ -333,7 +337,7 @@ def _tradeoff(options: argparse.Namespace) -> None:
     for name in ("error", "time", "repeats"):
         value = getattr(options, name)
         if value is not None and not value > 0:
-            raise ValueError(f"--{name} must be positive, it is {value}")
+            raise UserError(f"--{name} must be positive, it is {value}")
     import_extra("matplotlib", "tradeoff draws with", "plot")
     sweep = plan(
         options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick,
@@ -345,7 +349,7 @@ def _tradeoff(options: argparse.Namespace) -> None:
     if failures:
         print("\n".join(f"failed: {failure}" for failure in failures), file=sys.stderr)
     if not measured:
-        raise ValueError(f"{sweep.path}: nothing could be measured")
+        raise UserError(f"{sweep.path}: nothing could be measured")
     plot = save_plot(sweep, measured)
     asks = options.error is not None or options.time is not None
     if options.markdown:
@@ -354,7 +358,7 @@ def _tradeoff(options: argparse.Namespace) -> None:
         print("\n".join(recommend(measured, options.error, options.time) if asks else front_lines(measured)))
     print(f"{len(measured)} configurations: {sweep.table}, {plot}")
     if failures:
-        raise ValueError(f"{len(failures)} configurations failed")
+        raise UserError(f"{len(failures)} configurations failed")
 
 
 class _Counter:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .errors import ArgumentError, UserError
 from .powers import floor_to_power_of_two
 from .ray import Ray
 from .types import AnyArray, Vector
@@ -70,11 +71,11 @@ def scale(x: float, y: float, z: float) -> Float[np.ndarray, "4 4"]:
 
 
 def rotate(degrees: float, x: float, y: float, z: float) -> Float[np.ndarray, "4 4"]:
-    """Rotation about the axis (x, y, z), counter-clockwise seen against it (Rodrigues' formula); ValueError on a zero axis."""
+    """Rotation about the axis (x, y, z), counter-clockwise seen against it (Rodrigues' formula); UserError on a zero axis."""
     axis = np.array([x, y, z], dtype=np.float64)
     length = np.linalg.norm(axis)
     if not length > 0:
-        raise ValueError(f"rotate: the axis must not be zero, it is {axis.tolist()}")
+        raise UserError(f"rotate: the axis must not be zero, it is {axis.tolist()}")
     axis = axis / length
     cross = np.cross(np.eye(3), axis)  # rows: e_i x axis, so that v @ cross = v x axis
     angle = np.radians(degrees)
@@ -83,16 +84,16 @@ def rotate(degrees: float, x: float, y: float, z: float) -> Float[np.ndarray, "4
     return matrix
 
 
-def require_invertible(place: str, matrix: Any) -> None:
-    """Raises ValueError on a shape other than 4x4, a last row other than 0 0 0 1, nan, or a singular linear part."""
+def require_invertible(owner: str, name: str, matrix: Any) -> None:
+    """Raises ArgumentError on a shape other than 4x4, a last row other than 0 0 0 1, nan, or a singular linear part."""
     if matrix.shape != (4, 4):
-        raise ValueError(f"{place} must be a 4x4 matrix, its shape is {matrix.shape}")
+        raise ArgumentError(owner, name, f"must be a 4x4 matrix, its shape is {matrix.shape}")
     if not isinstance(matrix, np.ndarray):
         return
     if not np.isfinite(matrix).all():
-        raise ValueError(f"{place} must be finite, it is {matrix.tolist()}")
+        raise ArgumentError(owner, name, f"must be finite, it is {matrix.tolist()}")
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise ValueError(f"{place} must be affine (last row 0 0 0 1), its last row is {matrix[3].tolist()}")
+        raise ArgumentError(owner, name, f"must be affine (last row 0 0 0 1), its last row is {matrix[3].tolist()}")
     columns = np.abs(matrix[:3, :3]).max(axis=0)
     if not columns.all() or abs(np.linalg.det(matrix[:3, :3] / columns)) < 1e-12:
-        raise ValueError(f"{place} must be invertible, it flattens space: {matrix[:3, :3].tolist()}")
+        raise ArgumentError(owner, name, f"must be invertible, it flattens space: {matrix[:3, :3].tolist()}")

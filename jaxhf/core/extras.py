@@ -3,6 +3,8 @@
 import importlib
 from types import ModuleType
 
+from .errors import UserError
+
 
 def import_extra(package: str, use: str, extra: str) -> ModuleType:
     """An optional package.
@@ -13,9 +15,9 @@ def import_extra(package: str, use: str, extra: str) -> ModuleType:
       extra: the extra of jaxhf that installs it.
 
     Raises:
-      ValueError: it is not installed.
+      UserError: it is not installed.
     """
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        raise ValueError(f"{use} {package}: pip install 'jaxhf[{extra}]'") from error
+        raise UserError(f"{use} {package}: pip install 'jaxhf[{extra}]'") from error

@@ -1,8 +1,10 @@
-"""Every knob that trades accuracy for speed."""
+"""The settings of the renderer: what trades accuracy for speed."""
 
 import dataclasses
 import math
 from typing import Literal, get_args
+
+from .errors import ArgumentError
 
 Traversal = Literal["pyramid", "dda"]
 Shading = Literal["smooth", "flat"]
@@ -11,7 +13,7 @@ NormalScheme = Literal["central", "four", "six", "six-angle", "six-equal"]
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How a scene is rendered: frozen and hashable, so that it can be a static argument of a compiled function.
+    """How a scene is rendered. Frozen and hashable, so that it can be a static argument of a compiled function.
 
     Attributes:
       traversal: "pyramid", a walk that passes over blocks of cells of all sizes by their bounds (Tevs et al. 2008);
@@ -20,13 +22,13 @@ class Settings:
         out of it ends with `Status.EXHAUSTED`, which `render` shows black and the AOVs "status" and "exhausted" report.
       shading: "smooth", interpolated normals; "flat", the triangle's own.
       normals: at the vertices, see `vertex_normals`.
-      shadows: whether light is blocked by what stands before it.
+      shadows: whether surfaces between a light and a point keep its light off.
       samples: rays a pixel, a square number: the centres of a regular n x n grid. None: what the scene says, rounded up
         to a square.
-      max_depth: how often a ray may be mirrored before the rest counts as black.
-      edge_samples: points on edges of the terrain, in all, at which the derivative of moving silhouettes and shadow
-        boundaries is taken, and about as many samples more for it in the pixels where these are seen, see
-        docs/gradients.md; 0: the derivative that each sample has by itself, no more. The picture is the same.
+      max_depth: how often a ray may be mirrored; what it would meet after that counts as black.
+      edge_samples: for derivatives alone: how many points are drawn on the terrain's edges, in all, to take the derivative of
+        moving silhouettes and shadow boundaries, with about as many additional samples in the pixels where these are seen,
+        see docs/gradients.md. 0: only the derivative of each sample's radiance. The picture is the same.
       chunk: rays that are traced together; rounded down to a square of 8 x 8, 16 x 16, ... pixels.
     """
 
@@ -58,14 +60,16 @@ class Settings:
     def __post_init__(self):
         for name, kind in (("traversal", Traversal), ("shading", Shading), ("normals", NormalScheme)):
             if getattr(self, name) not in get_args(kind):
-                raise ValueError(f"Settings: {name} must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}")
+                raise ArgumentError(
+                    "Settings", name, f"must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}"
+                )
         if not isinstance(self.shadows, bool):
-            raise ValueError(f"Settings: shadows must be True or False, it is {self.shadows!r}")
+            raise ArgumentError("Settings", "shadows", f"must be True or False, it is {self.shadows!r}")
         for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("edge_samples", 0), ("chunk", 64)):
             value = getattr(self, name)
             if value is None and name in ("max_steps", "samples"):
                 continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ValueError(f"Settings: {name} must be a whole number from {least} on, it is {value!r}")
+                raise ArgumentError("Settings", name, f"must be a whole number from {least} on, it is {value!r}")
         if self.samples is not None and math.isqrt(self.samples) ** 2 != self.samples:
-            raise ValueError(f"Settings: samples must be a square number (1, 4, 9, ...), it is {self.samples}")
+            raise ArgumentError("Settings", "samples", f"must be a square number (1, 4, 9, ...), it is {self.samples}")

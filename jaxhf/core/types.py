@@ -7,6 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from .errors import ArgumentError
+
 # What a leaf of a scene may be: float64 NumPy until the scene is rendered, or whatever JAX array or tracer the caller put
 # there. A type checker takes it for the latter, which it is wherever rays are traced.
 if TYPE_CHECKING:
@@ -45,13 +47,13 @@ def rgb_leaf(value: Any) -> Any:
     return leaf
 
 
-def require_number(place: str, leaf: Any) -> None:
-    """Raises ValueError on anything but a single number."""
+def require_number(owner: str, name: str, leaf: Any) -> None:
+    """Raises ArgumentError on anything but a single number."""
     if leaf.shape != ():
-        raise ValueError(f"{place} must be one number, its shape is {leaf.shape}")
+        raise ArgumentError(owner, name, f"must be one number, its shape is {leaf.shape}")
 
 
-def require_finite(place: str, leaf: Any) -> None:
-    """Raises ValueError where a value that is known now, not traced, holds a nan or an inf."""
+def require_finite(owner: str, name: str, leaf: Any) -> None:
+    """Raises ArgumentError where a value that is known now, not traced, holds a nan or an inf."""
     if isinstance(leaf, np.ndarray) and not np.isfinite(leaf).all():
-        raise ValueError(f"{place} must be finite, it is {np.array2string(leaf, separator=', ')}")
+        raise ArgumentError(owner, name, f"must be finite, it is {np.array2string(leaf, separator=', ')}")

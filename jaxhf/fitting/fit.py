@@ -16,8 +16,10 @@ from jax.sharding import Mesh
 from jaxtyping import Bool, Float
 
 from ..core.devices import local_mesh
+from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..core.types import AnyArray
+from ..io.errors import FileError
 from ..io.files import require_folder
 from ..scene.scene import Scene
 from .basis import beyond, make_basis
@@ -65,7 +67,7 @@ def fit(
     scenes: Sequence[Scene],
     targets: Sequence[Any],
     *,
-    settings: Settings = Settings(),
+    settings: Settings | None = None,
     weights: Sequence[Any] | None = None,
     noise: Any = 0.01,
     start: Any = None,
@@ -105,7 +107,7 @@ def fit(
       scenes: one a picture. Their first heightfields share shape, precision, spacing and origin, and are what is sought.
       targets: linear radiance, shape (h, w), (h, w, 1) or (h, w, 3) as the scene's camera says, top row first. One without or
         with one channel is compared with the mean over a picture's channels.
-      settings: how to render.
+      settings: how to render; None: `Settings()`.
       weights: for each picture None or a map (h, w) or (h, w, c), from 0 (masked: the target may be nan there)
         on; it divides the noise.
       noise: standard deviation of a target's values at weight 1, radiance; one number or one for each picture.
@@ -152,7 +154,7 @@ def fit(
       FileNotFoundError, PermissionError: the checkpoint's folder is not there or cannot be written to, before as well.
       KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
-    scenes, targets = tuple(scenes), tuple(targets)
+    scenes, targets, settings = tuple(scenes), tuple(targets), settings or Settings()
     asked = Asked(
         weights, noise, prior, prior_std, prior_length, prior_exponent, smoothness, albedo, albedo_smoothness, exposures,
         offsets, loss, loss_scale,
@@ -162,7 +164,7 @@ def fit(
     if path is not None:
         _require_place(path, resume)
     elif resume:
-        raise ValueError("fit: resume must come with a checkpoint to go on from")
+        raise ArgumentError("fit", "resume", "must come with a checkpoint to go on from")
     groups = make_groups(scenes, targets, settings, asked)
     first = scenes[0]
     shape, dtype = first.heights.shape, first.heights.dtype
@@ -185,13 +187,13 @@ def fit(
         local_mesh() if mesh is None else mesh,
     )
     if solver == "bfgs" and count_unknowns(unknowns) > BFGS_UNKNOWNS:
-        raise ValueError(
-            f"fit: solver bfgs takes at most {BFGS_UNKNOWNS} unknowns, there are {count_unknowns(unknowns)}; take lbfgs"
+        raise ArgumentError(
+            "fit", "solver", f"bfgs takes at most {BFGS_UNKNOWNS} unknowns, there are {count_unknowns(unknowns)}; take lbfgs"
         )
     sampled = uncertainty is not None and uncertainty != "exact"
     if (solver == "lm" or sampled) and dtype == np.float32 and jax.config.jax_enable_x64:  # pyright: ignore
         # lineax's LSMR then mixes single with double precision, a TypeError from deep inside.
-        raise ValueError("fit: scenes must have float64 heights where JAX's x64 mode is on, theirs are float32")
+        raise ArgumentError("fit", "scenes", "must have float64 heights where JAX's x64 mode is on, theirs are float32")
     if uncertainty == "exact":
         require_small(unknowns, problem)
     run = Descent(
@@ -217,30 +219,30 @@ def fit(
 def _check_choices(asked, solver, levels, max_steps, inner_steps, every, tolerance, uncertainty) -> None:
     for name, value, kind in (("solver", solver, Solver), ("loss", asked.loss, Loss), ("albedo", asked.albedo, Albedo)):
         if value not in get_args(kind):
-            raise ValueError(f"fit: {name} must be one of {', '.join(get_args(kind))}; it is {value!r}")
+            raise ArgumentError("fit", name, f"must be one of {', '.join(get_args(kind))}; it is {value!r}")
     for name, value in (("max_steps", max_steps), ("inner_steps", inner_steps), ("checkpoint_every", every)):
         if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"fit: {name} must be a whole number from 1 on, it is {value!r}")
+            raise ArgumentError("fit", name, f"must be a whole number from 1 on, it is {value!r}")
     numbers = {
         "prior_length": asked.prior_length, "prior_exponent": asked.prior_exponent, "smoothness": asked.smoothness,
         "albedo_smoothness": asked.albedo_smoothness, "loss_scale": asked.loss_scale, "tolerance": tolerance,
     }  # fmt: skip
     for name, value in numbers.items():
         if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"fit: {name} must be positive and finite, it is {value!r}")
+            raise ArgumentError("fit", name, f"must be positive and finite, it is {value!r}")
     if levels is not None and not (len(levels) and all(0 < level <= 1 for level in levels) and levels[-1] == 1):
-        raise ValueError(f"fit: levels must be shares above 0, the last of them 1; they are {levels!r}")
+        raise ArgumentError("fit", "levels", f"must be shares above 0, the last of them 1; they are {levels!r}")
     whole = isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and uncertainty >= 2
     if not (uncertainty is None or uncertainty == "exact" or whole):
-        raise ValueError(f"fit: uncertainty must be None, 'exact' or a number of samples from 2 on, it is {uncertainty!r}")
+        raise ArgumentError(
+            "fit", "uncertainty", f"must be None, 'exact' or a number of samples from 2 on, it is {uncertainty!r}"
+        )
 
 
 def _require_place(checkpoint: Path, resume: bool) -> None:
     require_folder(checkpoint, "a checkpoint")
     if checkpoint.exists() and not resume:
-        raise ValueError(
-            f"{checkpoint}: this checkpoint is there already; resume=True goes on from it, to begin anew remove it"
-        )
+        raise FileError(f"{checkpoint}: this checkpoint is there already; resume=True goes on from it, to begin anew remove it")
 
 
 def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
@@ -248,9 +250,11 @@ def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny
     holes = np.argwhere(~np.isfinite(heights))
     if len(holes):
         iy, ix = holes[0]
-        raise ValueError(
-            f"fit: scenes[0]: the heights must have no holes where there is no start, row {iy} column {ix} is "
-            f"{heights[iy, ix]}; fill them, or give a start without holes"
+        raise ArgumentError(
+            "fit",
+            "scenes[0]",
+            f": the heights must have no holes where there is no start, row {iy} column {ix} is "
+            f"{heights[iy, ix]}; fill them, or give a start without holes",
         )
     return heights
 

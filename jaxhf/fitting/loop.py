@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..io.checkpoint import load_arrays, load_facts, save_checkpoint
+from ..io.errors import FileError
 from ..scene.scene import Scene
 from .basis import Unknowns, make_basis
 from .history import Step, Stop
@@ -225,7 +226,7 @@ class Descent:
         assert self.path is not None
         facts = load_facts(self.path)
         if facts["fingerprint"] != self.fingerprint:
-            raise ValueError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
+            raise FileError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
         self.unknowns, best, (base, loss_scale), state = load_arrays(self.path, self._arrays())
         self.stage, self.stage_start, self.converged = facts["stage"], facts["stage_start"], facts["converged"]
         self.best, self.seconds = (facts["best"], best), facts["seconds"]

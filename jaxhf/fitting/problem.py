@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
+from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..scene.heightfield import Heightfield
 from ..scene.localise import localise
@@ -110,14 +111,18 @@ class Asked(NamedTuple):
 def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], settings: Settings, asked: Asked) -> tuple[Group, ...]:
     """Checks scenes and pictures, and gathers those that one program can render."""
     if len(scenes) == 0:
-        raise ValueError("fit: scenes must hold at least one Scene, it is empty")
+        raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
     if len(targets) != len(scenes):
-        raise ValueError(f"fit: targets must hold a picture for each of the {len(scenes)} scenes, they are {len(targets)}")
+        raise ArgumentError(
+            "fit", "targets", f"must hold a picture for each of the {len(scenes)} scenes, they are {len(targets)}"
+        )
     if asked.weights is not None and len(asked.weights) != len(scenes):
-        raise ValueError(f"fit: weights must hold one for each of the {len(scenes)} scenes, they are {len(asked.weights)}")
+        raise ArgumentError(
+            "fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(asked.weights)}"
+        )
     noise = np.asarray(asked.noise, np.float64)
     if noise.shape not in ((), (len(scenes),)) or not (np.isfinite(noise) & (noise > 0)).all():
-        raise ValueError(f"fit: noise must be positive, one number or one for each scene, it is {asked.noise!r}")
+        raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {asked.noise!r}")
     noise = np.broadcast_to(noise, (len(scenes),))
     for k, scene in enumerate(scenes):
         _require_alike(k, scene, scenes[0])
@@ -144,18 +149,22 @@ def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], settings: Setti
 def _require_alike(k: int, scene: Scene, first: Scene) -> None:
     """All scenes have the same first heightfield, but for the heights."""
     if not isinstance(scene, Scene):
-        raise ValueError(f"fit: scenes[{k}] must be a Scene, it is a {type(scene).__name__}")
+        raise ArgumentError("fit", f"scenes[{k}]", f"must be a Scene, it is a {type(scene).__name__}")
     if not scene.heightfields:
-        raise ValueError(f"fit: scenes[{k}] must have a heightfield, there is none among its objects")
+        raise ArgumentError("fit", f"scenes[{k}]", "must have a heightfield, there is none among its objects")
     field, other = scene.heightfields[0], first.heightfields[0]
     for name in ("shape", "dtype"):
         mine, theirs = getattr(field.heights, name), getattr(other.heights, name)
         if mine != theirs:
-            raise ValueError(f"fit: scenes[{k}]: the heights must have the {name} of the first scene's, {theirs}; it is {mine}")
+            raise ArgumentError(
+                "fit", f"scenes[{k}]", f": the heights must have the {name} of the first scene's, {theirs}; it is {mine}"
+            )
     for name in ("dx", "dy", "x0", "y0"):
         mine, theirs = getattr(field, name), getattr(other, name)
         if mine != theirs:
-            raise ValueError(f"fit: scenes[{k}]: {name} must be that of the first scene's heightfield, {theirs}; it is {mine}")
+            raise ArgumentError(
+                "fit", f"scenes[{k}]", f": {name} must be that of the first scene's heightfield, {theirs}; it is {mine}"
+            )
 
 
 def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -163,19 +172,23 @@ def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray
     size = (scene.camera.height, scene.camera.width)
     target = np.asarray(target, np.float64)
     if target.shape not in (size, (*size, 1), (*size, 3)):
-        raise ValueError(f"fit: targets[{k}] must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}")
+        raise ArgumentError(
+            "fit", f"targets[{k}]", f"must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}"
+        )
     target = target.reshape(*size, -1)
     weight = np.ones(size) if weight is None else np.asarray(weight, np.float64)
     if weight.shape not in (size, target.shape):
-        raise ValueError(f"fit: weights[{k}] must have shape {size}, its shape is {weight.shape}")
+        raise ArgumentError("fit", f"weights[{k}]", f"must have shape {size}, its shape is {weight.shape}")
     if not np.isfinite(weight).all() or weight.min() < 0 or weight.max() == 0:
-        raise ValueError(f"fit: weights[{k}] must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}")
+        raise ArgumentError(
+            "fit", f"weights[{k}]", f"must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}"
+        )
     weight = np.broadcast_to(weight.reshape(*size, -1), target.shape)
     bad = ~np.isfinite(target) & (weight > 0)
     if bad.any():
         y, x, c = np.argwhere(bad)[0]
-        raise ValueError(
-            f"fit: targets[{k}] must be finite where it has a weight; row {y} column {x} channel {c} is {target[y, x, c]}"
+        raise ArgumentError(
+            "fit", f"targets[{k}]", f"must be finite where it has a weight; row {y} column {x} channel {c} is {target[y, x, c]}"
         )
     return np.where(weight > 0, target, 0), weight
 
@@ -186,13 +199,15 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, e
     if prior is None:
         for name, value in (("prior_std", std), ("prior_length", length)):
             if value is not None:
-                raise ValueError(f"fit: {name} must stand with a prior, there is none")
+                raise ArgumentError("fit", name, "must stand with a prior, there is none")
         return None
     if std is None:
-        raise ValueError("fit: prior must stand with prior_std, how far it may be off")
+        raise ArgumentError("fit", "prior", "must stand with prior_std, how far it may be off")
     std = np.asarray(std, np.float64)
     if std.shape not in ((), shape) or not (std > 0).all():
-        raise ValueError(f"fit: prior_std must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}")
+        raise ArgumentError(
+            "fit", "prior_std", f"must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}"
+        )
     margin = prior_margin(field, length)
     heights = beyond(make_heights("prior", prior, shape), margin)
     weight, stiffness = beyond(np.broadcast_to(1 / std, shape), margin), None
@@ -231,10 +246,10 @@ def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndar
     if heights.shape == ():
         heights = np.full(shape, heights)
     if heights.ndim != 2 or min(heights.shape) < 2:
-        raise ValueError(f"fit: {name} must be a number or heights of at least 2x2, its shape is {heights.shape}")
+        raise ArgumentError("fit", name, f"must be a number or heights of at least 2x2, its shape is {heights.shape}")
     if not np.isfinite(heights).all():
         iy, ix = np.argwhere(~np.isfinite(heights))[0]
-        raise ValueError(f"fit: {name} must be finite, row {iy} column {ix} is {heights[iy, ix]}")
+        raise ArgumentError("fit", name, f"must be finite, row {iy} column {ix} is {heights[iy, ix]}")
     return heights if heights.shape == shape else resample(heights, shape)
 
 
@@ -246,8 +261,8 @@ def first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, asked:
     else:
         material = next(obj.material for obj in scene.objects if obj.shape is scene.heightfields[0])
         if not isinstance(material, Matte):
-            raise ValueError(
-                f"fit: albedo is asked for, the heightfield's material must be Matte, it is {type(material).__name__}"
+            raise ArgumentError(
+                "fit", "albedo", f"is asked for, the heightfield's material must be Matte, it is {type(material).__name__}"
             )
         if asked.albedo == "map" and isinstance(material.albedo, ImageTexture):
             texels = material.albedo.texels.shape[:2]

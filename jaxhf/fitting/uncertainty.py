@@ -12,6 +12,7 @@ from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..core.devices import on_every_device
+from ..core.errors import ArgumentError
 from .basis import Unknowns
 from .problem import Problem
 from .residuals import known_residuals, linearised, picture_residuals, unusual
@@ -52,9 +53,10 @@ def require_small(unknowns: Unknowns, problem: Problem) -> None:
     rows = sum(group.targets.size for group in problem.groups) + 4 * problem.basis.base.size
     entries = rows * sum(leaf.size for leaf in jax.tree.leaves(unknowns))
     if entries > EXACT_ENTRIES:
-        raise ValueError(
-            f"fit: uncertainty 'exact' takes at most {EXACT_ENTRIES} residuals times unknowns, they are {entries}; "
-            "give a number of samples"
+        raise ArgumentError(
+            "fit",
+            "uncertainty",
+            f"'exact' takes at most {EXACT_ENTRIES} residuals times unknowns, they are {entries}; give a number of samples",
         )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 
+from .errors import FileError
 from .files import PathLike, replacing, require_file
 
 _MAGIC = b"jaxhf checkpoint 1\n"
@@ -27,7 +28,7 @@ def save_checkpoint(path: PathLike, facts: dict[str, Any], arrays: Any) -> None:
 
 
 def load_facts(path: PathLike) -> dict[str, Any]:
-    """The facts of a checkpoint; ValueError where the file is damaged or is something else."""
+    """The facts of a checkpoint; FileError where the file is damaged or is something else."""
     return json.loads(_body(path).partition(b"\n")[0])
 
 
@@ -39,8 +40,8 @@ def load_arrays(path: PathLike, like: Any) -> Any:
 def _body(path: PathLike) -> bytes:
     content = require_file(path).read_bytes()
     if not content.startswith(_MAGIC):
-        raise ValueError(f"{path}: this is not a checkpoint of jaxhf's, or not of this version")
+        raise FileError(f"{path}: this is not a checkpoint of jaxhf's, or not of this version")
     checksum, _, body = content[len(_MAGIC) :].partition(b"\n")
     if hashlib.sha256(body).hexdigest().encode() != checksum:
-        raise ValueError(f"{path}: the checkpoint is damaged: its checksum does not agree")
+        raise FileError(f"{path}: the checkpoint is damaged: its checksum does not agree")
     return body

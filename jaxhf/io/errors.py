@@ -4,8 +4,14 @@ import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
+from ..core.errors import UserError
 
-class SceneError(ValueError):
+
+class FileError(UserError):
+    """Something is wrong with a file, or with its name, which begins the message where it is known."""
+
+
+class SceneError(FileError):
     """Something is wrong in a file that the user wrote; the message begins with `file:line:` where a line is known."""
 
     def __init__(self, path: Path | str, line: int | None, message: str):
@@ -28,13 +34,15 @@ def resolve_inside(root: Path, folder: Path, name: str) -> Path:
       name: as written.
 
     Raises:
-      ValueError: `name` leads out of `root`, by "..", by an absolute path or by a link.
+      FileError: `name` leads out of `root`, by "..", by an absolute path or by a link; or it holds a null character.
       FileNotFoundError: no file is there.
     """
+    if "\0" in name:
+        raise FileError(f"{name!r} is no file's name")
     root = root.resolve()
     path = (folder / name).resolve()
     if not path.is_relative_to(root):
-        raise ValueError(f"{name!r} lies outside the scene's folder {str(root)!r}")
+        raise FileError(f"{name!r} lies outside the scene's folder {str(root)!r}")
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {name!r} in {str(folder)!r}")
     return path

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 from numpy.typing import DTypeLike
 
-from .errors import nearest
+from ..core.errors import ArgumentError
+from .errors import FileError, nearest
 
 MAX_PIXELS = 2**28  # 16384 x 16384, for images and for grids of heights
 
@@ -21,11 +22,11 @@ Codec = TypeVar("Codec")
 
 
 def by_ending(codecs: Mapping[str, Codec], path: Path, task: str) -> Codec:
-    """What does `task` for the ending of `path`; ValueError where nothing does."""
+    """What does `task` for the ending of `path`; FileError where nothing does."""
     ending = path.suffix.lower()
     if ending not in codecs:
         named = f"the ending {path.suffix!r}" if ending else "a name without an ending"
-        raise ValueError(f"{path}: cannot {task} {named}; {nearest(ending, codecs)}")
+        raise FileError(f"{path}: cannot {task} {named}; {nearest(ending, codecs)}")
     return codecs[ending]
 
 
@@ -34,13 +35,13 @@ def require_file(path: PathLike) -> Path:
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if not path.is_file():
-        raise ValueError(f"{path}: must be a file, it is a folder or a device")
+        raise FileError(f"{path}: must be a file, it is a folder or a device")
     return path
 
 
 @contextlib.contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Puts the file's name in front of whatever goes wrong inside, as one ValueError.
+    """Puts the file's name in front of whatever goes wrong inside, as one FileError.
 
     The decoders raise nearly anything on broken files: OSError, SyntaxError, RuntimeError, EOFError, struct.error.
     """
@@ -49,7 +50,7 @@ def reading(path: Path) -> Iterator[None]:
     except (MemoryError, PermissionError):
         raise
     except Exception as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise FileError(f"{path}: {error}") from error
 
 
 def require_folder(path: Path, what: str) -> None:
@@ -57,13 +58,13 @@ def require_folder(path: Path, what: str) -> None:
 
     Raises:
       FileNotFoundError: the folder does not exist.
-      ValueError: `path` is a folder itself.
+      FileError: `path` is a folder itself.
       PermissionError: the folder cannot be written to.
     """
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {str(path.parent)!r}")
     if path.is_dir():
-        raise ValueError(f"{path}: {what} cannot be written here, it is a folder")
+        raise FileError(f"{path}: {what} cannot be written here, it is a folder")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise PermissionError(f"{path}: the folder {str(path.parent)!r} cannot be written to")
 
@@ -95,20 +96,20 @@ def save_text(path: PathLike, text: str) -> None:
 
 
 def require_precision(dtype: DTypeLike) -> np.dtype:
-    """The type that heights are read in; ValueError where it is not float32 or float64, or JAX would narrow it in silence."""
+    """The dtype of the heights; ArgumentError where it is not float32 or float64, or JAX would narrow it in silence."""
     found = np.dtype(dtype)
     if found not in (np.float32, np.float64):
-        raise ValueError(f"dtype must be float32 or float64, it is {found}")
+        raise ArgumentError("", "dtype", f"must be float32 or float64, it is {found}")
     if jax.dtypes.canonicalize_dtype(found) != found:
-        raise ValueError("dtype float64 needs JAX's x64 mode: jax.config.update('jax_enable_x64', True)")
+        raise ArgumentError("", "dtype", "float64 needs JAX's x64 mode: jax.config.update('jax_enable_x64', True)")
     return found
 
 
 def require_pixels(height: int, width: int) -> None:
     if height < 1 or width < 1:
-        raise ValueError(f"its size must be positive, it is {width} x {height}")
+        raise FileError(f"its size must be positive, it is {width} x {height}")
     if height * width > MAX_PIXELS:
-        raise ValueError(f"it must hold at most {MAX_PIXELS} pixels, it declares {width} x {height}")
+        raise FileError(f"it must hold at most {MAX_PIXELS} pixels, it declares {width} x {height}")
 
 
 def read_npy(file: Any, size: int) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..core.extras import import_extra
+from .errors import FileError
 from .files import require_pixels
 from .georeference import WGS84, CoordinateSystem, Ellipsoid
 from .terrain import Terrain, heights_of
@@ -21,10 +22,10 @@ def read_tiff(path: Path, nodata: float | None, overrules: bool) -> Terrain:
         page: Any = file.pages[0]
         require_pixels(page.imagelength, page.imagewidth)
         if page.samplesperpixel != 1 or page.imagedepth != 1:
-            raise ValueError(f"heights in a TIFF must be one band, it has {page.samplesperpixel}")
+            raise FileError(f"heights in a TIFF must be one band, it has {page.samplesperpixel}")
         end = max((at + count for at, count in zip(page.dataoffsets, page.databytecounts, strict=True)), default=0)
         if end > path.stat().st_size:
-            raise ValueError(f"it is cut off: its pixels end at byte {end}, the file at {path.stat().st_size}")
+            raise FileError(f"it is cut off: its pixels end at byte {end}, the file at {path.stat().st_size}")
         tagged = _gdal_nodata(page.tags[42113].value) if 42113 in page.tags else None
         nodata = tagged if nodata is None or (tagged is not None and not overrules) else nodata
         if nodata is not None and page.dtype.kind == "f":
@@ -37,7 +38,7 @@ def read_tiff(path: Path, nodata: float | None, overrules: bool) -> Terrain:
         if scale is not None and tie is not None:
             return _placed(heights, scale, tie, page.geotiff_tags or {})
         if scale is not None or tie is not None or matrix is not None:
-            raise ValueError("its GeoTIFF tags must be ModelPixelScale with ModelTiepoint: rotated rasters are not read")
+            raise FileError("its GeoTIFF tags must be ModelPixelScale with ModelTiepoint: rotated rasters are not read")
         return Terrain(heights)
 
 
@@ -49,7 +50,7 @@ def _gdal_nodata(text: str) -> float:
     try:
         return float(text.strip("\0 "))
     except ValueError as error:
-        raise ValueError(f"its GDAL_NODATA tag must be a number, it is {text!r}") from error
+        raise FileError(f"its GDAL_NODATA tag must be a number, it is {text!r}") from error
 
 
 def _gdal_factors(text: str | bytes) -> dict[str, float]:
@@ -58,16 +59,16 @@ def _gdal_factors(text: str | bytes) -> dict[str, float]:
     try:
         items = list(ElementTree.fromstring(text.strip(b"\0 ")).iter("Item"))
     except ElementTree.ParseError as error:
-        raise ValueError(f"its GDAL_METADATA tag must be XML: {error}") from error
+        raise FileError(f"its GDAL_METADATA tag must be XML: {error}") from error
     roles = {item.get("role"): item.text for item in items if item.get("sample", "0") == "0"}
     factors = {}
     for role in {"scale", "offset"} & roles.keys():
         try:
             factors[role] = float(roles[role] or "")
         except ValueError as error:
-            raise ValueError(f"the {role} in its GDAL_METADATA must be a number, it is {roles[role]!r}") from error
+            raise FileError(f"the {role} in its GDAL_METADATA must be a number, it is {roles[role]!r}") from error
         if not math.isfinite(factors[role]):
-            raise ValueError(f"the {role} in its GDAL_METADATA must be finite, it is {factors[role]}")
+            raise FileError(f"the {role} in its GDAL_METADATA must be finite, it is {factors[role]}")
     return factors
 
 
@@ -82,7 +83,7 @@ def _placed(heights: np.ndarray, scale: Sequence[float], tie: Sequence[float], k
     west, south = x + (centre - column) * dx, y - (len(heights) - 1 + centre - row) * dy
     degrees = keys.get("GTModelTypeGeoKey") == 2  # geographic
     if degrees and keys.get("GeogAngularUnitsGeoKey", 9102) not in (0, 9102, 9122):  # undefined, or EPSG's codes of degrees
-        raise ValueError(f"its coordinates must be in degrees, GeogAngularUnitsGeoKey is {int(keys['GeogAngularUnitsGeoKey'])}")
+        raise FileError(f"its coordinates must be in degrees, GeogAngularUnitsGeoKey is {int(keys['GeogAngularUnitsGeoKey'])}")
     code = keys.get("GeographicTypeGeoKey" if degrees else "ProjectedCSTypeGeoKey")
     code = None if code is None or code == _USER_DEFINED else int(code)
     crs = CoordinateSystem(degrees, _globe(keys) if degrees else None, code)
@@ -105,7 +106,7 @@ def _globe(keys: Mapping[str, Any]) -> Ellipsoid | None:
             return None
         flattening = 1 - polar / axis if inverse is None else 1 / inverse if inverse else 0.0  # GDAL: 0 is a sphere
         if not (axis > 0 and 0 <= flattening < 1):
-            raise ValueError(f"its ellipsoid must be flattened by 0 to 1, its axis is {axis} m, its flattening {flattening}")
+            raise FileError(f"its ellipsoid must be flattened by 0 to 1, its axis is {axis} m, its flattening {flattening}")
         return Ellipsoid(float(axis), float(flattening))
     code = keys.get("GeographicTypeGeoKey", 4326)
     if code == _USER_DEFINED:

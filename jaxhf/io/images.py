@@ -16,7 +16,9 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
+from ..core.errors import ArgumentError
 from ..core.extras import import_extra
+from .errors import FileError
 from .files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_folder, require_pixels
 from .png import require_whole
 
@@ -70,14 +72,14 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb") -> None:
     """
     path = require_writable(path)
     if transfer not in _TRANSFERS:
-        raise ValueError(f"transfer must be one of {', '.join(_TRANSFERS)}; it is {transfer!r}")
+        raise ArgumentError("save_image", "transfer", f"must be one of {', '.join(_TRANSFERS)}; it is {transfer!r}")
     pixels = np.asarray(image)
     if pixels.dtype.kind == "V":  # bfloat16 and its like, which .npy would store without their meaning
         pixels = pixels.astype(np.float32)
     if pixels.dtype.kind != "f":
-        raise ValueError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
+        raise FileError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
-        raise ValueError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
+        raise FileError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
     with replacing(path) as temporary:
         _WRITERS[path.suffix.lower()](temporary, pixels, _TRANSFERS[transfer])
 
@@ -119,14 +121,14 @@ def read_png(path: Path) -> np.ndarray:
     if depth < 16:
         return _decoded(data, "RGBA")[:, :, :3]
     if channels > 1:  # Pillow would cut them down to 8 bits
-        raise ValueError(f"a PNG of 16 bits must be grey, it has {channels} channels")
+        raise FileError(f"a PNG of 16 bits must be grey, it has {channels} channels")
     return _decoded(data)
 
 
 def _read_jpeg(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     data = path.read_bytes()
     if not data.startswith(b"\xff\xd8\xff"):
-        raise ValueError("it is not a JPEG")
+        raise FileError("it is not a JPEG")
     return _decoded(data, "RGB")
 
 
@@ -159,17 +161,17 @@ def _read_exr(path: Path) -> np.ndarray:
         with exr.File(str(path), separate_channels=True) as file:
             channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
     except RuntimeError as error:
-        raise ValueError("it is not an OpenEXR file, or damaged") from error
+        raise FileError("it is not an OpenEXR file, or damaged") from error
     except ValueError as error:
         if "part index" not in str(error):
             raise
-        raise ValueError("it is cut off or damaged: pixels are missing") from error
+        raise FileError("it is cut off or damaged: pixels are missing") from error
     names = next((names for names in ("RGB", "Y") if set(names) <= set(channels)), None)
     if names is None:
-        raise ValueError(f"its channels must be R, G, B or Y, they are {', '.join(channels)}")
+        raise FileError(f"its channels must be R, G, B or Y, they are {', '.join(channels)}")
     shapes = {channels[name].shape for name in names}
     if len(shapes) > 1:
-        raise ValueError(f"its channels must have one size, they have {sorted(shapes)}")
+        raise FileError(f"its channels must have one size, they have {sorted(shapes)}")
     return np.stack([channels[name] for name in names], axis=-1) if len(names) == 3 else channels[names]
 
 
@@ -178,15 +180,15 @@ def _read_pfm(path: Path) -> np.ndarray:
     data = path.read_bytes()
     header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]+)\s", data)
     if header is None:
-        raise ValueError("it is not a PFM")
+        raise FileError("it is not a PFM")
     channels, width, height = 3 if header[1] == b"PF" else 1, int(header[2]), int(header[3])
     scale = float(header[4])
     if scale == 0:
-        raise ValueError("its scale must not be 0: the sign gives the byte order")
+        raise FileError("its scale must not be 0: the sign gives the byte order")
     require_pixels(height, width)
     declared, present = 4 * channels * width * height, len(data) - header.end()
     if declared != present:
-        raise ValueError(f"it is cut off or damaged: {width} x {height} pixels take {declared} bytes, {present} are there")
+        raise FileError(f"it is cut off or damaged: {width} x {height} pixels take {declared} bytes, {present} are there")
     pixels = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end())
     return pixels.astype(np.float32).reshape((height, width, 3)[: 3 if channels == 3 else 2])[::-1].copy()
 
@@ -195,9 +197,9 @@ def _read_npy(path: Path) -> np.ndarray:
     with path.open("rb") as file:
         image = read_npy(file, path.stat().st_size)
     if image.dtype.kind != "f":
-        raise ValueError(f"its array must hold linear radiance in floats, it holds {image.dtype}")
+        raise FileError(f"its array must hold linear radiance in floats, it holds {image.dtype}")
     if image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
-        raise ValueError(f"its array must have shape (h, w, 3) or (h, w), it has {image.shape}")
+        raise FileError(f"its array must have shape (h, w, 3) or (h, w), it has {image.shape}")
     return image.astype(np.float32)
 
 

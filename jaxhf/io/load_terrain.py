@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.extras import import_extra
+from .errors import FileError
 from .files import PathLike, by_ending, read_npy, reading, require_file
 from .georeference import WGS84, CoordinateSystem
 from .geotiff import read_tiff
@@ -68,12 +69,12 @@ def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = No
     reader = by_ending(_READERS, path, "read heights from")
     with reading(path):
         if not math.isfinite(z_scale) or z_scale == 0:
-            raise ValueError(f"z_scale must be finite and not zero, it is {z_scale}")
+            raise FileError(f"z_scale must be finite and not zero, it is {z_scale}")
         terrain = reader(path, nodata, nodata_overrules)
         with np.errstate(over="ignore"):
             scaled = terrain.heights * terrain.heights.dtype.type(z_scale)
         if np.isinf(scaled).any():
-            raise ValueError(f"heights times z_scale must fit into {scaled.dtype}, z_scale is {z_scale}")
+            raise FileError(f"heights times z_scale must fit into {scaled.dtype}, z_scale is {z_scale}")
         return dataclasses.replace(terrain, heights=scaled)
 
 
@@ -110,7 +111,7 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
         def number(name: str) -> float:
             value = array(name)
             if value.size != 1:
-                raise ValueError(f"its {name} must be one number, its shape is {value.shape}")
+                raise FileError(f"its {name} must be one number, its shape is {value.shape}")
             return float(value.item())
 
         if "heights" in members or len(members) == 1:
@@ -118,10 +119,10 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
             grid = {key: number(key) for key in ("dx", "dy", "x0", "y0") if key in members}
             return Terrain(heights_of(array(name), nodata), **grid, crs=CoordinateSystem() if len(grid) == 4 else None)
         if "elevation" not in members:
-            raise ValueError(f"it must hold an array 'heights', or only one, it holds {', '.join(sorted(members))}")
+            raise FileError(f"it must hold an array 'heights', or only one, it holds {', '.join(sorted(members))}")
         missing = {"dx", "dy", "xmin", "ymin", "ymax"} - members.keys()
         if missing:
-            raise ValueError(f"beside 'elevation' it must hold {', '.join(sorted(missing))}")
+            raise FileError(f"beside 'elevation' it must hold {', '.join(sorted(missing))}")
         heights = heights_of(array("elevation")[::-1], nodata)
         south = min(number("ymin"), number("ymax"))  # matplotlib's file has them swapped
         dx, dy = number("dx"), number("dy")
@@ -132,7 +133,7 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
 def _read_png(path: Path, nodata: float | None, _: bool) -> Terrain:
     values = read_png(path)
     if values.dtype != np.uint16:
-        raise ValueError("heights in a PNG must be 16-bit grey, its samples have at most 8 bits")
+        raise FileError("heights in a PNG must be 16-bit grey, its samples have at most 8 bits")
     return Terrain(heights_of(values[::-1], nodata))
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from ..core.errors import ArgumentError, UserError
 from .files import require_pixels
 
 Pair = Sequence[float]
@@ -52,11 +53,11 @@ def waves(
       range: (lowest, highest).
     """
     if count < 1:
-        raise ValueError(f"count must be from 1 on, it is {count}")
+        raise ArgumentError("", "count", f"must be from 1 on, it is {count}")
     if not 0 < lengths[0] <= lengths[1]:
-        raise ValueError(f"lengths must be (shortest, longest), both positive, they are {list(lengths)}")
+        raise ArgumentError("", "lengths", f"must be (shortest, longest), both positive, they are {list(lengths)}")
     x, y = _positions(size)
-    random = np.random.default_rng(seed)
+    random = _generator(seed)
     total = np.zeros(np.shape(x))
     for angle, share, phase in zip(random.normal(size=count), random.random(count), random.random(count), strict=True):
         length = lengths[0] * (lengths[1] / lengths[0]) ** share
@@ -78,10 +79,10 @@ def bumps(
       range: (lowest, highest).
     """
     if count < 1 or not radius > 0:
-        raise ValueError(f"count and radius must be positive, they are {count} and {radius}")
+        raise UserError(f"count and radius must be positive, they are {count} and {radius}")
     x, y = _positions(size)
     total = np.zeros(np.shape(x))
-    for along_x, along_y in np.random.default_rng(seed).random((count, 2)):
+    for along_x, along_y in _generator(seed).random((count, 2)):
         total += np.exp(-((x - along_x * x.max()) ** 2 + (y - along_y * y.max()) ** 2) / (2 * radius**2))
     return _stretched(total, range)
 
@@ -93,7 +94,7 @@ def grid(size: Sequence[int], lines: int = 10) -> Float[np.ndarray, "h w 3"]:
       Linear colours, shape (h, w, 3).
     """
     if lines < 1:
-        raise ValueError(f"lines must be from 1 on, it is {lines}")
+        raise ArgumentError("", "lines", f"must be from 1 on, it is {lines}")
     u, v = _texel_centres(size)
     h, w = size
     colour = np.stack(np.broadcast_arrays(0.25 + 0.65 * u, 0.25 + 0.65 * v, 0.35), axis=-1)
@@ -114,7 +115,7 @@ def checker(
       Linear colours, shape (h, w, 3).
     """
     if squares < 1:
-        raise ValueError(f"squares must be from 1 on, it is {squares}")
+        raise ArgumentError("", "squares", f"must be from 1 on, it is {squares}")
     u, v = _texel_centres(size)
     odd = (np.floor(u * squares) + np.floor(v * squares)) % 2
     return _painted(np.broadcast_to(first, (*odd.shape, 3)), odd, second)
@@ -145,9 +146,9 @@ def sky(
       Linear colours, shape (h, w, 3).
     """
     if not 0 <= clouds <= 1:
-        raise ValueError(f"clouds must lie in 0..1, it is {clouds}")
+        raise ArgumentError("", "clouds", f"must lie in 0..1, it is {clouds}")
     if not sun_radius > 0:
-        raise ValueError(f"sun_radius must be positive, it is {sun_radius}")
+        raise ArgumentError("", "sun_radius", f"must be positive, it is {sun_radius}")
     u, v = _texel_centres(size)
     h, w = size
     colour = _painted(np.broadcast_to(horizon, (*np.broadcast_shapes(u.shape, v.shape), 3)), 1 - (1 - v) ** 2.5, zenith)
@@ -166,9 +167,15 @@ HEIGHTS = {"fractal": fractal, "waves": waves, "bumps": bumps}
 TEXTURES = {"grid": grid, "checker": checker, "sky": sky}
 
 
+def _generator(seed: int) -> np.random.Generator:
+    if seed < 0:
+        raise ArgumentError("", "seed", f"must be non-negative, it is {seed}")
+    return np.random.default_rng(seed)
+
+
 def _require_size(size: Sequence[int], least: int) -> None:
     if min(size) < least:
-        raise ValueError(f"size must be at least {least} x {least}, it is {list(size)}")
+        raise ArgumentError("", "size", f"must be at least {least} x {least}, it is {list(size)}")
     require_pixels(size[0], size[1])
 
 
@@ -176,7 +183,7 @@ def _noise(size: Sequence[int], seed: int, exponent: float) -> np.ndarray:
     """Periodic noise with mean 0 and standard deviation 1: white noise, filtered in the frequency domain."""
     _require_size(size, 2)
     rows, columns = size
-    white = np.random.default_rng(seed).normal(size=(rows, columns))
+    white = _generator(seed).normal(size=(rows, columns))
     frequency = np.hypot(np.fft.fftfreq(rows)[:, None], np.fft.rfftfreq(columns))
     frequency[0, 0] = np.inf
     noise = np.fft.irfft2(np.fft.rfft2(white) * frequency**-exponent, s=(rows, columns))
@@ -202,7 +209,7 @@ def _stretched(values: np.ndarray, range: Pair) -> np.ndarray:
     """`values`, mapped linearly so that their least is range[0] and their greatest range[1], to the bit."""
     low, high = range
     if not low <= high:
-        raise ValueError(f"range must be (lowest, highest), it is {list(range)}")
+        raise ArgumentError("", "range", f"must be (lowest, highest), it is {list(range)}")
     share = (values - values.min()) / max(values.max() - values.min(), np.finfo(values.dtype).tiny)
     return np.clip((1 - share) * low + share * high, low, high)
 

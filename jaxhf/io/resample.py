@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from .errors import FileError
 from .terrain import Terrain
 
 
@@ -23,7 +24,7 @@ def at_vertices(terrain: Terrain, wanted: Terrain) -> Float[np.ndarray, "ny nx"]
     assert own is not None
     assert other is not None
     if None not in (own.code, other.code) and own.code != other.code:
-        raise ValueError(f"it must have the terrain's coordinates, EPSG:{other.code}; it has EPSG:{own.code}")
+        raise FileError(f"it must have the terrain's coordinates, EPSG:{other.code}; it has EPSG:{own.code}")
     heights = terrain.heights
     (_, columns), (_, wanted_columns) = heights.shape, wanted.heights.shape
     middle, wanted_middle = terrain.x0 + (columns - 1) / 2 * terrain.dx, wanted.x0 + (wanted_columns - 1) / 2 * wanted.dx
@@ -39,7 +40,7 @@ def at_vertices(terrain: Terrain, wanted: Terrain) -> Float[np.ndarray, "ny nx"]
         at = np.where(np.abs(at - vertex) < 1e-6, vertex, at)  # without a share in the next one, which may be a hole
         if at[0] < -0.5 or at[-1] > count - 0.5:
             last, wanted_last = first + (count - 1) * step, wanted_first + (wanted_count - 1) * wanted_step
-            raise ValueError(
+            raise FileError(
                 f"it must cover the terrain, whose {name} goes from {wanted_first:.10g} to {wanted_last:.10g}; "
                 f"its own goes from {first:.10g} to {last:.10g}"
             )

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .errors import FileError
 from .files import PathLike, by_ending, reading, replacing, require_folder
 from .geotiff import import_tifffile
 from .terrain import Terrain
@@ -40,10 +41,10 @@ def _terrain(path: Path, given: Any) -> Terrain:
     if isinstance(given, Terrain):
         return given
     if path.suffix.lower() != ".npy":
-        raise ValueError(f"{path}: what is written must be a Terrain, whose place goes with it; it is a {type(given).__name__}")
+        raise FileError(f"{path}: what is written must be a Terrain, whose place goes with it; it is a {type(given).__name__}")
     heights = np.asarray(given)
     if heights.dtype not in (np.float32, np.float64) or heights.ndim != 2:
-        raise ValueError(
+        raise FileError(
             f"{path}: heights must be a Terrain, or float32 or float64 of shape (ny, nx); "
             f"they are {heights.dtype} of shape {heights.shape}"
         )
@@ -95,7 +96,7 @@ def _tags_of(tifffile: Any, like: Path, shape: tuple[int, ...]) -> list[tuple[An
     with tifffile.TiffFile(like) as file:
         page = file.pages[0]
         if (page.imagelength, page.imagewidth) != shape:
-            raise ValueError(
+            raise FileError(
                 f"{like}: it must have the shape of the heights, {shape}; it has {(page.imagelength, page.imagewidth)}"
             )
         found = [page.tags[code] for code in _GEOREFERENCE_TAGS if code in page.tags]

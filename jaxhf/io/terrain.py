@@ -8,7 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import DTypeLike
 
+from ..core.errors import ArgumentError
 from ..scene.heightfield import Heightfield
+from .errors import FileError
 from .georeference import WGS84, CoordinateSystem, metres_per_degree
 
 
@@ -32,12 +34,12 @@ class Terrain:
 
     def __post_init__(self):
         if self.heights.ndim != 2 or min(self.heights.shape) < 2:
-            raise ValueError(f"heights must have shape (ny, nx) of at least 2x2, theirs is {self.heights.shape}")
+            raise ArgumentError("", "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {self.heights.shape}")
         for name in ("dx", "dy", "x0", "y0"):
             value = getattr(self, name)
             if not math.isfinite(value) or (name in ("dx", "dy") and value <= 0):
                 rule = "positive and finite" if name in ("dx", "dy") else "finite"
-                raise ValueError(f"{name} must be {rule}, it is {value}")
+                raise ArgumentError("", name, f"must be {rule}, it is {value}")
 
     @property
     def nodata(self) -> Bool[np.ndarray, "ny nx"]:
@@ -62,9 +64,9 @@ class Terrain:
         if crs is not None and crs.degrees:
             if not (-360 <= self.x0 <= 360 and -90 <= self.y0 <= 90):
                 corner = f"the south-western corner is at longitude {self.x0}, latitude {self.y0}"
-                raise ValueError(f"degrees must lie on a globe, {corner}")
+                raise FileError(f"degrees must lie on a globe, {corner}")
             if crs.globe is None and not {"dx", "dy"} <= given.keys():
-                raise ValueError("its degrees are on a globe of unknown size: dx and dy must be given, in metres")
+                raise FileError("its degrees are on a globe of unknown size: dx and dy must be given, in metres")
             middle = self.y0 + (len(self.heights) - 1) / 2 * self.dy
             along_x, along_y = metres_per_degree(middle, crs.globe or WGS84)
             crs, grid = CoordinateSystem(), {"dx": self.dx * along_x, "dy": self.dy * along_y, "x0": 0.0, "y0": 0.0}
@@ -79,9 +81,9 @@ def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, off
     What is not finite, and what equals `nodata`, becomes nan.
     """
     if values.dtype.kind not in "fiu":
-        raise ValueError(f"heights must be numbers, they are {values.dtype}")
+        raise FileError(f"heights must be numbers, they are {values.dtype}")
     if values.ndim != 2:
-        raise ValueError(f"heights must have shape (ny, nx), theirs is {values.shape}")
+        raise FileError(f"heights must have shape (ny, nx), theirs is {values.shape}")
     exact_in_float32 = values.dtype.itemsize <= (4 if values.dtype.kind == "f" else 2)
     heights = values.astype(np.float32 if exact_in_float32 else np.float64)
     holes = ~np.isfinite(heights)
@@ -101,5 +103,5 @@ def fitted(heights: np.ndarray, dtype: DTypeLike) -> np.ndarray:
     with np.errstate(over="ignore"):
         found = heights.astype(dtype)
     if np.isinf(found).any():
-        raise ValueError(f"heights must fit into {found.dtype}, the largest is {np.nanmax(np.abs(heights)):.3g}")
+        raise ArgumentError("", "heights", f"must fit into {found.dtype}, the largest is {np.nanmax(np.abs(heights)):.3g}")
     return found

@@ -11,11 +11,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
+from ..core.errors import ArgumentError, UserError
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import float_leaf
 from ..scene.heightfield import Heightfield
-from ..scene.localise import localise
+from ..scene.localise import anchor, localise
 from ..scene.scene import Scene
 from ..trace.grid import Grid
 from ..trace.hit import Hit
@@ -23,15 +24,16 @@ from ..trace.intersect import intersect, leave
 from ..trace.world import first_hit, make_surface, make_world
 
 
-def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings = Settings()) -> Hit:
+def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings | None = None) -> Hit:
     """The first hits of the camera's rays through the points (x, y) of the picture, in pixels from its top left corner.
 
     Returns:
-      A `Hit` whose leaves have a leading axis n, with `p` relative to the terrain's corner.
+      A `Hit` whose leaves have a leading axis n, with `p` in the world's frame.
     """
     local = localise(scene)
     dtype = local.camera.world_from_camera.dtype
-    return _cast_camera(local, jnp.asarray(x, dtype), jnp.asarray(y, dtype), settings)
+    hit = _cast_camera(local, jnp.asarray(x, dtype), jnp.asarray(y, dtype), settings or Settings())
+    return _moved(hit, anchor(scene))
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
@@ -44,7 +46,7 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
     return jax.vmap(one)(x, y)
 
 
-def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings(), *, leaving: Hit | None = None) -> Hit:
+def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings | None = None, *, leaving: Hit | None = None) -> Hit:
     """Where rays meet a heightfield; differentiable in the heights, in `o`, in `d` and in `leaving`.
 
     Args:
@@ -66,10 +68,10 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings
     dtype = heightfield.heights.dtype
     corner = np.array([heightfield.x0, heightfield.y0, 0.0])
     if (o is None) == (leaving is None):
-        raise ValueError("cast: rays start at o or at the hits that they are leaving, and one of the two must be None")
+        raise UserError("cast: rays start at o or at the hits that they are leaving, and one of the two must be None")
     for name, value in (("o", o), ("d", d)):
         if value is not None and np.shape(value)[-1:] != (3,):
-            raise ValueError(f"cast: {name} must have shape (..., 3), its shape is {np.shape(value)}")
+            raise ArgumentError("cast", name, f"must have shape (..., 3), its shape is {np.shape(value)}")
     if leaving is not None:
         start, axes = leaving, leaving.t.ndim
     elif isinstance(o, jax.Array):
@@ -85,10 +87,13 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings = Settings
 
     starts = jax.tree.map(lambda leaf: in_a_row(leaf, leaf.shape[axes:]), start)
     field = Heightfield(heightfield.heights, heightfield.dx, heightfield.dy)
-    hit = _cast(field, starts, in_a_row(d, (3,)), settings)
-    offset = jnp.asarray(corner, dtype)
-    hit = eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(offset, hit.p.shape))
-    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), hit)
+    hit = _cast(field, starts, in_a_row(d, (3,)), settings or Settings())
+    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), _moved(hit, corner))
+
+
+def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
+    """Hits with a leading axis, their points moved by `offset`."""
+    return eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(jnp.asarray(offset, hit.p.dtype), hit.p.shape))
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))

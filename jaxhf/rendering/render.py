@@ -18,6 +18,7 @@ from ..boundary.guiding import edge_sets
 from ..boundary.term import boundary_term, default_key
 from ..core.autodiff import with_tangent
 from ..core.devices import local_mesh, on_every_device
+from ..core.errors import ArgumentError, UserError
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.localise import localise, localise_camera
@@ -46,21 +47,21 @@ class Prepared(eqx.Module):
 
     def with_camera(self, camera: Camera) -> "Prepared":
         """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
-        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, camera=camera))
+        return dataclasses.replace(self, scene=self.scene.with_camera(camera))
 
 
-def prepare(scene: Scene, settings: Settings = Settings(), *, mesh: Mesh | None = None) -> Prepared:
+def prepare(scene: Scene, settings: Settings | None = None, *, mesh: Mesh | None = None) -> Prepared:
     """Takes the normals and the bounds of the heights once, for many pictures of the same terrain in the same light.
 
     The arguments are those of `render`.
     """
-    settings, mesh = resolve_settings(settings, scene), local_mesh() if mesh is None else mesh
+    settings, mesh = resolve_settings(settings or Settings(), scene), local_mesh() if mesh is None else mesh
     return Prepared(scene, mesh, _make_world(on_every_device(localise(scene), mesh), settings=settings))
 
 
 def render(
     scene: Scene | Prepared,
-    settings: Settings = Settings(),
+    settings: Settings | None = None,
     *,
     aovs: Sequence[str] = (),
     progress: Callable[[int, int], None] | None = None,
@@ -76,7 +77,7 @@ def render(
     Args:
       scene: what to see. Values that are NumPy or Python numbers keep double precision until the origin has been moved to
         the terrain; the rest is computed in the precision of the (first) heightfield's heights.
-      settings: the knobs; those of a `Prepared` scene stay what they are.
+      settings: the knobs; None: `Settings()`, or those of a `Prepared` scene, which can be rendered with no others.
       aovs: names out of `AOVS`.
       progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
       key: of JAX's random numbers, for what is sampled: the points on edges, if the settings ask for them. The same key
@@ -93,14 +94,14 @@ def render(
     aovs = tuple(aovs)
     for name in aovs:
         if name not in AOVS:
-            raise ValueError(f"render: aovs must be among {', '.join(AOVS)}; one is {name!r}")
+            raise ArgumentError("render", "aovs", f"must be among {', '.join(AOVS)}; one is {name!r}")
     if not isinstance(scene, Prepared) and progress is not None:
-        scene, settings = prepare(scene, settings, mesh=mesh), Settings()
+        scene, settings = prepare(scene, settings, mesh=mesh), None
     if isinstance(scene, Prepared):
         if mesh is not None and mesh != scene.mesh:
-            raise ValueError(f"render: the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
-        if settings != Settings() and resolve_settings(settings, scene.scene) != scene.settings:
-            raise ValueError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
+            raise UserError(f"render: the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
+        if settings is not None and resolve_settings(settings, scene.scene) != scene.settings:
+            raise UserError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
         world, mesh = scene._world, scene.mesh
         camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:
@@ -108,7 +109,7 @@ def render(
         else:
             outputs = _trace_in_parts(world, camera, aovs, mesh, progress)
     else:
-        settings, mesh = resolve_settings(settings, scene), local_mesh() if mesh is None else mesh
+        settings, mesh = resolve_settings(settings or Settings(), scene), local_mesh() if mesh is None else mesh
         local = on_every_device(localise(scene), mesh)
         outputs = _trace_all(local, settings, aovs, mesh, default_key(key, settings, mesh))
     image = outputs.pop("image")

@@ -1,1 +1,1 @@
-"""What a user builds: objects, materials, lights and cameras, and the origin from which they are traced."""
+"""What a user builds: objects, materials, lights and cameras, and the origin relative to which they are traced."""

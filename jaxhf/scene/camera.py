@@ -1,4 +1,4 @@
-"""From a place in the picture to a ray in the world."""
+"""Cameras: from a point of the picture to a ray in the world, and back."""
 
 from typing import Any
 
@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.affine import Affine, affine, require_invertible
+from ..core.errors import ArgumentError
 from ..core.ray import Ray
 from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
 from ..core.vector import unit
+from .show import known, numbers
 
 
 class Projection(eqx.Module):
@@ -28,7 +30,7 @@ class Projection(eqx.Module):
         return self.linear[:, 0] * p[0] + self.linear[:, 1] * p[1] + self.linear[:, 2] * p[2] + self.offset
 
     def of(self, world: Affine) -> "Projection":
-        """The same for points in another frame, from which `world` leads to the world's."""
+        """The same projection for points in another frame; `world` maps that frame to the world's."""
         columns = [
             self.linear[:, 0] * world.linear[0, k]
             + self.linear[:, 1] * world.linear[1, k]
@@ -39,7 +41,7 @@ class Projection(eqx.Module):
 
 
 class Perspective(eqx.Module):
-    """A pinhole.
+    """A pinhole camera.
 
     Attributes:
       world_from_camera: 4x4; camera space is +x right, +y up, +z forward (the handedness of pbrt).
@@ -54,9 +56,9 @@ class Perspective(eqx.Module):
 
     def __check_init__(self):
         _check_camera(self)
-        require_number("Perspective: fov", self.fov)
+        require_number("Perspective", "fov", self.fov)
         if isinstance(self.fov, np.ndarray) and not 0 < self.fov < 180:
-            raise ValueError(f"Perspective: fov must lie between 0 and 180 degrees, it is {self.fov}")
+            raise ArgumentError("Perspective", "fov", f"must lie between 0 and 180 degrees, it is {self.fov}")
 
     @classmethod
     def look_at(
@@ -73,17 +75,20 @@ class Perspective(eqx.Module):
         return Ray(world.offset, unit(world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))))
 
     def film_from_world(self) -> Projection:
-        """The inverse of `ray`: where in the picture a point is seen."""
+        """The projection of points in the world to pixels, the inverse of `ray`."""
         camera = affine(jnp.asarray(self.world_from_camera)).inverse()
         return _film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
 
     def viewpoint(self) -> tuple[Vector, bool]:
-        """The eye, and that it is at a place."""
+        """The position of the eye, and True: it is a point."""
         return affine(jnp.asarray(self.world_from_camera)).offset, True
+
+    def __repr__(self) -> str:
+        return _shown(self, f"fov={numbers(self.fov)}")
 
 
 class Orthographic(eqx.Module):
-    """Parallel rays.
+    """A camera whose rays are parallel.
 
     Attributes:
       world_from_camera: as for `Perspective`; rays start in the camera's plane z = 0.
@@ -98,9 +103,9 @@ class Orthographic(eqx.Module):
 
     def __check_init__(self):
         _check_camera(self)
-        require_number("Orthographic: extent", self.extent)
+        require_number("Orthographic", "extent", self.extent)
         if isinstance(self.extent, np.ndarray) and not 0 < self.extent < np.inf:
-            raise ValueError(f"Orthographic: extent must be positive and finite, it is {self.extent}")
+            raise ArgumentError("Orthographic", "extent", f"must be positive and finite, it is {self.extent}")
 
     @classmethod
     def look_at(
@@ -118,27 +123,39 @@ class Orthographic(eqx.Module):
         return Ray(origin, unit(world.linear[:, 2]))
 
     def film_from_world(self) -> Projection:
-        """The inverse of `ray`: where in the picture a point is seen."""
+        """The projection of points in the world to pixels, the inverse of `ray`."""
         camera = affine(jnp.asarray(self.world_from_camera)).inverse()
         half = jnp.asarray(self.extent) / 2
         return _film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
 
     def viewpoint(self) -> tuple[Vector, bool]:
-        """The direction towards the eye, and that it is infinitely far away."""
+        """The direction towards the eye, and False: it is infinitely far away."""
         return -affine(jnp.asarray(self.world_from_camera)).linear[:, 2], False
+
+    def __repr__(self) -> str:
+        return _shown(self, f"extent={numbers(self.extent)}")
 
 
 Camera = Perspective | Orthographic
 
 
+def _shown(camera: Camera, lens: str) -> str:
+    matrix = known(camera.world_from_camera)
+    if matrix is None or matrix.shape != (4, 4):
+        pose = f"world_from_camera={numbers(camera.world_from_camera)}"
+    else:
+        pose = f"eye={numbers(matrix[:3, 3])}, looking={numbers(matrix[:3, 2])}"
+    return f"{type(camera).__name__}({pose}, {lens}, {camera.width} x {camera.height})"
+
+
 def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
-    """Pixels to the screen on which the shorter side runs from -1 to 1, x right, y up."""
+    """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
     short = min(camera.width, camera.height)
     return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
 
 
 def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
-    """`_screen` undone: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
+    """The inverse of `_screen`: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
     scale = min(camera.width, camera.height) / (2 * half)
     linear, offset = camera_from_world.linear, camera_from_world.offset
     return Projection(
@@ -159,8 +176,8 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
     leaves = {"eye": eye, "target": target, "up": up}
     for name, leaf in leaves.items():
         if leaf.shape != (3,):
-            raise ValueError(f"look_at: {name} must hold three numbers, its shape is {leaf.shape}")
-        require_finite(f"look_at: {name}", leaf)
+            raise ArgumentError("look_at", name, f"must hold three numbers, its shape is {leaf.shape}")
+        require_finite("look_at", name, leaf)
     host = all(isinstance(leaf, np.ndarray) for leaf in leaves.values())
     xp = np if host else jnp
 
@@ -168,11 +185,13 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
         return v / xp.sqrt((v * v).sum())
 
     if host and not (target - eye).any():
-        raise ValueError(f"look_at: target must differ from eye, both are {eye.tolist()}")
+        raise ArgumentError("look_at", "target", f"must differ from eye, both are {eye.tolist()}")
     forward = direction(target - eye)
     right = xp.cross(forward, up)
     if host and not np.linalg.norm(right) > 1e-9 * np.linalg.norm(up):
-        raise ValueError(f"look_at: up must not point along the view, it is {up.tolist()} for the view {forward.tolist()}")
+        raise ArgumentError(
+            "look_at", "up", f"must not point along the view, it is {up.tolist()} for the view {forward.tolist()}"
+        )
     right = direction(right)
     columns = xp.stack([right, xp.cross(right, forward), forward, eye], axis=1)
     return xp.concatenate([columns, xp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=columns.dtype)])
@@ -180,8 +199,8 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
 
 def _check_camera(camera: Camera) -> None:
     kind = type(camera).__name__
-    require_invertible(f"{kind}: world_from_camera", camera.world_from_camera)
+    require_invertible(kind, "world_from_camera", camera.world_from_camera)
     for side in ("width", "height"):
         value = getattr(camera, side)
         if not isinstance(value, int) or value < 1:
-            raise ValueError(f"{kind}: {side} must be a whole number of pixels from 1 on, it is {value!r}")
+            raise ArgumentError(kind, side, f"must be a whole number of pixels from 1 on, it is {value!r}")

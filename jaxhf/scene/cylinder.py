@@ -1,13 +1,15 @@
-"""An open cylinder, such as carries the sky of the seed scenes."""
+"""An open cylinder, on which pbrt scenes paint their sky."""
 
 import equinox as eqx
 import numpy as np
 
+from ..core.errors import ArgumentError
 from ..core.types import ScalarLeaf, float_leaf, require_finite, require_number
+from .show import fields
 
 
 class Cylinder(eqx.Module):
-    """A full circle about the z axis of its frame, without caps; seen from both sides.
+    """A cylinder about the z axis of its object's frame, without caps; seen from both sides.
 
     (u, v): u = phi / 2 pi with phi = atan2(y, x) in [0, 2 pi), v runs from z_min to z_max (pbrt-v2, `Shape "cylinder"`).
 
@@ -21,10 +23,13 @@ class Cylinder(eqx.Module):
 
     def __check_init__(self):
         for name in ("radius", "z_min", "z_max"):
-            require_number(f"Cylinder: {name}", getattr(self, name))
+            require_number("Cylinder", name, getattr(self, name))
         if isinstance(self.radius, np.ndarray) and not 0 < self.radius < np.inf:
-            raise ValueError(f"Cylinder: radius must be positive, it is {self.radius}")
+            raise ArgumentError("Cylinder", "radius", f"must be positive, it is {self.radius}")
         if isinstance(self.z_min, np.ndarray) and isinstance(self.z_max, np.ndarray) and not self.z_min < self.z_max:
-            raise ValueError(f"Cylinder: z_min must lie below z_max, they are {self.z_min} and {self.z_max}")
-        require_finite("Cylinder: z_min", self.z_min)
-        require_finite("Cylinder: z_max", self.z_max)
+            raise ArgumentError("Cylinder", "z_min", f"must lie below z_max, they are {self.z_min} and {self.z_max}")
+        require_finite("Cylinder", "z_min", self.z_min)
+        require_finite("Cylinder", "z_max", self.z_max)
+
+    def __repr__(self) -> str:
+        return fields(self)

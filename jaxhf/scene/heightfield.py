@@ -6,9 +6,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
+from ..core.errors import ArgumentError
+from ..core.powers import next_power_of_two
 from ..core.types import AnyArray
+from .show import known, number, numbers
 
 # So that a walk's state fits into 32 bits; each side of the grid counts as the next power of two.
 MOST_CELLS = 2**28
@@ -19,13 +23,13 @@ def _heights(value: Any) -> jax.Array:
         heights = jnp.asarray(value)
     except TypeError as error:
         whole = ": take its .heightfield()" if hasattr(value, "heightfield") else ""
-        raise ValueError(
-            f"Heightfield: heights must be an array of numbers, they are a {type(value).__name__}{whole}"
+        raise ArgumentError(
+            "Heightfield", "heights", f"must be an array of numbers, they are a {type(value).__name__}{whole}"
         ) from error
     if jnp.issubdtype(heights.dtype, jnp.integer):
         return heights.astype(jnp.float32)
     if heights.dtype not in (jnp.float32, jnp.float64):
-        raise ValueError(f"Heightfield: heights must be float32, float64 or whole numbers, they are {heights.dtype}")
+        raise ArgumentError("Heightfield", "heights", f"must be float32, float64 or whole numbers, they are {heights.dtype}")
     return heights
 
 
@@ -52,12 +56,14 @@ class Heightfield(eqx.Module):
         self.heights = _heights(heights)
         shape = self.heights.shape
         if len(shape) != 2 or min(shape) < 2:
-            raise ValueError(f"Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is {shape}")
-        padded = [1 << max(1, (n - 2).bit_length()) for n in shape]
+            raise ArgumentError("Heightfield", "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {shape}")
+        padded = [next_power_of_two(n - 1) for n in shape]
         if math.prod(padded) > MOST_CELLS:
-            raise ValueError(
-                f"Heightfield: heights must have at most 2**28 cells, each side rounded up to a power of two; "
-                f"shape {shape} makes {padded[0]} x {padded[1]}"
+            raise ArgumentError(
+                "Heightfield",
+                "heights",
+                "must have at most 2**28 cells, each side rounded up to a power of two; "
+                f"shape {shape} makes {padded[0]} x {padded[1]}",
             )
         square = dx if dy is None else dy  # one of the two alone counts for both
         self.dx = float(1 / (shape[1] - 1) if square is None else square if dx is None else dx)
@@ -66,7 +72,17 @@ class Heightfield(eqx.Module):
         for name in ("dx", "dy"):
             value = getattr(self, name)
             if not 0 < value < math.inf:
-                raise ValueError(f"Heightfield: {name} must be positive and finite, it is {value}")
+                raise ArgumentError("Heightfield", name, f"must be positive and finite, it is {value}")
         for name in ("x0", "y0"):
             if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"Heightfield: {name} must be finite, it is {getattr(self, name)}")
+                raise ArgumentError("Heightfield", name, f"must be finite, it is {getattr(self, name)}")
+
+    def __repr__(self) -> str:
+        heights = known(self.heights)
+        size, span = numbers(self.heights), ""
+        if heights is not None and heights.ndim == 2:
+            finite = heights[np.isfinite(heights)]
+            lowest, highest = (finite.min(), finite.max()) if finite.size else (np.nan, np.nan)
+            size, span = f"{len(heights)} x {heights.shape[1]}", f", heights {number(lowest)} .. {number(highest)}"
+        grid = ", ".join(f"{name}={number(getattr(self, name))}" for name in ("dx", "dy", "x0", "y0"))
+        return f"Heightfield({size}, {grid}{span})"

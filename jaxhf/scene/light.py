@@ -1,12 +1,15 @@
-"""Where the light comes from."""
+"""Lights."""
 
+import warnings
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ..core.errors import ArgumentError
 from ..core.types import VectorLeaf, float_leaf, require_finite, rgb_leaf
+from .show import fields
 
 
 class Directional(eqx.Module):
@@ -14,32 +17,41 @@ class Directional(eqx.Module):
 
     Attributes:
       towards: the vector from the scene towards the light, world frame; its length does not matter.
-      radiance: the irradiance on a surface that faces the light, one number or (r, g, b): with pi, a white matte
-        surface that faces the light has radiance 1.
+      irradiance: of a surface that faces the light, one number or (r, g, b); None: pi, under which a white matte surface
+        that faces the light has radiance 1.
+      radiance: what the argument `irradiance` was called until 0.1; gives a DeprecationWarning.
     """
 
-    towards: VectorLeaf = eqx.field(converter=float_leaf)
-    radiance: VectorLeaf = eqx.field(converter=rgb_leaf, default=np.pi)
+    towards: VectorLeaf
+    irradiance: VectorLeaf
 
-    def __check_init__(self):
-        _require_vector("Directional: towards", self.towards)
-        _require_vector("Directional: radiance", self.radiance)
+    def __init__(self, towards: Any, irradiance: Any = None, *, radiance: Any = None):
+        self.towards = float_leaf(towards)
+        self.irradiance = rgb_leaf(_chosen(irradiance, radiance, 5))  # two frames between are Equinox's
+        _require_vector("Directional", "towards", self.towards)
+        _require_vector("Directional", "irradiance", self.irradiance)
         if isinstance(self.towards, np.ndarray) and not self.towards.any():
-            raise ValueError("Directional: towards must not be zero, it is [0, 0, 0]")
+            raise ArgumentError("Directional", "towards", "must not be zero, it is [0, 0, 0]")
+
+    def __repr__(self) -> str:
+        return fields(self)
 
     @classmethod
-    def from_angles(cls, azimuth: Any = 315.0, altitude: Any = 45.0, radiance: Any = np.pi) -> "Directional":
-        """Light as cartographers give it: x is east, y north, z up.
+    def from_angles(
+        cls, azimuth: Any = 315.0, altitude: Any = 45.0, irradiance: Any = None, *, radiance: Any = None
+    ) -> "Directional":
+        """Light from a compass direction, as cartographers give it: x is east, y north, z up.
 
         Args:
-          azimuth: where the light stands, degrees clockwise from north.
+          azimuth: the direction in which the light stands, degrees clockwise from north.
           altitude: its height above the horizon, degrees.
-          radiance: as the attribute.
+          irradiance, radiance: as for the class.
         """
         azimuth, altitude = float_leaf(azimuth), float_leaf(altitude)
         xp = np if isinstance(azimuth, np.ndarray) and isinstance(altitude, np.ndarray) else jnp
         a, h = xp.deg2rad(azimuth), xp.deg2rad(altitude)
-        return cls(xp.stack([xp.sin(a) * xp.cos(h), xp.cos(a) * xp.cos(h), xp.sin(h)]), radiance)
+        towards = xp.stack([xp.sin(a) * xp.cos(h), xp.cos(a) * xp.cos(h), xp.sin(h)])
+        return cls(towards, _chosen(irradiance, radiance, 3))
 
 
 class Point(eqx.Module):
@@ -54,16 +66,19 @@ class Point(eqx.Module):
     intensity: VectorLeaf = eqx.field(converter=rgb_leaf, default=1.0)
 
     def __check_init__(self):
-        _require_vector("Point: p", self.p)
-        _require_vector("Point: intensity", self.intensity)
+        _require_vector("Point", "p", self.p)
+        _require_vector("Point", "intensity", self.intensity)
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 class Sky(eqx.Module):
-    """A sky of one colour: the background of the picture, and diffuse light from the upper half space.
+    """A sky of one colour: the background of the picture, and diffuse light from the upper hemisphere.
 
     A surface tilted by beta against the horizontal sees the share (1 + cos beta) / 2 of the sky, the isotropic sky of
     Liu and Jordan (The interrelationship and characteristic distribution of direct, diffuse and total solar radiation,
-    Solar Energy 4(3), 1960). Terrain in front of the sky is not taken into account: that would have to be sampled.
+    Solar Energy 4(3), 1960). It is not shadowed by other terrain, which would have to be sampled.
 
     Attributes:
       radiance: one number or (r, g, b).
@@ -72,13 +87,26 @@ class Sky(eqx.Module):
     radiance: VectorLeaf = eqx.field(converter=rgb_leaf)
 
     def __check_init__(self):
-        _require_vector("Sky: radiance", self.radiance)
+        _require_vector("Sky", "radiance", self.radiance)
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 Light = Directional | Point | Sky
 
 
-def _require_vector(place: str, leaf: VectorLeaf) -> None:
+def _chosen(irradiance: Any, radiance: Any, stacklevel: int) -> Any:
+    """The irradiance of a directional light, whichever of its two names it was given by."""
+    if radiance is None:
+        return np.pi if irradiance is None else irradiance
+    if irradiance is not None:
+        raise ArgumentError("Directional", "radiance", "must stand without irradiance, whose old name it is")
+    warnings.warn("Directional: radiance is now called irradiance", DeprecationWarning, stacklevel=stacklevel)
+    return radiance
+
+
+def _require_vector(owner: str, name: str, leaf: VectorLeaf) -> None:
     if leaf.shape != (3,):
-        raise ValueError(f"{place} must hold three numbers, its shape is {leaf.shape}")
-    require_finite(place, leaf)
+        raise ArgumentError(owner, name, f"must hold three numbers, its shape is {leaf.shape}")
+    require_finite(owner, name, leaf)

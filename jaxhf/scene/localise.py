@@ -20,20 +20,20 @@ def localise(scene: Scene) -> Scene:
     Where positions are still NumPy numbers the move happens in double precision, so that a terrain in UTM coordinates
     (northings of 5e6, where single precision has steps of 0.5) renders to the same bits as one at the origin.
     """
-    anchor = _anchor(scene)
+    origin = anchor(scene)
 
     def moved_object(obj: Object) -> Object:
         shape, corner = obj.shape, _grid_corner(obj.shape)
         if isinstance(shape, Heightfield):
             shape = Heightfield(shape.heights, shape.dx, shape.dy)
         world: Any = np.eye(4) if obj.world_from_object is None else obj.world_from_object
-        shift = world[:3, :3] @ _like(world, corner) - _like(world, anchor)
+        shift = world[:3, :3] @ _like(world, corner) - _like(world, origin)
         if obj.world_from_object is None and not np.any(shift):
             return Object(shape, obj.material)
         return Object(shape, obj.material, _shifted(world, shift))
 
     def moved_light(light: Light) -> Light:
-        return Point(light.p - _like(light.p, anchor), light.intensity) if isinstance(light, Point) else light
+        return Point(light.p - _like(light.p, origin), light.intensity) if isinstance(light, Point) else light
 
     moved = Scene(
         objects=tuple(moved_object(obj) for obj in scene.objects),
@@ -49,7 +49,7 @@ def localise(scene: Scene) -> Scene:
 def localise_camera(camera: Camera, scene: Scene) -> Camera:
     """A camera for `localise(scene)`."""
     matrix = camera.world_from_camera
-    moved = eqx.tree_at(lambda camera: camera.world_from_camera, camera, _shifted(matrix, -_like(matrix, _anchor(scene))))
+    moved = eqx.tree_at(lambda camera: camera.world_from_camera, camera, _shifted(matrix, -_like(matrix, anchor(scene))))
     dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
     return jax.tree.map(lambda leaf: _in_precision(leaf, dtype), moved)
 
@@ -60,11 +60,11 @@ def _in_precision(leaf: Any, dtype: Any) -> Any:
 
 
 def _grid_corner(shape: Shape) -> np.ndarray:
-    """Where a heightfield's vertex (0, 0) stands, at height 0, in its object's frame."""
+    """The position of a heightfield's vertex (0, 0) at height 0, in its object's frame."""
     return np.array([shape.x0, shape.y0, 0.0]) if isinstance(shape, Heightfield) else np.zeros(3)
 
 
-def _anchor(scene: Scene) -> np.ndarray:
+def anchor(scene: Scene) -> np.ndarray:
     """The first heightfield's corner in the world; the world's own origin where that is traced or there is none."""
     obj = next((obj for obj in scene.objects if isinstance(obj.shape, Heightfield)), None)
     world: Any = None if obj is None else obj.world_from_object

@@ -1,11 +1,13 @@
-"""What a surface does with light."""
+"""Materials: how a surface reflects light."""
 
 from typing import Any
 
 import equinox as eqx
 from jaxtyping import Float
 
+from ..core.errors import ArgumentError
 from ..core.types import AnyArray, require_finite, rgb_leaf
+from .show import fields
 from .texture import ImageTexture
 
 
@@ -25,8 +27,11 @@ class Matte(eqx.Module):
     def __check_init__(self):
         if not isinstance(self.albedo, ImageTexture):
             if self.albedo.shape != (3,):
-                raise ValueError(f"Matte: albedo must be one number or three, its shape is {self.albedo.shape}")
-            require_finite("Matte: albedo", self.albedo)
+                raise ArgumentError("Matte", "albedo", f"must be one number or three, its shape is {self.albedo.shape}")
+            require_finite("Matte", "albedo", self.albedo)
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 class Mirror(eqx.Module):
@@ -40,8 +45,11 @@ class Mirror(eqx.Module):
 
     def __check_init__(self):
         if self.reflectance.shape != (3,):
-            raise ValueError(f"Mirror: reflectance must be one number or three, its shape is {self.reflectance.shape}")
-        require_finite("Mirror: reflectance", self.reflectance)
+            raise ArgumentError("Mirror", "reflectance", f"must be one number or three, its shape is {self.reflectance.shape}")
+        require_finite("Mirror", "reflectance", self.reflectance)
+
+    def __repr__(self) -> str:
+        return fields(self)
 
 
 Material = Matte | Mirror

@@ -1,5 +1,7 @@
-"""What is in the picture."""
+"""Scenes: objects, a camera and lights."""
 
+import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -7,18 +9,20 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from ..core.affine import require_invertible
+from ..core.errors import ArgumentError, UserError
 from ..core.types import AnyArray, MatrixLeaf, float_leaf
 from .camera import Camera
 from .cylinder import Cylinder
 from .heightfield import Heightfield
 from .light import Light, Sky
 from .material import Material, Matte
+from .show import numbers
 
 Shape = Heightfield | Cylinder
 
 
 class Object(eqx.Module):
-    """A shape, what it is made of, and where it stands.
+    """A shape with its material and its transform.
 
     Attributes:
       shape: a `Heightfield` or a `Cylinder`.
@@ -35,15 +39,19 @@ class Object(eqx.Module):
         self.material = Matte(0.7) if material is None else material
         self.world_from_object = None if world_from_object is None else float_leaf(world_from_object)
         if not isinstance(shape, Shape):
-            raise ValueError(f"Object: shape must be a Heightfield or a Cylinder, it is {type(shape).__name__}")
+            raise ArgumentError("Object", "shape", f"must be a Heightfield or a Cylinder, it is {type(shape).__name__}")
         if not isinstance(self.material, Material):
-            raise ValueError(f"Object: material must be Matte or Mirror, it is {type(self.material).__name__}")
+            raise ArgumentError("Object", "material", f"must be Matte or Mirror, it is {type(self.material).__name__}")
         if self.world_from_object is not None:
-            require_invertible("Object: world_from_object", self.world_from_object)
+            require_invertible("Object", "world_from_object", self.world_from_object)
+
+    def __repr__(self) -> str:
+        pose = "" if self.world_from_object is None else f", world_from_object={numbers(self.world_from_object)}"
+        return f"Object({self.shape!r}, {self.material!r}{pose})"
 
 
 class Scene(eqx.Module):
-    """Objects, seen by a camera, in light.
+    """Objects, the camera that sees them, and the lights.
 
     Attributes:
       objects: at least one `Object`.
@@ -59,19 +67,19 @@ class Scene(eqx.Module):
 
     def __check_init__(self):
         if not self.objects:
-            raise ValueError("Scene: objects must hold at least one Object, it is empty")
-        for place, values, kinds in (
+            raise ArgumentError("Scene", "objects", "must hold at least one Object, it is empty")
+        for name, values, kinds in (
             ("objects", self.objects, Object),
             ("camera", (self.camera,), Camera),
             ("lights", self.lights, Light),
         ):
             for value in values:
                 if not isinstance(value, kinds):
-                    raise ValueError(f"Scene: {place} does not take a {type(value).__name__}")
+                    raise ArgumentError("Scene", name, f"does not take a {type(value).__name__}")
         if sum(isinstance(light, Sky) for light in self.lights) > 1:
-            raise ValueError("Scene: lights may hold one Sky, they hold more")
+            raise ArgumentError("Scene", "lights", "may hold one Sky, they hold more")
         if not isinstance(self.samples, int) or self.samples < 1:
-            raise ValueError(f"Scene: samples must be a whole number from 1 on, it is {self.samples!r}")
+            raise ArgumentError("Scene", "samples", f"must be a whole number from 1 on, it is {self.samples!r}")
 
     @property
     def heightfields(self) -> tuple[Heightfield, ...]:
@@ -82,13 +90,24 @@ class Scene(eqx.Module):
     def heights(self) -> Float[AnyArray, "ny nx"]:
         """The heights of the first heightfield, shape (ny, nx); ValueError where the scene has none."""
         if not self.heightfields:
-            raise ValueError("Scene: there is no heightfield among its objects")
+            raise UserError("Scene: there is no heightfield among its objects")
         return self.heightfields[0].heights
+
+    def __repr__(self) -> str:
+        return f"Scene(objects={self.objects!r}, camera={self.camera!r}, lights={self.lights!r}, samples={self.samples})"
+
+    def with_camera(self, camera: Camera) -> "Scene":
+        """The same scene seen by another camera; nothing is compiled again if its picture has the same size."""
+        return dataclasses.replace(self, camera=camera)
+
+    def with_lights(self, lights: Iterable[Light]) -> "Scene":
+        """The same scene in another light; nothing is compiled again if these are as many lights of the same types."""
+        return dataclasses.replace(self, lights=lights)
 
     def with_heights(self, heights: Any) -> "Scene":
         """The same scene over other heights of the same shape and precision; nothing is compiled again."""
         old = self.heights
         new = jnp.asarray(heights, old.dtype)
         if new.shape != old.shape:
-            raise ValueError(f"with_heights: heights must keep their shape {old.shape}, theirs is {new.shape}")
+            raise ArgumentError("with_heights", "heights", f"must keep their shape {old.shape}, theirs is {new.shape}")
         return eqx.tree_at(lambda scene: scene.heightfields[0].heights, self, new)

@@ -1,15 +1,16 @@
-"""Images as colours on a surface."""
+"""Textures: images spread over a surface."""
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..core.errors import ArgumentError
 from ..core.types import AnyArray, Point2, Vector, float_leaf
 
 
 class ImageTexture(eqx.Module):
-    """An image spread over (u, v) in 0..1 and repeated beyond, looked up bilinearly.
+    """An image spread over (u, v) in 0..1 and repeated outside, looked up bilinearly.
 
     Attributes:
       texels: linear colours, shape (h, w, 3): row 0 is v = 0, u runs along a row, texel centres lie at half steps.
@@ -19,10 +20,12 @@ class ImageTexture(eqx.Module):
 
     def __check_init__(self):
         if len(self.texels.shape) != 3 or self.texels.shape[2] != 3 or 0 in self.texels.shape:
-            raise ValueError(f"ImageTexture: texels must have shape (h, w, 3), theirs is {self.texels.shape}")
+            raise ArgumentError("ImageTexture", "texels", f"must have shape (h, w, 3), theirs is {self.texels.shape}")
         if isinstance(self.texels, np.ndarray) and not np.isfinite(self.texels).all():
             iy, ix, _ = np.argwhere(~np.isfinite(self.texels))[0]
-            raise ValueError(f"ImageTexture: texels must be finite, row {iy} column {ix} is {self.texels[iy, ix].tolist()}")
+            raise ArgumentError(
+                "ImageTexture", "texels", f"must be finite, row {iy} column {ix} is {self.texels[iy, ix].tolist()}"
+            )
 
     def __call__(self, uv: Point2) -> Vector:
         texels = jnp.asarray(self.texels)

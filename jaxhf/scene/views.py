@@ -1,4 +1,4 @@
-"""Cameras made for a terrain, and pictures of another size."""
+"""A camera above a terrain, and scenes with pictures of another size."""
 
 import dataclasses
 import math
@@ -11,11 +11,12 @@ from .scene import Scene
 
 
 def from_above(field: Heightfield, width: int | None, height: int | None) -> Orthographic:
-    """A camera that sees all of a heightfield from straight above, north up, and what is beside it in other proportions.
+    """A camera that sees a whole heightfield from straight above, north up.
 
     Args:
-      width, height: pixels; one of the two may be None, and then keeps them square: it is rounded up, so that less than
-        half a pixel on either side is beside the field.
+      width, height: pixels. Where their proportions are not the field's, the picture shows its surroundings too. One of them
+        may be None: as many pixels as make them square, rounded up, so that less than half a pixel on either side shows
+        the surroundings.
     """
     ny, nx = field.heights.shape
     across, up = (nx - 1) * field.dx, (ny - 1) * field.dy
@@ -35,6 +36,7 @@ def _pixels(exact: float) -> int:
 
 
 def resized(scene: Scene, width: int, height: int) -> Scene:
+    """The same view in a picture of width x height pixels."""
     return dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, width=width, height=height))
 
 

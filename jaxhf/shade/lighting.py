@@ -43,7 +43,7 @@ def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:
 def _towards(light: Directional | Point, p: Vector) -> tuple[Vector, Vector, Scalar | None]:
     """Unit direction to the light, irradiance across that direction, distance (None: infinite)."""
     if isinstance(light, Directional):
-        return unit(light.towards), light.radiance, None
+        return unit(light.towards), light.irradiance, None
     to = light.p - p
     size = largest_component(to)
     size = floor_to_power_of_two(jnp.where(size > 0, size, 1))  # beyond its square root no number has a square

@@ -10,8 +10,10 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..core.errors import ArgumentError
 from ..core.machine import default_devices
 from ..core.settings import Settings
+from ..io.errors import FileError
 from ..io.files import PathLike
 from ..io.scenes import load_scene
 from ..scene.light import Sky
@@ -200,14 +202,14 @@ def plan(
     """
     for knob in knobs:
         if knob not in KNOBS:
-            raise ValueError(f"tradeoff: knobs must be among {', '.join(KNOBS)}; one is {knob!r}")
+            raise ArgumentError("tradeoff", "knobs", f"must be among {', '.join(KNOBS)}; one is {knob!r}")
     for name, value in (("width", width), ("devices", devices)):
         if value is not None and value < 1:
-            raise ValueError(f"tradeoff: {name} must be a whole number from 1 on, it is {value}")
+            raise ArgumentError("tradeoff", name, f"must be a whole number from 1 on, it is {value}")
     path = Path(path)
     scene = load_scene(path)
     if not scene.heightfields:
-        raise ValueError(f"{path}: there is no heightfield whose rendering could be measured")
+        raise FileError(f"{path}: there is no heightfield whose rendering could be measured")
     camera = scene.camera
     longest = PIXELS // 2 if quick else PIXELS
     scale = width / camera.width if width else min(1.0, longest / max(camera.width, camera.height))
@@ -215,7 +217,7 @@ def plan(
     devices = devices or default_devices()
     fits = fits or not _FIT_VALUES.keys().isdisjoint(knobs)
     if fits and not np.isfinite(scene.heights).all():
-        raise ValueError(f"{path}: a fit's terrain must be without holes, this one has {np.sum(~np.isfinite(scene.heights))}")
+        raise FileError(f"{path}: a fit's terrain must be without holes, this one has {np.sum(~np.isfinite(scene.heights))}")
     configurations = tuple(dict.fromkeys(_configurations(scene, frozenset(knobs or KNOBS), quick, fits)))
     folder = Path(f"{path.stem}-tradeoff") if folder is None else Path(folder)
     identity = _identity(resized(scene, *size), devices, quick)

@@ -1,5 +1,6 @@
 """The command line as a user runs it: its own process, single precision, what it prints and how it ends."""
 
+import importlib.metadata
 import importlib.util
 import re
 import subprocess
@@ -58,6 +59,14 @@ def test_help_does_not_import_jax(arguments):
     run = python("-c", script, *arguments)
     assert run.returncode == 0
     assert run.stdout.splitlines()[-1] == "False"
+
+
+def test_version():
+    """Without JAX, by `import jaxhf` too."""
+    run = jaxhf_command("--version")
+    assert (run.returncode, run.stdout) == (0, f"jaxhf {importlib.metadata.version('jaxhf')}\n")
+    run = python("-c", "import sys, jaxhf; print(jaxhf.__version__, 'jax' in sys.modules)")
+    assert run.stdout == f"{importlib.metadata.version('jaxhf')} False\n"
 
 
 def test_render(tmp_path):
@@ -129,6 +138,26 @@ def test_info():
     )
     assert lines[3].startswith("light 0: Point, p (-0.9, -1.3, 1.5), intensity (18, 18, 18)")
     assert lines[4].startswith("light 1: Sky, radiance (0.05, 0.07, 0.1)")
+
+
+def test_our_own_bug_keeps_its_traceback(tmp_path):
+    """Only what is known for the user's mistake becomes one line."""
+    script = """
+import sys
+import jaxhf.rendering.render
+from jaxhf.cli.main import main
+
+def broken(*_, **__):
+    raise ValueError("a bug")
+
+jaxhf.rendering.render.render = broken
+sys.exit(main(sys.argv[1:]))
+"""
+    run = python("-c", script, "render", SCENE, "-o", tmp_path / "out.png")
+    assert run.returncode == 1
+    lines = run.stderr.splitlines()
+    assert (lines[0], lines[-1]) == ("Traceback (most recent call last):", "ValueError: a bug")
+    assert "in broken" in run.stderr
 
 
 @pytest.mark.parametrize("error", [MemoryError("8 GiB"), RuntimeError("RESOURCE_EXHAUSTED: Out of memory")])

@@ -364,6 +364,6 @@ def test_what_fit_refuses_is_named_with_its_line(folder, name):
     np.save(folder / "nan.npy", np.array([[0.0, np.nan, 1.0], [0.0, 0.0, 1.0]]))
     np.save(folder / "nothing.npy", np.zeros((3, 4)))
     given = case(folder, text)
-    with pytest.raises(ValueError, match=r"^fit: ") as refused:
+    with pytest.raises(jaxhf.ArgumentError, match=r"^fit: ") as refused:
         jaxhf.fit(given.scenes, given.targets, weights=given.weights, noise=given.noise, **given.options)
     assert re.match(rf"{folder}/case\.toml{message}", str(given.located(refused.value)))

@@ -218,9 +218,9 @@ def test_lights(tmp_path):
     assert isinstance(distant, Directional)
     assert isinstance(default, Directional)
     np.testing.assert_array_equal(distant.towards, [-2, 0, 10])
-    np.testing.assert_array_equal(distant.radiance, [3, 4, 3])
+    np.testing.assert_array_equal(distant.irradiance, [3, 4, 3])
     np.testing.assert_array_equal(default.towards, [0, 0, -2])
-    np.testing.assert_array_equal(default.radiance, [1, 1, 1])
+    np.testing.assert_array_equal(default.irradiance, [1, 1, 1])
 
 
 def test_stratified_samples(tmp_path):

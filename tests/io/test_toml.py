@@ -158,7 +158,14 @@ def test_directional_lights(tmp_path, text, towards):
     (light,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "directional"\n{text}\n{FIELD}').lights
     assert isinstance(light, Directional)
     np.testing.assert_allclose(light.towards, towards, atol=1e-15)
-    np.testing.assert_array_equal(light.radiance, (np.pi,) * 3)
+    np.testing.assert_array_equal(light.irradiance, (np.pi,) * 3)
+
+
+def test_the_old_name_of_irradiance(tmp_path):
+    with pytest.warns(DeprecationWarning, match=r"scene\.toml:8: lights\[0\]\.radiance is now called irradiance$"):
+        (light,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "directional"\nradiance = [1, 2, 3]\n{FIELD}').lights
+    assert isinstance(light, Directional)
+    np.testing.assert_array_equal(light.irradiance, (1, 2, 3))
 
 
 def test_the_last_transform_acts_first(tmp_path):
@@ -292,10 +299,14 @@ MISTAKES = [
     (surface('material = "mirror"\nreflectance = [1, -0.5, 1]'), 11, "reflectance must be 0 or more, it is [1, -0.5, 1]"),
     (light('type = "sky"\nradiance = -3'), 12, "lights[0].radiance must be 0 or more, it is -3"),
     (light('type = "directional"\nradiance = -3'), 12, "lights[0].radiance must be 0 or more, it is -3"),
+    (light('type = "directional"\nirradiance = -3'), 12, "lights[0].irradiance must be 0 or more, it is -3"),
+    (light('type = "directional"\nirradiance = 3\nradiance = 3'), 13, "lights[0].radiance must stand without irradiance"),
     (light('type = "point"\nposition = [0, 0, 1]\nintensity = -3'), 13, "lights[0].intensity must be 0 or more, it is -3"),
     (texture('source = "checker"\nsize = [2, 2]\nfirst = -1'), 13, "textures.t.first must be 0 or more, it is -1"),
     (f"{CAMERA}{FIELD}[[pictures]]\n", 10, "'pictures' makes this a fit file, for `jaxhf fit`"),
     (f"{CAMERA}{FIELD}[fit]\nnoise = 1\n", 10, "'fit' makes this a fit file, for `jaxhf fit`"),
+    (field('source = "fractal"\nsize = [5, 5]\nseed = -1'), 10, "objects[0].seed must be non-negative, it is -1"),
+    (field('file = "a\\u0000.npy"'), 8, "objects[0].file: 'a\\x00.npy' is no file's name"),
     (field('source = "fractal"\nsize = 5'), 9, "objects[0].size must be a list of 2 whole numbers, rows and columns, it is 5"),
     (field('source = "fractal"\nsize = [5.0, 5]'), 9, "objects[0].size must be a list of 2 whole numbers"),
     (field("file = 3"), 8, "objects[0].file must be a string, it is 3"),

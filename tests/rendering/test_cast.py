@@ -9,6 +9,7 @@ import pytest
 from compare import COUNT, DOWN, DTYPES, ROUGH, SLACK, assert_none, compare_with_oracle, every_family, heightfield, numpied
 
 import jaxhf
+from jaxhf.rendering.cast import cast_camera
 
 SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
 
@@ -272,6 +273,18 @@ def test_rays_from_whole_numbers_start_there():
     expected, found = jaxhf.cast(field, o, d), jaxhf.cast(field, jnp.asarray(o), jnp.asarray(d))
     np.testing.assert_array_equal(found.p, expected.p)
     np.testing.assert_array_equal(found.p[:2], (0, 12))
+
+
+def test_a_camera_casts_in_the_frame_of_the_world():
+    """Its hits lie where `cast` finds those of the same rays, by a terrain far from the world's origin."""
+    field = jaxhf.Heightfield(MILD.heights, 0.5, 2.0, x0=5e5, y0=4.5e6)
+    camera = jaxhf.Perspective.look_at((5e5 + 1, 4.5e6 - 3, 6), (5e5 + 2, 4.5e6 + 6, 0), width=8, height=8)
+    x, y = np.array([3.5, 4.0, 4.5]), np.array([3.5, 4.5, 6.0])
+    seen = cast_camera(jaxhf.Scene([jaxhf.Object(field)], camera), x, y)
+    rays = jax.vmap(camera.ray)(jnp.asarray(x), jnp.asarray(y))
+    hit = jaxhf.cast(field, rays.o, rays.d)
+    assert (np.asarray(hit.status) == jaxhf.Status.HIT).all()
+    np.testing.assert_allclose(seen.p, hit.p, rtol=0, atol=1e-8)
 
 
 def test_under_jit_and_vmap():

@@ -104,7 +104,7 @@ BAD = [
     (directional([0, NAN, 1]), "Directional: towards must be finite, it is [ 0., nan,  1.]"),
     (directional([1, 2]), "Directional: towards must hold three numbers, its shape is (2,)"),
     (directional(1), "Directional: towards must hold three numbers, its shape is ()"),
-    (directional([0, 0, 1], [1, 2]), "Directional: radiance must hold three numbers, its shape is (2,)"),
+    (directional([0, 0, 1], [1, 2]), "Directional: irradiance must hold three numbers, its shape is (2,)"),
     (lambda: jaxhf.Directional.from_angles(NAN), "Directional: towards must be finite, it is "),
     (lambda: jaxhf.Point([1, 2]), "Point: p must hold three numbers, its shape is (2,)"),
     (lambda: jaxhf.Point([1, 2, INF]), "Point: p must be finite, it is [ 1.,  2., inf]"),
@@ -135,6 +135,8 @@ BAD = [
     (scene(camera="front"), "Scene: camera does not take a str"),
     (scene(lights=[CAMERA]), "Scene: lights does not take a Perspective"),
     (scene(lights=[jaxhf.Sky(1), jaxhf.Sky(2)]), "Scene: lights may hold one Sky, they hold more"),
+    (lambda: scene()().with_lights([CAMERA]), "Scene: lights does not take a Perspective"),
+    (lambda: scene()().with_camera("front"), "Scene: camera does not take a str"),
     (scene(samples=0), "Scene: samples must be a whole number from 1 on, it is 0"),
     (scene(samples=2.0), "Scene: samples must be a whole number from 1 on, it is 2.0"),
     (settings(traversal="fast"), "Settings: traversal must be one of "),
@@ -162,10 +164,22 @@ BAD = [
 def test_bad_input_is_refused(make, message):
     jaxtyping.config.update("jaxtyping_disable", True)  # as a user has it: nobody checks the annotations
     try:
-        with pytest.raises(ValueError, match=f"^{re.escape(message)}"):
+        with pytest.raises(jaxhf.ArgumentError, match=f"^{re.escape(message)}") as refused:
             make()
+        assert refused.value.argument == message.partition(": ")[2].partition(" ")[0]
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.mark.parametrize("make", [lambda **more: jaxhf.Directional((0, 0, 1), **more), jaxhf.Directional.from_angles])
+def test_the_old_name_of_irradiance(make):
+    with pytest.warns(DeprecationWarning, match="radiance is now called irradiance"):
+        light = make(radiance=(1, 2, 3))
+    np.testing.assert_array_equal(light.irradiance, (1, 2, 3))
+    with pytest.raises(jaxhf.ArgumentError, match="radiance must stand without irradiance") as refused:
+        make(radiance=1, irradiance=1)
+    assert refused.value.argument == "radiance"
+    assert dataclasses.replace(light, towards=(0, 1, 0)).irradiance is light.irradiance
 
 
 def test_settings_are_frozen_and_hashable():
@@ -217,7 +231,7 @@ def test_whole_numbers_in_jax_become_floats(dtype):
     """Whatever moves them later would lose its fractions."""
     three, square = jnp.array([0, 0, 1], dtype), jnp.eye(4).astype(dtype)
     leaves: tuple[Any, ...] = (
-        jaxhf.Point(three, three).p, jaxhf.Point(three, three).intensity, jaxhf.Directional(three, three).radiance,
+        jaxhf.Point(three, three).p, jaxhf.Point(three, three).intensity, jaxhf.Directional(three, three).irradiance,
         jaxhf.Matte(three).albedo, jaxhf.Matte(jnp.array(1, dtype)).albedo, jaxhf.Cylinder(jnp.array(1, dtype)).radius,
         jaxhf.Object(FIELD, None, square).world_from_object, jaxhf.Perspective(square).world_from_camera,
     )  # fmt: skip
@@ -242,6 +256,66 @@ def test_defaults():
     made = jaxhf.Scene([OBJECT], CAMERA)
     assert (made.lights, made.samples) == ((), 1)
     assert (CAMERA.fov, CAMERA.width, CAMERA.height) == (45, 512, 512)
+
+
+SHOWN = [
+    (
+        jaxhf.Perspective.look_at((4.5e6 + 0.25, 0, 2), (4.5e6 + 0.25, 0, 0), up=(0, 1, 0), width=640, height=480),
+        "Perspective(eye=(4500000.25, 0, 2), looking=(0, 0, -1), fov=45, 640 x 480)",
+    ),
+    (jaxhf.Orthographic(np.eye(4), 1 / 63), "Orthographic(eye=(0, 0, 0), looking=(0, 0, 1), extent=0.0159, 512 x 512)"),
+    (jaxhf.Directional((0, 0.5, 1)), "Directional(towards=(0, 0.5, 1), irradiance=(3.142, 3.142, 3.142))"),
+    (jaxhf.Point(jnp.array([1, 2, 3])), "Point(p=(1, 2, 3), intensity=(1, 1, 1))"),
+    (jaxhf.Sky(1e-5), "Sky(radiance=(1e-05, 1e-05, 1e-05))"),
+    (jaxhf.Matte((0.2, 0.3, 0.4)), "Matte(albedo=(0.2, 0.3, 0.4))"),
+    (jaxhf.Matte(jaxhf.ImageTexture(jnp.ones((2, 4, 3)))), "Matte(albedo=ImageTexture(texels=f64[2,4,3]))"),
+    (jaxhf.Cylinder(), "Cylinder(radius=1, z_min=-1, z_max=1)"),
+    (
+        jaxhf.Heightfield([[300, NAN, 900], [1, 2, 3]], dx=30.0, x0=7.0),
+        "Heightfield(2 x 3, dx=30, dy=30, x0=7, y0=0, heights 1 .. 900)",
+    ),
+    (
+        jaxhf.Heightfield(np.full((2, 2), NAN)),
+        "Heightfield(2 x 2, dx=1, dy=1, x0=0, y0=0, heights nan .. nan)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("part", "text"), SHOWN, ids=[text.partition("(")[0] for _, text in SHOWN])
+def test_parts_print_their_numbers(part, text):
+    assert repr(part) == text
+
+
+def test_a_scene_prints_whatever_its_leaves_are():
+    """Traced, batched, shapes alone, nothing: a message about them must not end in another error."""
+    made = jaxhf.Scene([OBJECT, jaxhf.Object(jaxhf.Cylinder(), jaxhf.Mirror(), np.eye(4))], CAMERA, [jaxhf.Sky(1)])
+    assert repr(made).startswith("Scene(objects=(Object(Heightfield(2 x 3,")
+    seen = []
+
+    @jax.jit
+    def traced(scene):
+        seen.append(repr(scene))
+        return jax.vmap(lambda scene: seen.append(repr(scene)) or 0)(jax.tree.map(lambda leaf: leaf[None], scene))
+
+    traced(jax.tree.map(jnp.asarray, made))
+    seen += [repr(jax.tree.map(lambda leaf, to=to: to, made)) for to in (None, True, object())]
+    seen.append(repr(jax.eval_shape(lambda: jax.tree.map(jnp.asarray, made))))
+    deleted = jax.tree.map(jnp.array, made)
+    for leaf in jax.tree.leaves(deleted):
+        leaf.delete()
+    seen.append(repr(deleted))
+    assert "Heightfield(f64[2,3], dx=0.5, dy=1, x0=0, y0=0)" in seen[0]
+    assert "Perspective(world_from_camera=f64[4,4], fov=f64[], 512 x 512)" in seen[-1]
+    assert all(text.startswith("Scene(") for text in seen)
+
+
+def test_a_scene_with_another_camera_or_light():
+    made = jaxhf.Scene([OBJECT], CAMERA, [jaxhf.Sky(1)], samples=4)
+    other, light = jaxhf.Orthographic(np.eye(4)), jaxhf.Point((1, 2, 3))
+    changed = made.with_camera(other).with_lights([light])
+    assert changed.camera is other
+    assert changed.lights == (light,)
+    assert (changed.objects, changed.samples) == (made.objects, 4)
 
 
 def test_positions_keep_double_precision():

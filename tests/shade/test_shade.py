@@ -90,7 +90,7 @@ def test_directions_from_azimuth_and_altitude(azimuth, altitude, towards):
 def test_default_light_is_that_of_maps():
     light, default = jaxhf.Directional.from_angles(315, 45), jaxhf.Directional.from_angles()
     np.testing.assert_array_equal(default.towards, light.towards)
-    np.testing.assert_array_equal(default.radiance, np.full(3, np.pi))
+    np.testing.assert_array_equal(default.irradiance, np.full(3, np.pi))
 
 
 def test_point_light_falls_off_with_the_square():

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...core.affine import rotate, scale, translate
+from ...core.errors import UserError
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
 from ...scene.light import Directional, Light, Point
@@ -74,12 +75,12 @@ def _look_at(*numbers: float) -> Matrix:
     """camera_from_world of pbrt-v2: x right, y up, z forward, left-handed in a right-handed world."""
     eye, target, up = np.reshape(numbers, (3, 3))
     if not np.any(target - eye):
-        raise ValueError(f"LookAt: the target must differ from the eye, both are {eye.tolist()}")
+        raise UserError(f"LookAt: the target must differ from the eye, both are {eye.tolist()}")
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(up, forward)
     length = np.linalg.norm(right)
     if not length > 1e-9 * np.linalg.norm(up):
-        raise ValueError(f"LookAt: up must not point along the view, it is {up.tolist()} for the view {forward.tolist()}")
+        raise UserError(f"LookAt: up must not point along the view, it is {up.tolist()} for the view {forward.tolist()}")
     right = right / length
     world_from_camera = np.eye(4)
     world_from_camera[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)

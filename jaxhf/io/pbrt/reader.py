@@ -170,10 +170,10 @@ class _Reader:
                 matrix = make(*statement.numbers(count))
             else:
                 matrix = statement.matrix()
-            require_invertible(word.text, matrix)
+            require_invertible("", word.text, matrix)
             if word.text != "Transform":
                 matrix = self.graphics.world_from_object @ matrix
-                require_invertible("the current transformation", matrix)
+                require_invertible("", "the current transformation", matrix)
             self._set_transform(matrix)
 
     def _identity(self, statement: Statement) -> None:

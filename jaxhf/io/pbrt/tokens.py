@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from ...core.errors import UserError
 from ..errors import SceneError, nearest
 
 _NUMBER = r"[-+]?(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][-+]?[0-9]++)?"
@@ -102,7 +103,7 @@ def located(token: Token) -> Iterator[None]:
         yield
     except SceneError:
         raise
-    except (ValueError, OSError) as error:
+    except (UserError, OSError) as error:
         raise token.error(str(error)) from error
 
 

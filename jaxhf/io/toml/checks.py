@@ -1,11 +1,11 @@
 """Checks on the tables of a TOML scene; each of them ends with the line on which things went wrong."""
 
 import difflib
-import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ...core.errors import ArgumentError, UserError
 from ..errors import SceneError, nearest
 from .lines import Where
 from .tables import Keys
@@ -81,17 +81,16 @@ class Part(NamedTuple):
         return present[0]
 
     def made(self, function: Callable[..., Any], *args: Any, **values: Any) -> Any:
-        """function(*args, **values); its ValueError becomes a SceneError, on the line of the key that its message names."""
+        """function(*args, **values); what the user got wrong becomes a SceneError, on the line of the key that is to blame."""
         try:
             return function(*args, **values)
         except SceneError:
             raise
-        except (ValueError, FileNotFoundError) as error:
-            message, place = str(error), self
-            named = re.match(r"(?:\w+: )?(\w+) (?=must|may)", message)
-            if named and named[1] in self.table:
-                place = self.at(named[1])
-                message = f"{place.name} {message[named.end() :]}"
-            elif self.where and not message.startswith(self.name):
-                message = f"{self.name}: {message}"
-            raise place.error(message) from error
+        except (UserError, FileNotFoundError) as error:
+            if isinstance(error, ArgumentError) and error.argument in self.table:
+                place = self.at(error.argument)
+                raise place.error(f"{place.name} {error.rule}") from error
+            message = str(error)
+            raise self.error(
+                f"{self.name}: {message}" if self.where and not message.startswith(self.name) else message
+            ) from error

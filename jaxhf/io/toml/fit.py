@@ -1,7 +1,6 @@
 """Reads what to recover from which pictures: a scene with tables about pictures; `docs/fitting.md` describes the file."""
 
 import dataclasses
-import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
+from ...core.errors import ArgumentError, UserError
 from ...core.settings import Settings
 from ...scene.camera import Camera
 from ...scene.heightfield import Heightfield
@@ -88,17 +88,16 @@ class Case:
     like: Path | None
     part: Part
 
-    def located(self, error: ValueError) -> ValueError:
+    def located(self, error: ArgumentError) -> UserError:
         """An error of `fit`'s about its arguments, on the line where they stand; others as they are."""
-        about_picture = re.match(r"fit: (?:targets|weights|scenes)\[(\d+)\]:? (.*)", str(error), re.DOTALL)
-        about_option = re.match(r"fit: (\w+) (.*)", str(error), re.DOTALL)
-        if about_picture:
-            place = self.part.at("pictures", int(about_picture[1]))
-            return place.error(f"{place.name} {about_picture[2]}")
-        if about_option and about_option[1] in _FIT:
-            place = self.part.at("fit", about_option[1])
-            return place.error(f"{place.name} {about_option[2]}")
-        return error
+        name, _, index = error.argument.removesuffix("]").partition("[")
+        if index:  # of a picture: its scene, its target or its weights
+            place = self.part.at("pictures", int(index))
+        elif name in _FIT:
+            place = self.part.at("fit", name)
+        else:
+            return error
+        return place.error(f"{place.name} {error.rule}")
 
 
 class _Base(NamedTuple):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from ..errors import FileError
 from ..load_terrain import read_terrain
 from ..resample import at_vertices
 from ..terrain import Terrain
@@ -61,12 +62,12 @@ def known_heights(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
     heights, grid = terrain.heights, sought.grid(path, terrain)
     if terrain.crs is not None and grid is not None and grid.crs is not None:
         if terrain.crs.degrees and not grid.crs.degrees:
-            raise ValueError("it must lie in the coordinates of the terrain, it lies in degrees")
+            raise FileError("it must lie in the coordinates of the terrain, it lies in degrees")
         heights = at_vertices(terrain, grid)
     holes = np.argwhere(np.isnan(heights))
     if len(holes):
         iy, ix = holes[0].tolist()
-        raise ValueError(
+        raise FileError(
             f"it must have a height everywhere, {len(holes)} of {heights.size} are holes; the first is row {iy} column {ix}"
         )
     return heights

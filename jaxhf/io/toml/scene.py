@@ -6,6 +6,7 @@ are errors.
 
 import re
 import tomllib
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ...core.affine import require_invertible
+from ...core.errors import ArgumentError
 from ...scene.camera import Camera
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
-from ...scene.light import Light
+from ...scene.light import Directional, Light
 from ...scene.scene import Object, Scene
 from ...scene.texture import ImageTexture
 from .. import procedural
@@ -79,7 +81,15 @@ def read_camera(part: Part) -> Camera:
 
 def read_lights(part: Part, tables: list[dict[str, Any]]) -> list[Light]:
     """The lights in the list `lights` of `part`."""
-    return [_variant(part.at("lights", k, table=table), "type", LIGHTS) for k, table in enumerate(tables)]
+    return [_light(part.at("lights", k, table=table)) for k, table in enumerate(tables)]
+
+
+def _light(part: Part) -> Light:
+    light = _variant(part, "type", LIGHTS)
+    if isinstance(light, Directional) and "radiance" in part.table:
+        old = part.at("radiance")
+        warnings.warn(str(old.error(f"{old.name} is now called irradiance")), DeprecationWarning, stacklevel=2)
+    return light
 
 
 def read_objects(part: Part, values: dict[str, Any], dtype: np.dtype) -> list[tuple[Object, Terrain | None]]:
@@ -130,8 +140,7 @@ def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
         return None
     if len(given) > 1:
         raise part.at("matrix").error(f"{part.name} must have transform or matrix, it has both")
-    place = part.at(given[0])
-    place.made(require_invertible, place.name, values[given[0]])
+    part.made(require_invertible, "", given[0], values[given[0]])
     return values[given[0]]
 
 
@@ -152,7 +161,7 @@ def _field_keys(part: Part, common: Keys) -> Keys:
 
 def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> tuple[Heightfield, Terrain | None]:
     if values["z_scale"] == 0:
-        raise ValueError("z_scale must not be zero, it is 0")
+        raise ArgumentError("", "z_scale", "must not be zero, it is 0")
     source = values.get("source")
     grid = {name: values[name] for name in ("dx", "dy", "x0", "y0") if values[name] is not None}
     if "file" in values or source == "jacksboro":

@@ -1,10 +1,10 @@
 """Which keys the tables of a TOML scene take, and what is made of them. `docs/scene-files.md` explains them all."""
 
 import inspect
-import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+from ...core.errors import ArgumentError
 from ...scene.camera import Camera, Orthographic, Perspective
 from ...scene.light import Directional, Light, Point, Sky
 from ...scene.material import Material, Matte, Mirror
@@ -36,12 +36,17 @@ class Key(NamedTuple):
 Keys = Mapping[str, Key]
 
 
-def _directional(towards, azimuth, altitude, radiance) -> Directional:
+def _directional(towards, azimuth, altitude, irradiance, radiance) -> Directional:
+    if irradiance is not None and radiance is not None:
+        raise ArgumentError("", "radiance", "must stand without irradiance, whose old name it is")
+    irradiance = radiance if irradiance is None else irradiance
     if towards is None:
-        return Directional.from_angles(315.0 if azimuth is None else azimuth, 45.0 if altitude is None else altitude, radiance)
+        return Directional.from_angles(
+            315.0 if azimuth is None else azimuth, 45.0 if altitude is None else altitude, irradiance
+        )
     if azimuth is not None or altitude is not None:
-        raise ValueError("towards must stand without azimuth and altitude, it says the same")
-    return Directional(towards, radiance)
+        raise ArgumentError("", "towards", "must stand without azimuth and altitude, it says the same")
+    return Directional(towards, irradiance)
 
 
 def _point(position, intensity) -> Point:
@@ -73,7 +78,8 @@ LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
             "towards": Key(numbers(3), None),
             "azimuth": Key(number, None),
             "altitude": Key(number, None),
-            "radiance": Key(colour, math.pi),
+            "irradiance": Key(colour, None),
+            "radiance": Key(colour, None),  # the old name of irradiance
         },
     ),
     "point": (_point, {"position": Key(numbers(3)), "intensity": Key(colour)}),
