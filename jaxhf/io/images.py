@@ -7,7 +7,7 @@ length and against `MAX_PIXELS` before anything is decoded.
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
@@ -50,12 +50,13 @@ def _load(path: PathLike, decode: Callable[[np.ndarray], np.ndarray]) -> np.ndar
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
-def save_image(path: PathLike, image: Any) -> None:
+def save_image(path: PathLike, image: Any, *, transfer: Literal["srgb", "linear"] = "srgb") -> None:
     """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
 
-    Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8-bit sRGB of the values clipped to 0..1;
-    nan becomes 0. .exr and .pfm: float32. .npy: in the precision of `image`. The last three keep nan and inf. The file
-    appears whole or not at all: what was there before stays until its successor is complete.
+    Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8 bits of the values clipped to 0..1, by
+    the curve of sRGB or, with transfer="linear", in proportion as in printed maps; nan becomes 0. .exr and .pfm: float32.
+    .npy: in the precision of `image`. The last three keep nan and inf. The file appears whole or not at all: what was there
+    before stays until its successor is complete.
 
     Raises:
       FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of floats.
@@ -68,6 +69,8 @@ def save_image(path: PathLike, image: Any) -> None:
         raise ValueError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
         raise ValueError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
+    if path.suffix.lower() == ".png" and transfer == "linear":
+        pixels = linear_from_srgb(np.clip(pixels, 0, 1))
     with replacing(path) as temporary:
         _WRITERS[path.suffix.lower()](temporary, pixels)
 
