@@ -46,7 +46,7 @@ class Settings:
             "metavar": "SCHEME",
         },
     )
-    shadows: bool = field(default=True, metadata={"help": "shadows, under every light but the sky"})
+    shadows: bool = field(default=True, metadata={"help": "shadows of every light but the sky, which casts none"})
     samples: int | None = field(
         default=None,
         metadata={

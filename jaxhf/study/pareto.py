@@ -49,7 +49,7 @@ def recommend(measured: Sequence[Measured], error: float | None, seconds: float 
     return lines
 
 
-def front_lines(measured: Sequence[Measured]) -> list[str]:
+def pareto_lines(measured: Sequence[Measured]) -> list[str]:
     """Each task's front, in words."""
     lines = []
     for task in ERRORS:
