@@ -90,7 +90,8 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
         with bar(bar_format="{desc}", desc="compiling") as shown:
 
             def progress(step: "Step") -> None:
-                shown.set_description_str(f"step {step.step}: {step.level} modes, loss {step.loss:.6g}, {step.seconds:.1f} s")
+                at = f"step {step.step}: {step.level} DCT modes a side"
+                shown.set_description_str(f"{at}, loss {step.loss:.6g}, {step.seconds:.1f} s")
 
             found = fit(
                 case.scenes, case.targets, settings=case.settings, weights=case.weights, noise=case.noise,

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
 def add(commands: Any) -> None:
     about = (
         "Sweep each setting over a scene: error against a reference in double precision, time, compilation and peak memory; "
-        "print which settings nothing beats, and keep a table and a plot. What was measured is kept: the same command goes on "
-        "after Ctrl-C, and only prints when all is there. It says how long it will take."
+        "print the Pareto front of the settings, and keep a table and a plot. What was measured is kept: the same command "
+        "goes on after Ctrl-C, and only prints when all is there. It says how long it will take."
     )
     command = commands.add_parser("tradeoff", help="measure what each setting costs and gains", description=about)
     command.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
@@ -31,11 +31,11 @@ def add(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> None:
     from ..core.extras import require_matplotlib
-    from ..study.pareto import markdown, pareto_lines, recommend
+    from ..study.pareto import advice, markdown
     from ..study.plan import plan
     from ..study.plots import save_plot
 
-    for name in ("error", "time", "repeats"):
+    for name in ("error", "time", "repeats", "width", "devices"):
         value = getattr(options, name)
         if value is not None and not value > 0:
             raise ValueError(f"--{name} must be positive, it is {value}")
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace) -> None:
     if options.markdown:
         print(markdown(measured), end="\n\n")
     if asks or not options.markdown:
-        print("\n".join(recommend(measured, options.error, options.time) if asks else pareto_lines(measured)))
+        print("\n".join(advice(measured, options.error, options.time)))
     print(f"{len(measured)} configurations: {sweep.table}, {plot}")
     if failures:
         raise ValueError(f"{len(failures)} configurations failed")

@@ -245,5 +245,5 @@ def test_steps_are_shown_on_a_terminal(folder, monkeypatch, capsys):
     shown = [part.rstrip() for part in capsys.readouterr().err.split("\r")]
     assert [part for part in shown if part] == [
         "compiling",
-        *(f"step {k}: 9 modes, loss {10.0**-k:g}, {k / 2} s" for k in (1, 2, 3)),
+        *(f"step {k}: 9 DCT modes a side, loss {10.0**-k:g}, {k / 2} s" for k in (1, 2, 3)),
     ]
