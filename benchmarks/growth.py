@@ -14,14 +14,13 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxhf.core.machine import available_bytes, peak_mb
-from jaxhf.study.worker import MeasurementError, Worker, serve, timed
+from jaxhf.study.worker import Answers, MeasurementError, Worker, timed
 
 BASE = {"heights": 1024, "pixels": 512, "samples": 1, "images": 1}
 UNITS = {"heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores"}
@@ -45,7 +44,8 @@ def waves(size: int, count: int = 48) -> np.ndarray:
     return rows @ columns.T
 
 
-def prepare(job: dict[str, Any]) -> Mapping[str, Callable[[], Mapping[str, Any]]]:
+def prepare(job: dict[str, Any]) -> Answers:
+    os.sched_setaffinity(0, job["cores"])
     import jax
     from forward import CAMERAS, LIGHTS
 
@@ -92,7 +92,7 @@ def prepare(job: dict[str, Any]) -> Mapping[str, Callable[[], Mapping[str, Any]]
 def measure(quantity: str, value: int, cores: list[int], repeats: int) -> dict[str, Any]:
     job = BASE | {quantity: value} if quantity in BASE else dict(BASE)
     used = cores[:value] if quantity == "devices" else cores
-    with Worker(__file__, job | {"devices": len(used)}, set(used)) as worker:
+    with Worker(prepare, job | {"devices": len(used), "cores": used}) as worker:
         peak = worker.answer()["peak_mb"]
         frames = [worker.ask("frame")["seconds"] for _ in range(repeats)]
         worker.ask("prepared")
@@ -200,7 +200,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if "--serve" in sys.argv:
-        serve(prepare)
-    else:
-        main()
+    main()

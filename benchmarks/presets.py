@@ -1,4 +1,4 @@
-"""The curves that chose the presets: error over samples, over points on edges and over time on four scenes.
+"""The plots that chose the presets: error over samples, over points on edges and over time on four scenes.
 
 Each scene is swept by the command `tradeoff` over these two knobs alone, the derivative over its points only, with four
 samples; what was measured before is not measured again.
@@ -9,16 +9,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jaxhf
-from jaxhf.study.plan import Measured, Sweep, plan
-from jaxhf.study.plots import screenless_pyplot
+from jaxhf.study.plan import Configuration, Sweep, plan
 from jaxhf.study.sweep import run
 
 SCENES = ("jacksboro", "landsea", "texture", "debug4x4")
 PRESETS = {"draft": jaxhf.Settings.draft(), "balanced": jaxhf.Settings.balanced(), "exact": jaxhf.Settings.exact()}
 
 
-def by_samples(measured: Sequence[Measured]) -> dict[int, dict[str, float]]:
-    return dict(sorted((int(row.knobs["samples"]), row.figures) for row in measured))
+def by_samples(measured: Sequence[Configuration]) -> dict[int, dict[str, float]]:
+    return dict(sorted((row.settings.samples or 0, row.figures) for row in measured))
 
 
 def table(found: dict[str, dict[int, dict[str, float]]]) -> str:
@@ -33,8 +32,8 @@ def table(found: dict[str, dict[int, dict[str, float]]]) -> str:
     return "\n".join(lines)
 
 
-def by_points(measured: Sequence[Measured]) -> dict[int, dict[str, float]]:
-    return dict(sorted((int(row.knobs["edge_samples"]), row.figures) for row in measured if row.task == "derivative"))
+def by_points(measured: Sequence[Configuration]) -> dict[int, dict[str, float]]:
+    return dict(sorted((row.settings.edge_samples, row.figures) for row in measured if row.task == "derivative"))
 
 
 def derivative_table(found: dict[str, dict[int, dict[str, float]]]) -> str:
@@ -55,8 +54,10 @@ def derivative_table(found: dict[str, dict[int, dict[str, float]]]) -> str:
 def plot(
     found: dict[str, dict[int, dict[str, float]]], derivatives: dict[str, dict[int, dict[str, float]]], path: Path
 ) -> None:
-    plt = screenless_pyplot()
-    figure, (by_count, by_time, by_edges) = plt.subplots(1, 3, figsize=(15, 4.5), layout="constrained")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 4.5), layout="constrained")
+    by_count, by_time, by_edges = figure.subplots(1, 3)
     for scene, rows in found.items():
         errors = [figures["rmse"] for figures in rows.values()]
         by_count.plot(list(rows), errors, "o-", label=scene)
@@ -96,7 +97,7 @@ def main() -> None:
     scenes = Path(__file__).parents[1] / "scenes"
     found, derivatives = {}, {}
 
-    def swept(name: str, knob: str) -> list[Measured]:
+    def swept(name: str, knob: str) -> list[Configuration]:
         sweep: Sweep = plan(scenes / f"{name}.toml", options.output / name, width=options.width, knobs=(knob,))
         failures = run(sweep, options.repeats, lambda line: print(line, flush=True), lambda done, total, what: None)
         assert not failures, failures

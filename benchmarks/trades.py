@@ -10,9 +10,7 @@ medians of pairs. "difference" is the RMSE of the picture to the first variant's
 import argparse
 import json
 import os
-import sys
 import tempfile
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,7 @@ import numpy as np
 from seeds import SCENES
 
 from jaxhf.core.machine import peak_mb
-from jaxhf.study.worker import Worker, serve, timed
+from jaxhf.study.worker import Answers, Worker, timed
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "pyramid, triangles on demand, normals of six, smooth": {},
@@ -91,12 +89,13 @@ def with_stored_triangles() -> None:
     _world.make_grid = grid_of
 
 
-def prepare(job: dict[str, Any]) -> Mapping[str, Callable[[], Mapping[str, Any]]]:
+def prepare(job: dict[str, Any]) -> Answers:
+    os.sched_setaffinity(0, job["cores"])
     import jax
 
     import jaxhf
 
-    jax.config.update("jax_num_cpu_devices", job["devices"])
+    jax.config.update("jax_num_cpu_devices", len(job["cores"]))
     variant = VARIANTS[job["variant"]]
     if not variant.get("bounds", True):
         without_bounds()
@@ -125,8 +124,7 @@ def measure(scene: Path, cores: list[int], repeats: int, names: list[str]) -> li
     with tempfile.TemporaryDirectory() as folder:
 
         def start(name: str, k: int) -> Worker:
-            job = {"scene": str(scene), "variant": name, "devices": len(cores), "picture": f"{folder}/{k}.npy"}
-            return Worker(__file__, job, set(cores))
+            return Worker(prepare, {"scene": str(scene), "variant": name, "cores": cores, "picture": f"{folder}/{k}.npy"})
 
         with start(names[0], 0) as base:
             base.answer()
@@ -188,7 +186,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if "--serve" in sys.argv:
-        serve(prepare)
-    else:
-        main()
+    main()

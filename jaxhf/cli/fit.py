@@ -1,23 +1,33 @@
-"""What `jaxhf fit` does: a file's pictures to files of heights, watched on a terminal and safe from interruption."""
+"""`jaxhf fit`: a file's pictures to files of heights, watched on a terminal and safe from interruption."""
 
+import argparse
 import dataclasses
-import sys
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from ..core.errors import ArgumentError
-from ..core.extras import import_extra
-from ..fitting.fit import Fit, fit
-from ..fitting.history import Step
-from ..io.errors import FileError
-from ..io.files import require_writable_text, save_text
-from ..io.images import save_image
-from ..io.save_terrain import require_writable_heights, save_heights
-from ..io.terrain import Terrain
-from ..io.toml.fit import Case, load_case
-from .fit_report import report
+from . import arguments
+
+if TYPE_CHECKING:
+    from ..fitting.fit import Fit
+    from ..fitting.history import Step
+    from ..io.toml.fit import Case
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("fit", help="recover heights from pictures", description="Recover heights from pictures.")
+    command.add_argument("case", metavar="CASE", help="a .toml file: a scene, its pictures, and what is known")
+    command.add_argument("-o", "--output", required=True, metavar="OUT", help="the heights: .npy, .npz or .tif")
+    command.add_argument("--report", metavar="PAGE", help="an .html page with plots of heights, pictures and convergence")
+    command.add_argument("--resume", action="store_true", help="go on from OUT.checkpoint, if it is there")
+    arguments.add_machine(command)
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    outputs = Outputs(Path(options.output), Path(options.report) if options.report else None, options.resume)
+    arguments.set_up_jax(options.precision, options.devices)
+    print(fit_file(options.case, outputs, options.precision))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +45,11 @@ class Outputs:
     resume: bool
 
     def __post_init__(self):
+        from ..core.extras import import_extra
+        from ..io.errors import FileError
+        from ..io.files import require_writable_text
+        from ..io.save_terrain import require_writable_heights
+
         for path in (self.heights, self.std):
             require_writable_heights(path)
         if self.report is not None:
@@ -65,10 +80,21 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
       FileNotFoundError, ValueError: anything that is wrong in the file, before anything is traced.
       KeyboardInterrupt: Ctrl-C; its text says how to go on.
     """
+    import numpy as np
+
+    from ..fitting.fit import fit
+    from ..io.toml.fit import load_case
+    from .progress import bar
+
     case = load_case(path, np.dtype(precision))
     options: dict[str, Any] = {"checkpoint": outputs.checkpoint, "resume": outputs.resume, **case.options}
     try:
-        with _Progress() as progress:
+        with bar(bar_format="{desc}", desc="compiling") as shown:
+
+            def progress(step: "Step") -> None:
+                at = f"step {step.step}: {step.level} DCT modes a side"
+                shown.set_description_str(f"{at}, loss {step.loss:.6g}, {step.seconds:.1f} s")
+
             found = fit(
                 case.scenes, case.targets, settings=case.settings, weights=case.weights, noise=case.noise,
                 progress=progress, **options,
@@ -96,7 +122,15 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
     return "\n".join(lines)
 
 
-def _write(path: str, case: Case, found: Fit, outputs: Outputs) -> None:
+def _write(path: str, case: "Case", found: "Fit", outputs: Outputs) -> None:
+    import numpy as np
+
+    from ..io.files import save_text
+    from ..io.images import save_image
+    from ..io.save_terrain import save_heights
+    from ..io.terrain import Terrain
+    from .fit_report import report
+
     field = case.scenes[0].heightfields[0]
     for place, heights in ((outputs.heights, found.heights), (outputs.std, found.std)):
         if heights is not None:
@@ -108,26 +142,3 @@ def _write(path: str, case: Case, found: Fit, outputs: Outputs) -> None:
     if outputs.report is not None:
         page = report(f"Heights from {path}", found, field, case.targets, case.noise, case.names)
         save_text(outputs.report, page)
-
-
-class _Progress:
-    """One line that changes with each step, on a terminal only."""
-
-    def __init__(self) -> None:
-        self.shown = sys.stderr.isatty()
-
-    def __enter__(self) -> "_Progress":
-        self._show("compiling")
-        return self
-
-    def __call__(self, step: Step) -> None:
-        self._show(f"step {step.step}: {step.level} waves, loss {step.loss:.6g}, {step.seconds:.1f} s")
-
-    def __exit__(self, *_: object) -> None:
-        self._show("")
-        if self.shown:
-            print("\r", end="", file=sys.stderr, flush=True)
-
-    def _show(self, text: str) -> None:
-        if self.shown:
-            print(f"\r{text:70}", end="", file=sys.stderr, flush=True)

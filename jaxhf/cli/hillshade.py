@@ -1,26 +1,58 @@
-"""Shaded maps: terrain from straight above, north up."""
+"""`jaxhf hillshade`: a shaded map, the terrain from straight above, north up."""
 
-import numpy as np
-from jaxtyping import Float
+import argparse
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 from ..core.errors import ArgumentError, UserError
-from ..core.types import AnyArray
-from ..io.images import linear_from_srgb
-from ..io.terrain import Terrain
-from ..scene.light import Directional, Sky
-from ..scene.material import Matte
-from ..scene.scene import Object, Scene
-from ..scene.views import from_above
+from . import arguments
+from .render import draw
+
+if TYPE_CHECKING:
+    from ..io.terrain import Terrain
+    from ..scene.scene import Scene
+
+
+def add(commands: Any) -> None:
+    about = "Draw a shaded map: the terrain from straight above, north up, a pixel for each cell."
+    command = commands.add_parser("hillshade", help="draw a shaded map of a terrain", description=about)
+    command.add_argument("terrain", metavar="TERRAIN", help="heights: .npy, .npz, .png (16 bits) or .tif")
+    command.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="the picture: .png (bytes in proportion), .exr, .npy or .pfm"
+    )
+    command.add_argument(
+        "--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the light, from north, clockwise [315]"
+    )
+    command.add_argument("--altitude", type=float, default=45.0, metavar="DEGREES", help="of the light, above the horizon [45]")
+    command.add_argument(
+        "--sky", type=float, default=0.0, metavar="RADIANCE", help="light from everywhere, also seen through holes [0]"
+    )
+    arguments.add_size(command)
+    arguments.add_settings(command, ("shadows", "samples"), samples="1")
+    arguments.add_raster(command)
+    arguments.add_machine(command)
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    from ..io.load_terrain import load_heights
+
+    def load() -> "Scene":
+        terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+        terrain = replace(terrain, heights=terrain.heights.astype(options.precision))
+        return hillshade_scene(terrain, options.azimuth, options.altitude, options.sky, *arguments.size(options))
+
+    draw(options, load, transfer="linear")
 
 
 def hillshade_scene(
-    terrain: Terrain,
+    terrain: "Terrain",
     azimuth: float = 315.0,
     altitude: float = 45.0,
     sky: float = 0.0,
     width: int | None = None,
     height: int | None = None,
-) -> Scene:
+) -> "Scene":
     """A white map in light as cartographers give it; of one pixel a cell across, unless its size is given.
 
     Level ground has the radiance sin(altitude) + sky.
@@ -34,9 +66,14 @@ def hillshade_scene(
     Raises:
       ValueError: the light is not above the horizon, the sky is not 0 or more, or there is no height.
     """
+    from ..scene.light import Directional, Sky
+    from ..scene.material import Matte
+    from ..scene.scene import Object, Scene
+    from ..scene.views import from_above
+
     if not 0 < altitude <= 90:
         raise ArgumentError("hillshade", "altitude", f"must be above 0 and at most 90 degrees, it is {altitude}")
-    if not 0 <= sky < np.inf:
+    if not 0 <= sky < float("inf"):
         raise ArgumentError("hillshade", "sky", f"must be 0 or more, it is {sky}")
     if terrain.nodata.all():
         raise UserError("hillshade: there is no height in the terrain")
@@ -45,8 +82,3 @@ def hillshade_scene(
     if width is None and height is None:
         width = terrain.heights.shape[1] - 1
     return Scene([Object(field, Matte(1.0))], from_above(field, width, height), lights, samples=1)
-
-
-def printed(image: Float[AnyArray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """The map for a .png whose bytes are to be 255 times its radiance, as GDAL and printed maps have them, not its sRGB."""
-    return linear_from_srgb(np.clip(np.asarray(image), 0, 1))

@@ -1,8 +1,11 @@
 """The settings of the renderer: what trades accuracy for speed."""
 
 import dataclasses
+import inspect
 import math
-from typing import Literal, get_args
+import textwrap
+from dataclasses import field
+from typing import Any, Literal, get_args
 
 from .errors import ArgumentError
 
@@ -15,32 +18,61 @@ NormalScheme = Literal["central", "four", "six", "six-angle", "six-equal"]
 class Settings:
     """How a scene is rendered. Frozen and hashable, so that it can be a static argument of a compiled function.
 
-    Attributes:
-      traversal: "pyramid", a walk that passes over blocks of cells of all sizes by their bounds (Tevs et al. 2008);
-        "dda", over single cells (Amanatides and Woo 1987). Both find the same hits, bit for bit.
-      max_steps: the step budget of one walk, see `first_hit`; None: a bound that suffices for any ray. A ray that runs
-        out of it ends with `Status.EXHAUSTED`, which `render` shows black and the AOVs "status" and "exhausted" report.
-      shading: "smooth", interpolated normals; "flat", the triangle's own.
-      normals: at the vertices, see `vertex_normals`.
-      shadows: whether surfaces between a light and a point keep its light off.
-      samples: rays a pixel, a square number: the centres of a regular n x n grid. None: what the scene says, rounded up
-        to a square.
-      max_depth: how often a ray may be mirrored; what it would meet after that counts as black.
-      edge_samples: for derivatives alone: how many points are drawn on the terrain's edges, in all, to take the derivative of
-        moving silhouettes and shadow boundaries, with about as many additional samples in the pixels where these are seen,
-        see docs/gradients.md. 0: only the derivative of each sample's radiance. The picture is the same.
-      chunk: rays that are traced together; rounded down to a square of 8 x 8, 16 x 16, ... pixels.
+    The metadata of each field holds its help, which the end of this docstring and the command line's --help are made from.
     """
 
-    traversal: Traversal = "pyramid"
-    max_steps: int | None = None
-    shading: Shading = "smooth"
-    normals: NormalScheme = "six"
-    shadows: bool = True
-    samples: int | None = None
-    max_depth: int = 4
-    edge_samples: int = 0
-    chunk: int = 1024
+    traversal: Traversal = field(
+        default="pyramid",
+        metadata={
+            "help": "search for a ray's first hit: pyramid, which skips blocks of cells by their bounds (Tevs et al. 2008), or "
+            "dda, cell by cell (Amanatides and Woo 1987); the hits are the same, bit for bit",
+            "metavar": "SEARCH",
+        },
+    )
+    max_steps: int | None = field(
+        default=None,
+        metadata={
+            "help": "step budget of one search; a ray that exhausts it is black, and the AOVs status and exhausted say so",
+            "none": "as many as any ray needs",
+            "metavar": "N",
+        },
+    )
+    shading: Shading = field(
+        default="smooth", metadata={"help": "smooth, by interpolated normals, or flat, by the triangle's own normal"}
+    )
+    normals: NormalScheme = field(
+        default="six",
+        metadata={
+            "help": "normals at the vertices: central, of central differences; four, the mean of four triangles; the mean of "
+            "the six that touch the vertex, weighted by area (six), by angle (six-angle) or equally (six-equal)",
+            "metavar": "SCHEME",
+        },
+    )
+    shadows: bool = field(default=True, metadata={"help": "shadows of every light but the sky, which casts none"})
+    samples: int | None = field(
+        default=None,
+        metadata={
+            "help": "rays a pixel, a square number: the centres of a regular n x n grid",
+            "none": "the scene's, rounded up to a square",
+            "metavar": "N",
+        },
+    )
+    max_depth: int = field(
+        default=4, metadata={"help": "mirror bounces of a ray, beyond which the rest counts as black", "metavar": "N"}
+    )
+    edge_samples: int = field(
+        default=0,
+        metadata={
+            "help": "points on terrain edges, in all, at which the derivative of moving silhouettes and shadow boundaries is "
+            "taken, and about as many samples more in the pixels that see them, see docs/gradients.md; 0: the derivative that "
+            "each sample has by itself, no more; the picture is the same",
+            "metavar": "N",
+        },
+    )
+    chunk: int = field(
+        default=1024,
+        metadata={"help": "rays traced together, rounded down to a square of 8 x 8, 16 x 16, ... pixels", "metavar": "RAYS"},
+    )
 
     @classmethod
     def draft(cls) -> "Settings":
@@ -73,3 +105,13 @@ class Settings:
                 raise ArgumentError("Settings", name, f"must be a whole number from {least} on, it is {value!r}")
         if self.samples is not None and math.isqrt(self.samples) ** 2 != self.samples:
             raise ArgumentError("Settings", "samples", f"must be a square number (1, 4, 9, ...), it is {self.samples}")
+
+
+def _attribute(knob: "dataclasses.Field[Any]") -> str:
+    none = f"; None: {knob.metadata['none']}" if "none" in knob.metadata else ""
+    return textwrap.fill(f"{knob.name}: {knob.metadata['help']}{none}.", 116, initial_indent="  ", subsequent_indent="    ")
+
+
+Settings.__doc__ = "\n".join(
+    [inspect.cleandoc(Settings.__doc__ or ""), "", "Attributes:", *map(_attribute, dataclasses.fields(Settings))]
+)

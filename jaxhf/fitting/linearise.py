@@ -244,8 +244,8 @@ def _product(
     mesh: Mesh,
     at_vertices: Float[jax.Array, "vertices n"],
     slopes: Float[jax.Array, "chunks c k samples"],
-    vertices: Int[jax.Array, "chunks 3 n"],
-) -> Float[jax.Array, "chunks n c"]:
+    vertices: Int[jax.Array, "chunks 3 samples"],
+) -> Float[jax.Array, "chunks samples c"]:
     """The matrix of all samples times what stands at the vertices."""
     chunks, channels, _, size = slopes.shape
     parts = mesh.devices.size * math.ceil(chunks / (mesh.devices.size * _TOGETHER))

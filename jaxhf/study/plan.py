@@ -1,9 +1,11 @@
 """What a sweep of the settings over one scene measures, and what of it is in the table already."""
 
+import csv
 import dataclasses
 import hashlib
 import importlib.metadata
-from collections.abc import Iterator, Sequence
+import io
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,62 +16,48 @@ from ..core.errors import ArgumentError
 from ..core.machine import default_devices
 from ..core.settings import Settings
 from ..io.errors import FileError
-from ..io.files import PathLike
+from ..io.files import PathLike, reading, save_text
 from ..io.scenes import load_scene
 from ..scene.light import Sky
 from ..scene.material import Mirror
 from ..scene.scene import Scene
 from ..scene.views import resized
 from ..trace.world import resolve_settings
-from .table import read_rows
 
-FINEST = 256  # samples a pixel of the reference
-FINEST_DERIVATIVE = {"samples": 64, "edge_samples": 300_000}
+FINEST = 256  # samples a pixel of the picture's reference
 PIXELS = 480  # of a picture's longer side, at most, unless a width is given
 SETTINGS = tuple(field.name for field in dataclasses.fields(Settings))
 KNOBS = ("precision", *SETTINGS, "tolerance", "levels")
-FIGURES = (
-    "seconds", "fastest", "cpu_seconds", "against_base", "compile_seconds", "peak_mb",
-    "rmse", "p999", "wrong_hits", "cosine", "relative_error", "spread",
-)  # fmt: skip
+COSTS = ("seconds", "fastest", "cpu_seconds", "against_base", "compile_seconds", "peak_mb")
+FIGURES = (*COSTS, "rmse", "p999", "wrong_hits", "cosine", "relative_error", "spread")
 COLUMNS = ("identity", "task", *KNOBS, *FIGURES)
+ERRORS = {"picture": "rmse", "derivative": "relative_error", "fit": "rmse"}
+"""What a task's error is, where one number must do."""
 
 # What each knob is set to besides its value in the base; a scene without mirrors or lights that cast shadows has fewer.
-_VALUES: dict[str, tuple[Any, ...]] = {
-    "precision": ("float64",),
-    "traversal": ("dda",),
-    "max_steps": (8, 16, 32, 64, 128),
-    "samples": (1, 4, 9, 16, 64),
-    "shading": ("flat",),
-    "normals": ("central", "four", "six-angle", "six-equal"),
-    "shadows": (False,),
-    "max_depth": (0, 1, 2),
-    "chunk": (256, 4096, 16384),
-}
-_DERIVATIVE_VALUES: dict[str, tuple[Any, ...]] = {
-    "edge_samples": (0, 1000, 100_000),
-    "samples": (1, 16),
-    "precision": ("float64",),
-    "shading": ("flat",),
-}
-_FIT_VALUES: dict[str, tuple[Any, ...]] = {"tolerance": (1e-2, 1e-3, 1e-5), "levels": ((1.0,),)}
+_VALUES: dict[str, dict[str, tuple[Any, ...]]] = {
+    "picture": {
+        "precision": ("float64",), "traversal": ("dda",), "max_steps": (8, 16, 32, 64, 128), "samples": (1, 4, 9, 16, 64),
+        "shading": ("flat",), "normals": ("central", "four", "six-angle", "six-equal"), "shadows": (False,),
+        "max_depth": (0, 1, 2), "chunk": (256, 4096, 16384),
+    },
+    "derivative": {
+        "edge_samples": (0, 1000, 100_000), "samples": (1, 16), "precision": ("float64",), "shading": ("flat",),
+    },
+    "fit": {"tolerance": (1e-2, 1e-3, 1e-5), "levels": ((1.0,),)},
+}  # fmt: skip
 _QUICK: dict[str, tuple[Any, ...]] = {
-    "max_steps": (16, 64),
-    "samples": (1, 4, 16),
-    "normals": ("central",),
-    "chunk": (4096,),
-    "edge_samples": (0, 100_000),
-}
+    "max_steps": (16, 64), "samples": (1, 4, 16), "normals": ("central",), "chunk": (4096,), "edge_samples": (0, 100_000),
+}  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
 class Configuration:
-    """What one process measures.
+    """What one process measures: a "picture", a "derivative" (value and gradient of a loss) or a "fit".
 
     Attributes:
-      task: "picture", a frame; "derivative", value and gradient of a loss; "fit".
-      precision: "float32" or "float64".
       tolerance, levels: of a fit.
+      figures: those of `FIGURES` that were measured, if it was.
     """
 
     task: str
@@ -77,54 +65,35 @@ class Configuration:
     settings: Settings = Settings()  # noqa: RUF009 - frozen
     tolerance: float | None = None
     levels: tuple[float, ...] | None = None
+    figures: dict[str, float] = dataclasses.field(default_factory=dict, compare=False)
+
+    @property
+    def seconds(self) -> float:
+        return self.figures["seconds"]
+
+    @property
+    def error(self) -> float:
+        return self.figures[ERRORS[self.task]]
 
     @property
     def knobs(self) -> dict[str, str]:
         """All knobs as they stand in the table; what a task does not have is empty."""
-        values = {"precision": self.precision, **dataclasses.asdict(self.settings)}
-        knobs = {name: str(value) for name, value in values.items()}
-        if self.task != "fit":
-            return knobs | {"tolerance": "", "levels": ""}
-        levels = "coarse to fine" if self.levels is None else " ".join(str(level) for level in self.levels)
-        return knobs | {"tolerance": str(self.tolerance), "levels": levels}
+        knobs = {"precision": self.precision} | {name: str(getattr(self.settings, name)) for name in SETTINGS}
+        levels = "coarse to fine" if self.levels is None else " ".join(map(str, self.levels))
+        fits = (str(self.tolerance), levels) if self.task == "fit" else ("", "")
+        return knobs | dict(zip(("tolerance", "levels"), fits, strict=True))
 
-    def with_knob(self, knob: str, value: Any) -> "Configuration":
-        if knob in SETTINGS:
-            return dataclasses.replace(self, settings=dataclasses.replace(self.settings, **{knob: value}))
-        return dataclasses.replace(self, **{knob: value})
-
-
-@dataclasses.dataclass(frozen=True)
-class Measured:
-    """A row of the table.
-
-    Attributes:
-      task: as in `Configuration`.
-      knobs: as `Configuration.knobs`.
-      figures: those of `FIGURES` that the task has. against_base: how long a warm run takes, as the median of its ratios to
-        runs of the base in between. seconds: that times the base's own median; in the table on the disk, the median itself.
-        fastest: the least by the clock. cpu_seconds: the median, of all cores together. compile_seconds: what the first run
-        took beyond a warm one. peak_mb: the process's largest size, MiB. rmse, p999, wrong_hits, cosine, relative_error,
-        spread: see docs/tradeoff.md.
-    """
-
-    task: str
-    knobs: dict[str, str]
-    figures: dict[str, float]
+    def replace(self, **values: Any) -> "Configuration":
+        """The same with other values of some knobs."""
+        settings = {name: values.pop(name) for name in SETTINGS if name in values}
+        return dataclasses.replace(self, settings=dataclasses.replace(self.settings, **settings), **values)
 
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """What is to be measured of one scene, and where it is kept.
+    """What is to be measured of one scene, the base first, against what, and where it is kept.
 
-    Attributes:
-      path: of the scene.
-      folder: for the table, the reference and the plot.
-      width, height: of the picture.
-      devices: that share the work.
-      identity: of all that a figure depends on but the machine: scene, size, jaxhf's and JAX's version.
-      quick: fewer values against a coarser reference.
-      configurations: the base first.
+    Its identity is a digest of all that a figure depends on but the machine: scene, size, jaxhf's and JAX's version.
     """
 
     path: Path
@@ -133,148 +102,127 @@ class Sweep:
     height: int
     devices: int
     identity: str
-    quick: bool
     configurations: tuple[Configuration, ...]
+    references: tuple[Configuration, ...]
 
     @property
     def table(self) -> Path:
         return self.folder / "tradeoff.csv"
 
-    @property
-    def reference(self) -> Path:
-        return self.folder / "reference.npz"
+    def reference(self, task: str) -> Path:
+        return self.folder / f"{task}-{self.identity}.npz"
 
-    @property
-    def reference_samples(self) -> int:
-        """Four times the base's at least, else its error would be that of rounding."""
-        return max(FINEST // 4 if self.quick else FINEST, 4 * (self.configurations[0].settings.samples or 1))
-
-    def measured(self) -> list[Measured]:
-        """What the table holds of this sweep, in the sweep's order."""
-        rows = {(row["task"], *(row[knob] for knob in KNOBS)): row for row in self._rows()}
-        found = []
-        for configuration in self.configurations:
-            row = rows.get((configuration.task, *configuration.knobs.values()))
-            if row is not None:
-                figures = {name: float(row[name]) for name in FIGURES if row[name]}
-                found.append(Measured(configuration.task, configuration.knobs, figures))
-        first = self.configurations[0]
-        base = next((row.figures["seconds"] for row in found if (row.task, row.knobs) == (first.task, first.knobs)), None)
-        for row in found:
-            if base is not None and "against_base" in row.figures:
-                row.figures["seconds"] = row.figures["against_base"] * base
-        return found
+    def measured(self) -> list[Configuration]:
+        """What the table holds of this sweep, in its order; seconds are the ratio to the base in turn times the base's own."""
+        rows = {tuple(row[name] for name in ("identity", "task", *KNOBS)): row for row in read_rows(self.table)}
+        keyed = [(one, rows.get((self.identity, one.task, *one.knobs.values()))) for one in self.configurations]
+        found = [(one, {name: float(row[name]) for name in FIGURES if row[name]}) for one, row in keyed if row]
+        base = found[0][1]["seconds"] if found and found[0][0] == self.configurations[0] else None
+        return [
+            one.replace(figures=figures | ({} if base is None else {"seconds": figures["against_base"] * base}))
+            for one, figures in found
+        ]
 
     def missing(self) -> list[Configuration]:
         """What is still to be measured."""
-        there = {(row.task, *row.knobs.values()) for row in self.measured()}
-        return [one for one in self.configurations if (one.task, *one.knobs.values()) not in there]
+        there = self.measured()
+        return [one for one in self.configurations if one not in there]
 
-    def _rows(self) -> list[dict[str, str]]:
-        return [row for row in read_rows(self.table, COLUMNS) if row["identity"] == self.identity]
+    def add(self, one: Configuration, figures: Mapping[str, float]) -> None:
+        """Adds a row to the table, whole or not at all."""
+        row = {"identity": self.identity, "task": one.task, **one.knobs}
+        text = io.StringIO()
+        table = csv.DictWriter(text, COLUMNS, restval="", lineterminator="\n")
+        table.writeheader()
+        table.writerows([*read_rows(self.table), row | {name: f"{value:.9g}" for name, value in figures.items()}])
+        save_text(self.table, text.getvalue())
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """The table's rows; none where there is no file. ValueError where the columns are others."""
+    if not path.exists():
+        return []
+    with reading(path):
+        table = csv.DictReader(path.read_text().splitlines())
+        rows = list(table)
+        if table.fieldnames != list(COLUMNS):
+            raise ValueError("line 1: its columns are not those of this version of jaxhf; name another folder")
+        for line, row in enumerate(rows, 2):
+            if None in row or None in row.values():
+                raise ValueError(f"line {line}: a row must have {len(COLUMNS)} values")
+        return rows
 
 
 def plan(
-    path: PathLike,
-    folder: PathLike | None = None,
-    *,
-    width: int | None = None,
-    devices: int | None = None,
-    knobs: Sequence[str] = (),
-    quick: bool = False,
-    fits: bool = False,
-) -> Sweep:
-    """What is to be measured of a scene.
-
-    Args:
-      path: a scene file.
-      folder: where the results go; None: NAME-tradeoff in the current folder.
-      width: of the picture, pixels; the height keeps the scene's proportions. None: the scene's, at most `PIXELS` for the
-        longer side, half of that if `quick`.
-      devices: None: all cores.
-      knobs: which are swept; none: all.
-      quick: fewer values, against a reference of a quarter of the samples.
-      fits: also small fits, over their tolerance and levels. Either of these two among the knobs says so, too.
+    path: PathLike, folder: PathLike | None = None, *, width: int | None = None, devices: int | None = None,
+    knobs: Sequence[str] = (), quick: bool = False, fits: bool = False,
+) -> Sweep:  # fmt: skip
+    """What is to be measured of a scene file; the keywords are the options of `jaxhf tradeoff`, whose --help tells of them.
 
     Raises:
-      ValueError: an unknown knob, a width or a number of devices below 1, fits of a terrain with holes, or anything about the
-        scene.
+      ValueError: an unknown knob, fits of a terrain with holes, or anything about the scene.
     """
     for knob in knobs:
         if knob not in KNOBS:
             raise ArgumentError("tradeoff", "knobs", f"must be among {', '.join(KNOBS)}; one is {knob!r}")
-    for name, value in (("width", width), ("devices", devices)):
-        if value is not None and value < 1:
-            raise ArgumentError("tradeoff", name, f"must be a whole number from 1 on, it is {value}")
-    path = Path(path)
+    path, devices = Path(path), devices or default_devices()
     scene = load_scene(path)
     if not scene.heightfields:
         raise FileError(f"{path}: there is no heightfield whose rendering could be measured")
-    camera = scene.camera
-    longest = PIXELS // 2 if quick else PIXELS
-    scale = width / camera.width if width else min(1.0, longest / max(camera.width, camera.height))
-    size = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
-    devices = devices or default_devices()
-    fits = fits or not _FIT_VALUES.keys().isdisjoint(knobs)
+    fits = fits or not _VALUES["fit"].keys().isdisjoint(knobs)
     if fits and not np.isfinite(scene.heights).all():
         raise FileError(f"{path}: a fit's terrain must be without holes, this one has {np.sum(~np.isfinite(scene.heights))}")
-    configurations = tuple(dict.fromkeys(_configurations(scene, frozenset(knobs or KNOBS), quick, fits)))
+    camera, longest = scene.camera, PIXELS // 2 if quick else PIXELS
+    scale = width / camera.width if width else min(1.0, longest / max(camera.width, camera.height))
+    size = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
+    found = tuple(dict.fromkeys(_configurations(scene, knobs or KNOBS, quick, fits)))
+    # Four times the base's samples at least, else the reference's error would be that of rounding.
+    samples = max(FINEST // 4 if quick else FINEST, 4 * (found[0].settings.samples or 1))
+    exact = found[0].replace(precision="float64")
+    references = exact.replace(samples=samples), exact.replace(task="derivative", samples=64, edge_samples=300_000)
     folder = Path(f"{path.stem}-tradeoff") if folder is None else Path(folder)
-    identity = _identity(resized(scene, *size), devices, quick)
-    return Sweep(path, folder, *size, devices, identity, quick, configurations)
+    return Sweep(path, folder, *size, devices, _identity(resized(scene, *size), devices, quick), found, references)
 
 
-def _configurations(scene: Scene, knobs: frozenset[str], quick: bool, fits: bool) -> Iterator[Configuration]:
-    """One knob at a time from the base, then what interacts: the samples with what makes each of them cheaper."""
+def _configurations(scene: Scene, knobs: Collection[str], quick: bool, fits: bool) -> Iterator[Configuration]:
+    """One knob at a time from each task's base; for pictures then samples together with what makes each of them cheaper."""
+    knobs = set(knobs)
+    if not any(isinstance(obj.material, Mirror) for obj in scene.objects):
+        knobs.discard("max_depth")
+    if all(isinstance(light, Sky) for light in scene.lights):
+        knobs.discard("shadows")
 
-    def values(knob: str, all_values: tuple[Any, ...]) -> tuple[Any, ...]:
-        if knob not in knobs:
-            return ()
-        return _QUICK.get(knob, all_values) if quick else all_values
+    def one_at_a_time(base: Configuration, swept: Collection[str]) -> Iterator[Configuration]:
+        yield base
+        for knob, values in _VALUES[base.task].items():
+            for value in (_QUICK.get(knob, values) if quick else values) if knob in swept else ():
+                yield base.replace(**{knob: value})
 
     picture = Configuration("picture", settings=resolve_settings(Settings(), scene))
-    yield picture
-    absent = set() if any(isinstance(obj.material, Mirror) for obj in scene.objects) else {"max_depth"}
-    if all(isinstance(light, Sky) for light in scene.lights):
-        absent.add("shadows")
-    for knob, choices in _VALUES.items():
-        for value in () if knob in absent else values(knob, choices):
-            yield picture.with_knob(knob, value)
+    yield from one_at_a_time(picture, knobs)
     for changes in ({"shading": "flat"}, {"shadows": False}, {"shading": "flat", "shadows": False}):
-        if changes.keys() <= knobs - absent:
-            for samples in (picture.settings.samples, *((1, 16) if "samples" in knobs else ())):
-                settings = dataclasses.replace(picture.settings, samples=samples, **changes)
-                yield dataclasses.replace(picture, settings=settings)
+        for samples in (picture.settings.samples, *((1, 16) if "samples" in knobs else ())):
+            if changes.keys() <= knobs:
+                yield picture.replace(samples=samples, **changes)
     if "edge_samples" in knobs:
-        derivative = Configuration("derivative", settings=dataclasses.replace(Settings(), samples=4, edge_samples=10_000))
-        yield derivative
-        for knob in _DERIVATIVE_VALUES:
-            for value in values(knob, _DERIVATIVE_VALUES[knob]):
-                yield derivative.with_knob(knob, value)
+        yield from one_at_a_time(Configuration("derivative", settings=Settings(samples=4, edge_samples=10_000)), knobs)
     if fits:
-        fit = Configuration("fit", settings=dataclasses.replace(Settings(), samples=4), tolerance=1e-4)
-        yield fit
-        swept = _FIT_VALUES if knobs.isdisjoint(_FIT_VALUES) else knobs & _FIT_VALUES.keys()
-        for knob, choices in _FIT_VALUES.items():
-            for value in choices if knob in swept else ():
-                yield fit.with_knob(knob, value)
+        fit = Configuration("fit", settings=Settings(samples=4), tolerance=1e-4)
+        yield from one_at_a_time(fit, _VALUES["fit"] if knobs.isdisjoint(_VALUES["fit"]) else knobs)
 
 
 def _identity(scene: Scene, devices: int, quick: bool) -> str:
     """A digest of all that a figure depends on but the machine."""
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(scene):
-        array = np.asarray(leaf)
-        digest.update(f"{array.shape} {array.dtype}".encode() + array.tobytes())
-    package = Path(__file__).parents[1]
-    for source in sorted(package.rglob("*.py")):
+    for leaf in map(np.asarray, jax.tree.leaves(scene)):
+        digest.update(f"{leaf.shape} {leaf.dtype}".encode() + leaf.tobytes())
+    for source in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(source.read_bytes())
     versions = [importlib.metadata.version(name) for name in ("jax", "jaxlib")]
     digest.update(f"{jax.tree.structure(scene)} {devices} {quick} {versions} {jax.default_backend()}".encode())
     return digest.hexdigest()[:16]
 
 
-def describe(task: str, knobs: dict[str, str], base: dict[str, str]) -> str:
-    """Task and the knobs that differ from the base's, in words."""
-    changed = [f"{name} {value}" for name, value in knobs.items() if value and value != base[name]]
-    return f"{task}, {', '.join(changed) or 'the base'}"
+def changes(knobs: dict[str, str], base: dict[str, str]) -> str:
+    """The knobs that differ from the base's, in words."""
+    return ", ".join(f"{name} {value}" for name, value in knobs.items() if value and value != base[name]) or "the base"

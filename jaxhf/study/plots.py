@@ -5,30 +5,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ..core.extras import import_extra
 from ..io.files import replacing
-from .pareto import ERRORS, curves, front
-from .plan import Measured, Sweep
+from .pareto import by_task, one_at_a_time, pareto_front
+from .plan import ERRORS, Configuration, Sweep
 
 _LABELS = {
     "picture": "RMSE of the picture, of its mean radiance",
     "derivative": "relative error of the gradient",
     "fit": "RMSE of the heights, of their range",
 }
+_COLUMNS = 4
 
 
-def screenless_pyplot() -> Any:
-    """matplotlib's pyplot, without a screen; ValueError where it is not installed."""
-    import_extra("matplotlib", "tradeoff draws with", "plot")
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot
-
-    return matplotlib.pyplot
-
-
-def save_plot(sweep: Sweep, measured: Sequence[Measured]) -> Path:
+def save_plot(sweep: Sweep, measured: Sequence[Configuration]) -> Path:
     """Draws what was measured into the sweep's folder."""
     path = sweep.folder / "tradeoff.png"
     figure = plot(measured, f"{sweep.path.name}, {sweep.width} x {sweep.height} pixels, {sweep.devices} devices")
@@ -37,73 +26,55 @@ def save_plot(sweep: Sweep, measured: Sequence[Measured]) -> Path:
     return path
 
 
-def plot(measured: Sequence[Measured], title: str) -> Any:
+def plot(measured: Sequence[Configuration], title: str) -> Any:
     """A figure: for each task error over time with the Pareto front, then a panel for each knob."""
-    plt = screenless_pyplot()
-    tasks = [task for task in ERRORS if any(row.task == task for row in measured)]
-    knobs = [(task, knob, values) for task in tasks for knob, values in curves(measured, task).items()]
-    columns = 4
-    rows = -(-len(knobs) // columns)
-    figure = plt.figure(figsize=(15, 5 + 2.9 * rows), layout="constrained")
+    from matplotlib.figure import Figure
+
+    tasks = by_task(measured)
+    knobs = [(rows, knob, values) for rows in tasks for knob, values in one_at_a_time(rows).items()]
+    count = -(-len(knobs) // _COLUMNS)
+    figure: Any = Figure(figsize=(15, 5 + 2.9 * count), layout="constrained")
     figure.suptitle(title)
-    above, below = figure.subfigures(2, 1, height_ratios=[5, max(2.9 * rows, 0.1)])
-    for axes, task in zip(above.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
-        _draw_front(axes, measured, task)
-    if knobs:
-        panels = below.subplots(rows, columns, squeeze=False).ravel()
-        for axes, (task, knob, values) in zip(panels, knobs, strict=False):
-            _draw_knob(axes, task, knob, values, _decades(measured, task))
-        for axes in panels[len(knobs) :]:
-            axes.set_axis_off()
+    above, below = figure.subfigures(2, 1, height_ratios=[5, max(2.9 * count, 0.1)])
+    for axes, rows in zip(above.subplots(1, len(tasks), squeeze=False)[0], tasks, strict=True):
+        _draw_task(axes, rows)
+    panels = below.subplots(count, _COLUMNS, squeeze=False).ravel() if knobs else ()
+    for axes, (rows, knob, values) in zip(panels, knobs, strict=False):
+        _draw_knob(axes, knob, values, _points(rows)[1])
+    for axes in panels[len(knobs) :]:
+        axes.set_axis_off()
     return figure
 
 
-def _draw_front(axes: Any, measured: Sequence[Measured], task: str) -> None:
-    error = ERRORS[task]
-    rows = [row for row in measured if row.task == task]
-    shown: set[int] = set()
-    for knob, values in curves(measured, task).items():
-        mine = [row for _, row in values if row is not rows[0]]
-        shown.update(map(id, mine))
-        axes.plot([row.figures["seconds"] for row in mine], [_floor(row.figures[error]) for row in mine], "o", label=knob)
-    others = [row for row in rows[1:] if id(row) not in shown]
-    if others:
-        axes.plot(
-            [row.figures["seconds"] for row in others],
-            [_floor(row.figures[error]) for row in others],
-            "x",
-            color="0.4",
-            label="several",
-        )
-    axes.plot(rows[0].figures["seconds"], _floor(rows[0].figures[error]), "k*", markersize=12, label="base")
-    best = front(measured, task)
-    axes.step(
-        [row.figures["seconds"] for row in best], [_floor(row.figures[error]) for row in best], "k-", where="post", linewidth=1,
-        label="front",
-    )  # fmt: skip
-    axes.set(xscale="log", yscale="log", xlabel="seconds a run", ylabel=_LABELS[task], title=task)
+def _points(rows: Sequence[Configuration]) -> tuple[list[float], list[float]]:
+    """Seconds and errors; an error of zero has a place on a logarithmic axis, too."""
+    return [row.seconds for row in rows], [max(row.error, 1e-9) for row in rows]
+
+
+def _draw_task(axes: Any, rows: Sequence[Configuration]) -> None:
+    base, *several = rows
+    for knob, values in one_at_a_time(rows).items():
+        mine = [row for _, row in values if row is not base]
+        several = [row for row in several if row not in mine]
+        axes.plot(*_points(mine), "o", label=knob)
+    if several:
+        axes.plot(*_points(several), "x", color="0.4", label="several")
+    axes.plot(*_points([base]), "k*", markersize=12, label="base")
+    axes.step(*_points(pareto_front(rows)), "k-", where="post", linewidth=1, label="Pareto front")
+    axes.set(xscale="log", yscale="log", xlabel="seconds a run", ylabel=_LABELS[base.task], title=base.task)
     axes.grid(True, which="both", alpha=0.2)
     axes.legend(fontsize="small", ncols=2)
 
 
-def _floor(error: float) -> float:
-    """An error of zero has a place on a logarithmic axis, too."""
-    return max(error, 1e-9)
-
-
-def _decades(measured: Sequence[Measured], task: str) -> tuple[float, float]:
-    """Powers of ten around all errors of a task: in each panel the same, so that what changes nothing looks level."""
-    errors = [_floor(row.figures[ERRORS[task]]) for row in measured if row.task == task]
-    return 10.0 ** math.floor(math.log10(min(errors))), 10.0 ** (math.floor(math.log10(max(errors))) + 1)
-
-
-def _draw_knob(axes: Any, task: str, knob: str, values: list[tuple[str, Measured]], limits: tuple[float, float]) -> None:
-    places = range(len(values))
-    axes.bar(places, [row.figures["against_base"] for _, row in values], width=0.6, color="0.8")
+def _draw_knob(axes: Any, knob: str, values: Sequence[tuple[str, Configuration]], errors: Sequence[float]) -> None:
+    """Time as bars, error as a line; its axis spans all errors of the task, so that what changes nothing looks level."""
+    places, rows = range(len(values)), [row for _, row in values]
+    axes.bar(places, [row.figures["against_base"] for row in rows], width=0.6, color="0.8")
     axes.set_ylabel("time, of the base", fontsize="small")
     axes.set_xticks(places, [value for value, _ in values], fontsize="small", rotation=30 if len(values) > 4 else 0)
-    axes.set_title(f"{task}: {knob}", fontsize="medium")
-    errors = axes.twinx()
-    errors.plot(places, [_floor(row.figures[ERRORS[task]]) for _, row in values], "o-", color="tab:red", markersize=4)
-    errors.set(yscale="log", ylim=limits)
-    errors.set_ylabel(ERRORS[task].replace("_", " "), color="tab:red", fontsize="small")
+    axes.set_title(f"{rows[0].task}: {knob}", fontsize="medium")
+    decades = [math.floor(math.log10(error)) for error in errors]
+    right = axes.twinx()
+    right.plot(places, _points(rows)[1], "o-", color="tab:red", markersize=4)
+    right.set(yscale="log", ylim=(10.0 ** min(decades), 10.0 ** (max(decades) + 1)))
+    right.set_ylabel(ERRORS[rows[0].task].replace("_", " "), color="tab:red", fontsize="small")

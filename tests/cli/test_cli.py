@@ -1,5 +1,6 @@
-"""The command line as a user runs it: its own process, single precision, what it prints and how it ends."""
+"""The command line: what it prints, what it hands on, and how it ends; once in a process of its own, as a user runs it."""
 
+import dataclasses
 import importlib.metadata
 import importlib.util
 import re
@@ -12,7 +13,8 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.cli import main as command
+from jaxhf.cli.main import main
+from jaxhf.cli.progress import bar
 
 SCENE = Path(__file__).parents[2] / "scenes" / "debug4x4.toml"  # 320 x 240
 REPORT = re.compile(
@@ -22,20 +24,30 @@ REPORT = re.compile(
 )
 
 
-def python(*arguments, **options):
-    return subprocess.run([sys.executable, *map(str, arguments)], capture_output=True, text=True, timeout=120, **options)
-
-
 def jaxhf_command(*arguments, **options):
-    return python("-m", "jaxhf", *arguments, **options)
+    command = [sys.executable, "-m", "jaxhf", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **options)
 
 
-def report(run):
-    """The last line that a rendering prints, in its parts. A pipe gets nothing but that line."""
-    assert run.returncode == 0, run.stderr
-    assert run.stderr == ""
-    found = REPORT.fullmatch(run.stdout.splitlines()[-1])
-    assert found, run.stdout
+@pytest.fixture
+def in_this_process(monkeypatch, capsys):
+    """Runs `main` here, where JAX is set up already; returns exit code, standard output and standard error."""
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda precision, devices: None)
+
+    def run(*arguments):
+        try:
+            code = main(list(map(str, arguments)))
+        except SystemExit as ended:
+            code = ended.code
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def report(out):
+    """The one line that a rendering prints, in its parts."""
+    found = REPORT.fullmatch(out.rstrip("\n"))
+    assert found, out
     return found.groupdict()
 
 
@@ -53,26 +65,52 @@ def test_help_is_quick():
         assert "info" in run.stdout
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["render", "--help"], ["fit", "--help"]])
-def test_help_does_not_import_jax(arguments):
-    script = "import sys\nfrom jaxhf.cli.main import main\ntry: main(sys.argv[1:])\nfinally: print('jax' in sys.modules)"
-    run = python("-c", script, *arguments)
+def test_help_does_not_import_jax():
+    script = """
+import contextlib, sys
+from jaxhf.cli.main import main
+for command in ([], ["render"], ["hillshade"], ["fit"], ["tradeoff"], ["convert"], ["info"]):
+    with contextlib.suppress(SystemExit):
+        main([*command, "--help"])
+print({"jax", "numpy", "tqdm"} & sys.modules.keys())
+"""
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert run.returncode == 0
-    assert run.stdout.splitlines()[-1] == "False"
+    assert run.stdout.splitlines()[-1] == "set()"
+
+
+def test_every_setting_has_one_help(monkeypatch, in_this_process):
+    """What `render --help` says of a setting is what the docstring of `Settings` says; it has all but that of derivatives."""
+
+    def words(text):
+        return " ".join(text.split())
+
+    monkeypatch.setenv("COLUMNS", "1000")
+    code, said, _ = in_this_process("render", "--help")
+    assert code == 0
+    attributes = words(jaxhf.Settings.__doc__ or "")
+    for knob in dataclasses.fields(jaxhf.Settings):
+        option = f"--{'no-' * (knob.type is bool)}{knob.name.replace('_', '-')} "
+        assert (option in said) == (knob.metadata["help"] in said) == (knob.name != "edge_samples")
+        assert f"{knob.name}: {knob.metadata['help']}" in attributes
 
 
 def test_version():
     """Without JAX, by `import jaxhf` too."""
     run = jaxhf_command("--version")
     assert (run.returncode, run.stdout) == (0, f"jaxhf {importlib.metadata.version('jaxhf')}\n")
-    run = python("-c", "import sys, jaxhf; print(jaxhf.__version__, 'jax' in sys.modules)")
+    script = "import sys, jaxhf; print(jaxhf.__version__, 'jax' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     assert run.stdout == f"{importlib.metadata.version('jaxhf')} False\n"
 
 
 def test_render(tmp_path):
-    """--width alone keeps the scene's proportions; the picture is that of `render`."""
+    """--width alone keeps the scene's proportions; single precision; a pipe gets nothing but the report."""
     path = tmp_path / "out.npy"
-    found = report(jaxhf_command("render", SCENE, "-o", path, "--width", 20))
+    run = jaxhf_command("render", SCENE, "-o", path, "--width", 20)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr == ""
+    found = report(run.stdout)
     assert found["path"] == str(path)
     assert (found["width"], found["height"], found["rays"], found["samples"]) == ("20", "15", "1200", "4")
     assert found["exhausted"] == "0"
@@ -84,52 +122,82 @@ def test_render(tmp_path):
     assert image.max() > 2 * image.min() > 0
 
 
-def test_options_reach_the_renderer(tmp_path):
-    path = tmp_path / "out.npy"
-    options = ["--precision", "float64", "--height", 12, "--samples", 1, "--max-steps", 1, "--shading", "flat", "--no-shadows"]
-    found = report(jaxhf_command("render", SCENE, "-o", path, *options))
-    assert (found["width"], found["height"], found["samples"]) == ("16", "12", "1")
-    assert 0 < int(found["exhausted"]) <= 16 * 12
-    assert np.load(path).dtype == np.float64
+@pytest.fixture
+def rendered(monkeypatch):
+    """Replaces the renderer by noise with two exhausted rays in it; lists the scenes and settings that it was given."""
+    given = []
+
+    def render(scene, settings, *, aovs, progress):
+        given.append((scene, settings))
+        shape = scene.camera.height, scene.camera.width
+        progress(0, shape[0] * shape[1])
+        exhausted = np.zeros(shape, np.int32)
+        exhausted[2, 3] = 2
+        image = np.random.default_rng(0).uniform(0, 1.2, (*shape, 3)).astype(scene.heights.dtype)
+        return image, {"exhausted": exhausted}
+
+    monkeypatch.setattr("jaxhf.rendering.render.render", render)
+    return given
 
 
-@pytest.fixture(scope="module")
-def pictures(tmp_path_factory):
-    """One small picture in every format, by one process: it compiles only once."""
-    folder = tmp_path_factory.mktemp("pictures")
-    script = """
-import sys
-from jaxhf.cli.main import main
-for path in sys.argv[2:]:
-    assert main(["render", sys.argv[1], "-o", path, "--width", "16", "--height", "10", "--samples", "1"]) == 0
-"""
-    endings = [".png", ".npy", ".pfm"] + [".exr"] * (importlib.util.find_spec("OpenEXR") is not None)
-    paths = {ending: folder / f"out{ending}" for ending in endings}
-    run = python("-c", script, SCENE, *paths.values())
-    assert run.returncode == 0, run.stderr
-    assert len(run.stdout.splitlines()) == len(paths)
-    assert run.stderr == ""
-    return paths
+def test_options_reach_the_renderer(tmp_path, in_this_process, rendered):
+    options = [
+        "--precision", "float64", "--height", 12, "--samples", 1, "--max-steps", 1, "--shading", "flat", "--no-shadows",
+        "--traversal", "dda", "--normals", "central", "--max-depth", 2, "--chunk", 256,
+    ]  # fmt: skip
+    code, out, err = in_this_process("render", SCENE, "-o", tmp_path / "out.npy", *options)
+    assert (code, err) == (0, "")
+    ((scene, settings),) = rendered
+    assert settings == jaxhf.Settings(
+        samples=1, max_steps=1, shading="flat", shadows=False, traversal="dda", normals="central", max_depth=2, chunk=256
+    )
+    assert (scene.camera.width, scene.camera.height, scene.heights.dtype) == (16, 12, np.float64)
+    found = report(out)
+    assert (found["width"], found["height"], found["samples"], found["exhausted"]) == ("16", "12", "1", "2")
+    assert np.load(tmp_path / "out.npy").dtype == np.float64
+
+    assert in_this_process("render", SCENE, "-o", tmp_path / "out.npy")[0] == 0
+    scene, settings = rendered[1]
+    assert settings == jaxhf.Settings()
+    assert (scene.camera.width, scene.camera.height, scene.heights.dtype) == (320, 240, np.float32)
 
 
 @pytest.mark.parametrize("ending", [".png", ".npy", ".exr", ".pfm"])
-def test_formats(pictures, ending):
+def test_formats(tmp_path, in_this_process, rendered, ending):
     if ending == ".exr":
         pytest.importorskip("OpenEXR")
-    exact = np.load(pictures[".npy"])
+    for path in ("exact.npy", f"out{ending}"):
+        code, _, err = in_this_process("render", SCENE, "-o", tmp_path / path, "--width", 16, "--height", 10)
+        assert (code, err) == (0, "")
+    exact, image = np.load(tmp_path / "exact.npy"), jaxhf.load_image(tmp_path / f"out{ending}")
     assert exact.shape == (10, 16, 3)
-    image = jaxhf.load_image(pictures[ending])
     if ending == ".png":  # half of 1/255 in sRGB, where the curve is steepest: 2.3
         np.testing.assert_allclose(image, np.clip(exact, 0, 1), atol=2.3 / 510)
     else:
         np.testing.assert_array_equal(image, exact)
 
 
-def test_info():
-    run = jaxhf_command("info", SCENE)
-    assert run.returncode == 0
-    assert run.stderr == ""
-    lines = run.stdout.splitlines()
+def test_bars_are_for_terminals_and_long_work(monkeypatch, capsys):
+    def show(**options):
+        with bar(unit=" pixels", **options) as shown:
+            shown.total = 100
+            shown.update(10)
+            if not shown.disable:
+                shown.start_t, shown.last_print_t = shown.start_t - 1, shown.last_print_t - 1  # as if begun a second ago
+            shown.update(40)
+        return capsys.readouterr().err
+
+    assert show(delay=0.5) == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert "50/100" in show(delay=0.5)
+    assert show(delay=0.5).endswith("\r")  # wiped out
+    assert show(delay=5.0) == ""
+
+
+def test_info(in_this_process):
+    code, out, err = in_this_process("info", SCENE)
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
     assert lines[0] == f"{SCENE}: 320 x 240 pixels, 4 samples a pixel"
     assert lines[1] == "camera: Perspective, at (-0.9, -1.3, 1.5)"
     assert lines[2] == (
@@ -140,37 +208,25 @@ def test_info():
     assert lines[4].startswith("light 1: Sky, radiance (0.05, 0.07, 0.1)")
 
 
-def test_our_own_bug_keeps_its_traceback(tmp_path):
+def test_our_own_bug_keeps_its_traceback(tmp_path, monkeypatch, in_this_process):
     """Only what is known for the user's mistake becomes one line."""
-    script = """
-import sys
-import jaxhf.rendering.render
-from jaxhf.cli.main import main
 
-def broken(*_, **__):
-    raise ValueError("a bug")
+    def broken(*_, **__):
+        raise ValueError("a bug")
 
-jaxhf.rendering.render.render = broken
-sys.exit(main(sys.argv[1:]))
-"""
-    run = python("-c", script, "render", SCENE, "-o", tmp_path / "out.png")
-    assert run.returncode == 1
-    lines = run.stderr.splitlines()
-    assert (lines[0], lines[-1]) == ("Traceback (most recent call last):", "ValueError: a bug")
-    assert "in broken" in run.stderr
+    monkeypatch.setattr("jaxhf.rendering.render.render", broken)
+    with pytest.raises(ValueError, match=r"^a bug$"):
+        in_this_process("render", SCENE, "-o", tmp_path / "out.png")
 
 
 @pytest.mark.parametrize("error", [MemoryError("8 GiB"), RuntimeError("RESOURCE_EXHAUSTED: Out of memory")])
-def test_no_memory_is_an_error_in_one_line(monkeypatch, capsys, error):
+def test_no_memory_is_an_error_in_one_line(monkeypatch, in_this_process, error):
     def fail(*_):
         raise error
 
-    monkeypatch.setattr(command, "_info", fail)
-    assert command.main(["info", str(SCENE)]) == 2
-    assert (
-        capsys.readouterr().err
-        == "jaxhf: error: memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)\n"
-    )
+    monkeypatch.setattr("jaxhf.cli.info.run", fail)
+    said = "jaxhf: error: memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)\n"
+    assert in_this_process("info", SCENE) == (2, "", said)
 
 
 # Errors of the user's.
@@ -256,23 +312,33 @@ BAD = {
 }
 
 
+# In the tests' process jaxtyping would refuse these first.
+NOT_TYPED = {"unknown shading", "unknown traversal", "unknown normals"}
+
+
 @pytest.mark.parametrize("name", BAD)
-def test_bad_input(name, tmp_path):
+def test_bad_input(name, tmp_path, monkeypatch, in_this_process):
     """Exit code 2, one line, no traceback, no file."""
     files, scene, options, message = BAD[name]
+    monkeypatch.chdir(tmp_path)
     for file, text in files.items():
         (tmp_path / file).write_text(text)
     output = [] if options is None or "-o" in options else ["-o", "out.png"]
-    run = jaxhf_command("render", scene, *output, *(options or []), cwd=tmp_path)
-    assert run.returncode == 2, run.stderr
-    assert run.stdout == ""
-    (line,) = run.stderr.splitlines()
+    arguments = ["render", scene, *output, *(options or [])]
+    if name in NOT_TYPED:
+        run = jaxhf_command(*arguments, cwd=tmp_path)
+        code, out, err = run.returncode, run.stdout, run.stderr
+    else:
+        code, out, err = in_this_process(*arguments)
+    assert (code, out) == (2, ""), err
+    (line,) = err.splitlines()
     assert re.match(r"jaxhf( render)?: error: ", line), line
     assert re.search(message, line), line
     assert {path.name for path in tmp_path.iterdir()} == set(files)
 
 
 def test_bad_scene_for_info(tmp_path):
+    """In a process of its own, as a user meets it."""
     (tmp_path / "scene.toml").write_text(CAMERA)
     run = jaxhf_command("info", "scene.toml", cwd=tmp_path)
     assert run.returncode == 2
@@ -280,7 +346,7 @@ def test_bad_scene_for_info(tmp_path):
     assert "objects" in run.stderr
 
 
-def test_no_command():
-    run = jaxhf_command()
-    assert run.returncode == 2
-    assert len(run.stderr.splitlines()) == 1
+def test_no_command(in_this_process):
+    code, _, err = in_this_process()
+    assert code == 2
+    assert len(err.splitlines()) == 1

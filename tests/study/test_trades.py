@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "trades.py"
 SIDE = 33
@@ -20,6 +21,7 @@ WorldEnd
 """
 
 
+@pytest.mark.slow
 def test_variants_give_the_same_picture_from_other_arrays(tmp_path):
     heights = np.random.default_rng(0).uniform(0, 0.3, SIDE * SIDE).astype(np.float32)
     (tmp_path / "small.pbrt").write_text(SCENE.format(side=SIDE, heights=" ".join(map(str, heights))))

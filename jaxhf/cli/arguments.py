@@ -1,0 +1,79 @@
+"""Options that several commands share, and what a command makes of them."""
+
+import argparse
+import dataclasses
+from collections.abc import Collection
+from typing import get_args
+
+from ..core.errors import UserError
+from ..core.settings import Settings
+
+
+def add_settings(command: argparse.ArgumentParser, names: Collection[str], **defaults: str) -> None:
+    """Adds an option for each of these fields of `Settings`, with the help that its metadata holds.
+
+    Args:
+      command: gets the options; one that is not given is absent from the parsed namespace.
+      names: of the fields.
+      defaults: what --help names as the default of a field, where it is not that of `Settings`.
+    """
+    for knob in dataclasses.fields(Settings):
+        option = knob.name.replace("_", "-")
+        if knob.name not in names:
+            continue
+        if knob.type is bool:
+            command.add_argument(
+                f"--no-{option}", dest=knob.name, action="store_false", default=argparse.SUPPRESS,
+                help=f"leave out {knob.metadata['help']}",
+            )  # fmt: skip
+            continue
+        default = defaults.get(knob.name, knob.metadata.get("none", knob.default))
+        command.add_argument(
+            f"--{option}", type=int if int in (knob.type, *get_args(knob.type)) else str, default=argparse.SUPPRESS,
+            metavar=knob.metadata.get("metavar"), help=f"{knob.metadata['help']} [{default}]",
+        )  # fmt: skip
+
+
+def settings(options: argparse.Namespace) -> Settings:
+    return Settings(**{name: value for name, value in vars(options).items() if name in Settings.__dataclass_fields__})
+
+
+def add_size(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--width", type=int, metavar="PIXELS", help="size; with one of the two, the other keeps the proportions"
+    )
+    command.add_argument("--height", type=int, metavar="PIXELS")
+
+
+def size(options: argparse.Namespace) -> tuple[int | None, int | None]:
+    """Width and height, None where not given; ValueError where they are not positive."""
+    for name in ("width", "height"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise UserError(f"--{name} must be a whole number of pixels from 1 on, it is {value}")
+    return options.width, options.height
+
+
+def add_raster(command: argparse.ArgumentParser) -> None:
+    """How numbers stored in a file of heights are to be read."""
+    command.add_argument("--z-scale", type=float, default=1.0, metavar="S", help="heights are multiplied by it [1]")
+    command.add_argument("--nodata", type=float, metavar="V", help="a stored value that means no height [as the file says]")
+
+
+def add_machine(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--devices", type=int, metavar="N", help="cores that share the work, each with a copy [all, at most 16]"
+    )
+    command.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
+
+
+def set_up_jax(precision: str, devices: int | None) -> None:
+    """Configures JAX by the options of `add_machine`, which can only be done before its first use."""
+    import jax
+
+    from ..core.machine import default_devices
+
+    if devices is not None and devices < 1:
+        raise UserError(f"--devices must be a whole number from 1 on, it is {devices}")
+    jax.config.update("jax_enable_x64", precision == "float64")
+    jax.config.update("jax_num_cpu_devices", devices or default_devices())

@@ -1,0 +1,104 @@
+"""`jaxhf render`: a scene to a picture."""
+
+import argparse
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from ..core.settings import Settings
+from . import arguments
+
+if TYPE_CHECKING:
+    from ..scene.scene import Scene
+
+
+def add(commands: Any) -> None:
+    command = commands.add_parser("render", help="render a scene to a picture", description="Render a scene to a picture.")
+    command.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
+    command.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="the picture: .png (sRGB), .exr, .npy or .pfm (linear)"
+    )
+    arguments.add_size(command)
+    arguments.add_settings(command, Settings.__dataclass_fields__.keys() - {"edge_samples"})  # nothing is differentiated
+    arguments.add_machine(command)
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    draw(options, lambda: _load(options))
+
+
+def draw(options: argparse.Namespace, load: "Callable[[], Scene]", **saving: Any) -> None:
+    """Renders a scene, saves the picture and prints what it took.
+
+    Args:
+      options: output, the machine's and those of `Settings`.
+      load: makes the scene, when JAX is set up.
+      saving: for `save_image`.
+    """
+    from ..io.images import require_writable, save_image
+
+    require_writable(options.output)
+    settings = arguments.settings(options)
+    arguments.set_up_jax(options.precision, options.devices)
+    image, report = _timed_render(load(), settings)
+    save_image(options.output, image, **saving)
+    print(f"{options.output}: {report}")
+
+
+def _load(options: argparse.Namespace) -> "Scene":
+    import numpy as np
+
+    from ..io.scenes import load_scene
+    from ..scene.views import resized
+
+    scene = load_scene(options.scene, np.dtype(options.precision))
+    old, (width, height) = scene.camera, arguments.size(options)
+    if width is None and height is None:
+        return scene
+    width = width or max(1, round((height or 1) * old.width / old.height))
+    return resized(scene, width, height or max(1, round(width * old.height / old.width)))
+
+
+def _timed_render(scene: "Scene", settings: Settings) -> tuple[Any, str]:
+    import jax
+    import numpy as np
+
+    from ..rendering.render import render
+    from ..trace.world import resolve_settings
+    from .progress import bar
+
+    compiling = _CompileTime()
+    begin = time.perf_counter()
+    with bar(unit=" pixels", unit_scale=True, delay=0.5) as shown:
+
+        def advance(done: int, total: int) -> None:
+            shown.total = total
+            shown.update(done - shown.n)
+
+        image, aovs = render(scene, settings, aovs=("exhausted",), progress=advance)
+    elapsed = time.perf_counter() - begin
+    seconds = max(elapsed - compiling.seconds, 1e-9)
+    samples = resolve_settings(settings, scene).samples or 1
+    height, width = image.shape[:2]
+    rays = height * width * samples
+    return image, (
+        f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), "
+        f"{seconds:.3g} s + {compiling.seconds:.3g} s compiling, "
+        f"{jax.local_device_count()} x {jax.devices()[0].device_kind}, {rays / seconds:.3g} rays/s, "
+        f"{int(np.sum(aovs['exhausted']))} rays exhausted"
+    )
+
+
+class _CompileTime:
+    """Adds up the seconds that JAX spends on tracing and compiling from now on."""
+
+    def __init__(self) -> None:
+        import jax
+
+        self.seconds = 0.0
+        jax.monitoring.register_event_duration_secs_listener(self._add)
+
+    def _add(self, event: str, duration_secs: float, **_: Any) -> None:
+        if event.startswith("/jax/core/compile/"):
+            self.seconds += duration_secs

@@ -1,0 +1,77 @@
+"""`jaxhf tradeoff`: what each setting costs and gains on one scene, measured."""
+
+import argparse
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ..study.plan import Sweep
+
+
+def add(commands: Any) -> None:
+    about = (
+        "Sweep each setting over a scene: error against a reference in double precision, time, compilation and peak memory; "
+        "print the Pareto front of the settings, and keep a table and a plot. What was measured is kept: the same command "
+        "goes on after Ctrl-C, and only prints when all is there. It says how long it will take."
+    )
+    command = commands.add_parser("tradeoff", help="measure what each setting costs and gains", description=about)
+    command.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
+    command.add_argument("-o", "--output", metavar="FOLDER", help="for table, references and plot [NAME-tradeoff]")
+    command.add_argument("--error", type=float, metavar="E", help="recommend the cheapest settings within this error")
+    command.add_argument("--time", type=float, metavar="SECONDS", help="recommend the most exact settings within this time")
+    command.add_argument("--quick", action="store_true", help="fewer values, a smaller picture, a coarser reference")
+    command.add_argument("--fit", action="store_true", help="sweep tolerance and levels of a small fit, too")
+    command.add_argument("--knobs", nargs="+", default=(), metavar="KNOB", help="sweep only these")
+    command.add_argument("--width", type=int, metavar="PIXELS", help="size [the scene's, at most 480 for the longer side]")
+    command.add_argument("--devices", type=int, metavar="N", help="cores that share the work [all, at most 16]")
+    command.add_argument("--repeats", type=int, default=5, metavar="N", help="runs whose median is taken [5]")
+    command.add_argument("--markdown", action="store_true", help="print all figures as tables")
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    from ..core.errors import UserError
+    from ..core.extras import import_extra
+    from ..study.pareto import advice, markdown
+    from ..study.plan import plan
+    from ..study.plots import save_plot
+
+    for name in ("error", "time", "repeats", "width", "devices"):
+        value = getattr(options, name)
+        if value is not None and not value > 0:
+            raise UserError(f"--{name} must be positive, it is {value}")
+    import_extra("matplotlib", "tradeoff draws with", "plot")
+    sweep = plan(
+        options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick,
+        fits=options.fit,
+    )  # fmt: skip
+    failures = _watched(sweep, options.repeats) if sweep.missing() else []
+    measured = sweep.measured()
+    if failures:
+        print("\n".join(f"failed: {failure}" for failure in failures), file=sys.stderr)
+    if not measured:
+        raise UserError(f"{sweep.path}: nothing could be measured")
+    plot = save_plot(sweep, measured)
+    asks = options.error is not None or options.time is not None
+    if options.markdown:
+        print(markdown(measured), end="\n\n")
+    if asks or not options.markdown:
+        print("\n".join(advice(measured, options.error, options.time)))
+    print(f"{len(measured)} configurations: {sweep.table}, {plot}")
+    if failures:
+        raise UserError(f"{len(failures)} configurations failed")
+
+
+def _watched(sweep: "Sweep", repeats: int) -> list[str]:
+    """Measures what is missing, under a bar on a terminal; returns what failed."""
+    from ..study import sweep as sweeping
+    from .progress import bar
+
+    with bar(total=len(sweep.missing())) as shown:
+
+        def progress(done: int, total: int, what: str) -> None:
+            shown.n, shown.total = done, total
+            shown.set_postfix_str(what)
+
+        # What is printed on standard output may be a table on its way into a file.
+        return sweeping.run(sweep, repeats, lambda line: shown.write(line, file=sys.stderr), progress)
