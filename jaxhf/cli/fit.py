@@ -119,7 +119,7 @@ class _Progress:
         return self
 
     def __call__(self, step: Step) -> None:
-        self._show(f"step {step.step}: {step.level} waves, loss {step.loss:.6g}, {step.seconds:.1f} s")
+        self._show(f"step {step.step}: {step.level} modes a side, loss {step.loss:.6g}, {step.seconds:.1f} s")
 
     def __exit__(self, *_: object) -> None:
         self._show("")

@@ -145,7 +145,7 @@ def _convergence(found: Fit) -> Any:
         for level in sorted({step.level for step in steps}):
             chosen = [step for step in steps if step.level == level]
             places, losses = [getattr(step, at) for step in chosen], [step.loss for step in chosen]
-            (line,) = axis.plot(places, losses, "-", label=f"{level} waves")
+            (line,) = axis.plot(places, losses, "-", label=f"{level} modes a side")
             for accepted, marker in ((True, "o"), (False, "x")):
                 kept = [k for k, step in enumerate(chosen) if step.accepted == accepted]
                 axis.plot([places[k] for k in kept], [losses[k] for k in kept], marker, ms=4, color=line.get_color())

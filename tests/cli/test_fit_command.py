@@ -242,4 +242,4 @@ def test_steps_are_shown_on_a_terminal_only(monkeypatch, capsys):
     with _fit_command._Progress() as progress:
         progress(step)
     shown = capsys.readouterr().err.split("\r")
-    assert [part.rstrip() for part in shown] == ["", "compiling", "step 3: 16 waves, loss 12.5, 4.0 s", "", ""]
+    assert [part.rstrip() for part in shown] == ["", "compiling", "step 3: 16 modes a side, loss 12.5, 4.0 s", "", ""]

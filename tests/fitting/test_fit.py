@@ -1,5 +1,6 @@
 """Recovering heights from pictures: small terrains, no shadows, so that the derivative is that of the picture."""
 
+import inspect
 import os
 import subprocess
 import sys
@@ -16,11 +17,12 @@ import scipy.special
 
 import jaxhf
 from jaxhf.core.devices import local_mesh
-from jaxhf.fitting import loop as _descent
+from jaxhf.fitting import loop as _loop
 from jaxhf.fitting.basis import Unknowns, make_basis, resample
-from jaxhf.fitting.loop import make_stages
+from jaxhf.fitting.loop import FitLoop, make_stages
+from jaxhf.fitting.options import FitOptions
 from jaxhf.fitting.problem import Prior, Problem, make_prior
-from jaxhf.fitting.residuals import known_residuals
+from jaxhf.fitting.residuals import prior_residuals
 from jaxhf.fitting.robust import robust_weight, soften
 from jaxhf.fitting.solvers import Outcome
 from jaxhf.io.procedural import fractal
@@ -119,13 +121,13 @@ def test_what_is_known_beforehand_counts_in_standard_deviations():
     prior = Prior(jnp.asarray(x - 1), jnp.asarray(np.full((5, 6), 1 / 4)))
     problem = Problem((), basis, prior, jnp.asarray(1 / 2), jnp.asarray(1 / 8), None, "squares", SETTINGS, local_mesh())
     factors = jnp.asarray(np.stack([x * x, x], axis=-1))
-    off, rough, rough_paint, _ = known_residuals(Unknowns(jnp.zeros((5, 6)), factors), problem)
+    off, rough, rough_paint, _ = prior_residuals(Unknowns(jnp.zeros((5, 6)), factors), problem)
     np.testing.assert_allclose(off, 1 / 4)
     np.testing.assert_allclose(rough, [[1 / 2, 0, 0, 0, 0, -1 / 2]] * 5)
     np.testing.assert_allclose(rough_paint[:, 1:-1], 2 / 8)
 
 
-def test_errors_of_a_prior_hang_together_as_whittle_said():
+def test_errors_of_a_prior_are_correlated_as_whittle_said():
     """Its covariance as a matrix: prior_std at every vertex, and between two of them by the distance in world units."""
     ny, nx, std = 25, 31, np.linspace(1, 3, 25 * 31).reshape(25, 31)
     field = jaxhf.Heightfield(np.zeros((ny, nx)), dx=0.5, dy=1.0)
@@ -134,7 +136,7 @@ def test_errors_of_a_prior_hang_together_as_whittle_said():
     still = jnp.zeros(prior.heights.shape)
     basis = make_basis(field, np.asarray(still))
     problem = Problem((), basis, prior, None, None, None, "squares", SETTINGS, local_mesh())
-    rows = jax.jacfwd(lambda waves: known_residuals(Unknowns(waves), problem)[0])(still).reshape(still.size, -1)
+    rows = jax.jacfwd(lambda modes: prior_residuals(Unknowns(modes), problem)[0])(still).reshape(still.size, -1)
     heights = jax.jacfwd(basis.heights)(still).reshape(ny * nx, -1)
     root = np.asarray(heights) @ np.linalg.inv(rows)
     covariance = root @ root.T
@@ -264,11 +266,11 @@ def test_a_fit_that_stalls_says_so_and_keeps_the_best(targets, monkeypatch):
     def advance(solver, unknowns, state, problem):
         loss = next(losses, None)
         if loss is not None:
-            unknowns = eqx.tree_at(lambda u: u.waves, unknowns, unknowns.waves.at[1, 2].add(0.01))
+            unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, unknowns.coefficients.at[1, 2].add(0.01))
         number = jnp.asarray(loss or 6.0)
         return unknowns, state, Outcome(number, jnp.asarray(loss is not None), jnp.asarray(False), number, number, unknowns)
 
-    monkeypatch.setattr(_descent, "advance", advance)
+    monkeypatch.setattr(_loop, "advance", advance)
     found = jaxhf.fit(scenes(), targets, settings=SETTINGS)
     assert found.result is jaxhf.Stop.STALLED
     assert found.stats["steps"] == 3 + 5
@@ -372,9 +374,9 @@ def test_softened_residuals_square_to_the_robust_loss(loss):
 def test_the_basis_is_the_cosine_transform():
     field = jaxhf.Heightfield(np.zeros((5, 8)), dx=2.0, dy=1.0)
     basis = make_basis(field, np.ones((5, 8)))
-    waves = np.random.default_rng(0).standard_normal((5, 8))
-    expected = 1 + np.asarray(scipy.fft.idctn(np.asarray(basis.scale) * waves, norm="ortho"))
-    np.testing.assert_allclose(basis.heights(jnp.asarray(waves)), expected, rtol=1e-12)
+    coefficients = np.random.default_rng(0).standard_normal((5, 8))
+    expected = 1 + np.asarray(scipy.fft.idctn(np.asarray(basis.scale) * coefficients, norm="ortho"))
+    np.testing.assert_allclose(basis.heights(jnp.asarray(coefficients)), expected, rtol=1e-12)
     half = make_basis(field, np.ones((5, 8)), 0.5)
     assert np.count_nonzero(half.scale) == 3 * 4 - 1  # not the constant one, before all others are there
 
@@ -385,27 +387,34 @@ def test_resampling_keeps_a_plane():
     np.testing.assert_allclose(resample(2 * x - y, (9, 5)), 2 * fine_x - fine_y, atol=1e-12)
 
 
+def options(**given) -> FitOptions:
+    """With `fit`'s defaults."""
+    known = {
+        name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items() if item.default is not item.empty
+    }
+    return FitOptions(**{**known, **given})
+
+
 @pytest.mark.parametrize(("spread", "stage", "scale"), [(2.0, 1, 6.0), (1.05, 4, 3.0), (0.5, 4, 3.0)])
-def test_a_robust_loss_that_is_sharp_already_goes_to_its_last_stage(monkeypatch, spread, stage, scale):
-    monkeypatch.setattr(_descent, "pictures_and_influence", lambda unknowns, problem: ([], np.zeros((5, 6))))
-    monkeypatch.setattr(_descent, "_spread", lambda pictures, problem: spread)
-    monkeypatch.setattr(_descent.Descent, "_lift", lambda *_: 1.0)
+def test_a_robust_loss_near_its_final_scale_goes_to_its_last_stage(monkeypatch, spread, stage, scale):
+    monkeypatch.setattr(_loop, "pictures_and_influence", lambda unknowns, problem: ([], np.zeros((5, 6))))
+    monkeypatch.setattr(_loop, "_spread", lambda pictures, problem: spread)
+    monkeypatch.setattr(FitLoop, "_mean_scale", lambda *_: 1.0)
     field = jaxhf.Heightfield(np.zeros((5, 6)))
     problem = Problem(
         (), make_basis(field, np.zeros((5, 6))), None, None, None, jnp.asarray(3.0), "geman", SETTINGS, local_mesh()
     )
-    stages = [0.5, 1.0, 1.0, 1.0, 1.0]
-    run = _descent.Descent(problem, Unknowns(jnp.zeros((5, 6))), None, stages, 1e-4, 10, None, None, 10, "")
-    run.fresh = None
-    run._next_stage(field)
-    assert run.stage == 0  # there are still waves to come
-    run.best = (1.0, run.unknowns)
-    run._next_stage(field)
-    assert run.stage == stage
-    assert run.problem.loss_scale == scale
+    loop = FitLoop(problem, Unknowns(jnp.zeros((5, 6))), field, options(loss="geman", levels=[0.5, 1.0]))
+    loop.initial_state = None
+    loop._next_stage()
+    assert loop.stage == 0  # there are still modes to come
+    loop.best = (1.0, loop.unknowns)
+    loop._next_stage()
+    assert loop.stage == stage
+    assert loop.problem.loss_scale == scale
 
 
-def test_levels_double_from_eight_waves():
-    assert make_stages((64, 40), "lm", None, "squares") == [0.125, 0.25, 0.5, 1.0]
-    assert make_stages((12, 12), "lm", None, "huber") == [1.0, 1.0, 1.0, 1.0]
-    assert make_stages((64, 64), "adam", None, "squares") == [1.0]
+def test_levels_double_from_eight_modes():
+    assert make_stages((64, 40), options()) == [0.125, 0.25, 0.5, 1.0]
+    assert make_stages((12, 12), options(loss="huber")) == [1.0, 1.0, 1.0, 1.0]
+    assert make_stages((64, 64), options(solver="adam")) == [1.0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.fitting import fit as _fit, loop as _descent
+from jaxhf.fitting import fit as _fit, loop as _loop
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
 OPTIONS = {"settings": SETTINGS, "checkpoint_every": 2, "max_steps": 12, "tolerance": 1e-9}
@@ -68,8 +68,8 @@ class Slow:
 
 @contextlib.contextmanager
 def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
-    """Ctrl-C as `_descent` has called the function of this name for so many times: in it, or where its loss is waited for."""
-    original, calls = getattr(_descent, name), []
+    """Ctrl-C as `_loop` has called the function of this name for so many times: in it, or where its loss is waited for."""
+    original, calls = getattr(_loop, name), []
 
     def interrupted(*arguments):
         calls.append(arguments)
@@ -82,7 +82,7 @@ def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
         return unknowns, state, outcome._replace(loss=Slow())
 
     with monkeypatch.context() as patched:
-        patched.setattr(_descent, name, interrupted)
+        patched.setattr(_loop, name, interrupted)
         with pytest.raises(KeyboardInterrupt):
             yield
 
@@ -90,7 +90,7 @@ def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
 @pytest.mark.parametrize(
     ("name", "call", "waiting", "kept"),
     [
-        ("begin", 1, False, False),
+        ("init_state", 1, False, False),
         ("pictures_and_influence", 1, False, False),  # before the first level
         ("advance", 1, False, True),
         ("advance", 1, True, True),
@@ -123,10 +123,10 @@ def test_ctrl_c_while_a_step_is_computed_keeps_the_one_before(tmp_path, monkeypa
     ("name", "call", "step"),
     [
         ("pictures_and_influence", 2, 9),
-        ("pictures_and_influence", 3, 9),  # those by which the constant wave is lifted
-        ("restarted", 2, 9),
+        ("pictures_and_influence", 3, 9),  # those by which the mean is scaled
+        ("reset_state", 2, 9),
         ("pictures_and_influence", 4, 22),
-        ("restarted", 3, 22),
+        ("reset_state", 3, 22),
     ],
 )
 def test_ctrl_c_while_a_stage_changes_keeps_the_end_of_the_one_before(tmp_path, monkeypatch, whole_in_levels, name, call, step):
@@ -153,7 +153,7 @@ def test_ctrl_c_after_the_last_step_keeps_them_all(tmp_path, monkeypatch, whole)
 
 
 def test_a_checkpoint_that_cannot_be_kept_is_refused_first(tmp_path, monkeypatch):
-    monkeypatch.setattr(_fit, "Descent", None)  # nothing begins
+    monkeypatch.setattr(_fit, "FitLoop", None)  # nothing begins
     path = tmp_path / "fit.checkpoint"
     with pytest.raises(FileNotFoundError, match=r"none/fit\.checkpoint: there is no folder"):
         jaxhf.fit(*problem(), **OPTIONS, checkpoint=tmp_path / "none" / "fit.checkpoint", resume=True)
