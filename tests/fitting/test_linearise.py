@@ -61,22 +61,25 @@ def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
 
 
 @pytest.mark.parametrize(
-    ("which", "settings", "channels"),
+    ("which", "settings", "channels", "derivative"),
     [
-        ("one", jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3),
-        ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat"), 1),
+        ("one", jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3, "jvp"),
+        ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat"), 1, "vjp"),
     ],
     ids=["smooth with edges", "flat, several objects"],
 )
-def test_matrix_is_the_derivative_of_render(which, settings, channels):
-    """In every height, to rounding."""
+def test_matrix_is_the_derivative_of_render(which, settings, channels, derivative):
+    """In every pixel, or in every height, to rounding. (The forward derivative of `render` compiles sooner.)"""
     scene = terrains(which)
     heights = tuple(jnp.asarray(field.heights) for field in scene.heightfields)
     cotangent = jax.random.normal(jax.random.key(1), (22, 37, channels), heights[0].dtype)
+    tangent = tuple(jax.random.normal(jax.random.key(2 + k), field.shape, field.dtype) for k, field in enumerate(heights))
 
     def both(picture):
-        image, pull = jax.vjp(picture, heights)
-        return image, pull(cotangent)[0]
+        if derivative == "jvp":
+            return jax.jvp(picture, (heights,), (tangent,))
+        image, vjp = jax.vjp(picture, heights)
+        return image, vjp(cotangent)[0]
 
     by_matrix, by_render = (jax.jit(lambda f=f: both(f))() for f in pictures(scene, settings, channels))
     for mine, theirs in zip(jax.tree.leaves(by_matrix), jax.tree.leaves(by_render), strict=True):
@@ -84,34 +87,42 @@ def test_matrix_is_the_derivative_of_render(which, settings, channels):
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-11 * np.nanmax(np.abs(theirs)))
 
 
-@pytest.mark.parametrize("surface", [1, 2])
-@pytest.mark.parametrize("receiver", [1, 2])
-def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(surface, receiver):
+@pytest.fixture(scope="module")
+def derivatives():
+    """Of a boundary point's place in the picture: in all heights by JAX, and in those of its deciding vertices."""
     settings = jaxhf.Settings(edge_samples=1)
     scene = localise(terrains("all"))
     world, camera = make_world(scene, settings), scene.camera
-    point = EdgePoint(
-        valid=jnp.asarray(True), edge=jnp.int32(0), surface=jnp.int32(surface), light=jnp.int32(0),
-        start=jnp.array([5, 6], jnp.int32), end=jnp.array([6, 7], jnp.int32), s=jnp.asarray(0.3), measure=jnp.asarray(1.0),
-        receiver=jnp.int32(receiver), cell=jnp.array([2, 1], jnp.int32), upper=jnp.asarray(True), t=jnp.asarray(0.4),
-    )  # fmt: skip
 
-    def by_rows(rows):
+    def by_rows(rows, point):
         surfaces = [
             world.surfaces[0],
             *(eqx.tree_at(lambda g: g.rows, g, r) for g, r in zip(world.surfaces[1:], rows, strict=True)),
         ]
         return picture_point(eqx.tree_at(lambda w: w.surfaces, world, tuple(surfaces)), camera, settings, point, point.s)[0]
 
-    expected = jnp.concatenate(
-        jax.jit(jax.jacrev(by_rows))([grid.rows for grid in world.surfaces if isinstance(grid, Grid)]), axis=1
-    )
-
-    def by_five(perturbation):
+    def by_five(perturbation, point):
         return picture_point(world, camera, settings, point, point.s, perturbation=perturbation)[0]
 
-    places = deciding_vertices(world, point)
-    found = jnp.zeros_like(expected).at[:, places].add(jax.jit(jax.jacrev(by_five))(jnp.zeros(5)))
+    @jax.jit
+    def both(point):
+        rows = [grid.rows for grid in world.surfaces if isinstance(grid, Grid)]
+        expected = jnp.concatenate(jax.jacrev(by_rows)(rows, point), axis=1)
+        places = deciding_vertices(world, point)
+        return expected, jnp.zeros_like(expected).at[:, places].add(jax.jacrev(by_five)(jnp.zeros(5), point))
+
+    return both
+
+
+@pytest.mark.parametrize("surface", [1, 2])
+@pytest.mark.parametrize("receiver", [1, 2])
+def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(derivatives, surface, receiver):
+    point = EdgePoint(
+        valid=jnp.asarray(True), edge=jnp.int32(0), surface=jnp.int32(surface), light=jnp.int32(0),
+        start=jnp.array([5, 6], jnp.int32), end=jnp.array([6, 7], jnp.int32), s=jnp.asarray(0.3), measure=jnp.asarray(1.0),
+        receiver=jnp.int32(receiver), cell=jnp.array([2, 1], jnp.int32), upper=jnp.asarray(True), t=jnp.asarray(0.4),
+    )  # fmt: skip
+    expected, found = derivatives(point)
     assert np.count_nonzero(expected) == 10
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
