@@ -168,8 +168,8 @@ def jacksboro(options: argparse.Namespace) -> None:
 def _missing(whole: np.ndarray, coarse: np.ndarray, part: Any) -> tuple[float, float, float]:
     """What such a map misses, from a survey of all but this part of the terrain.
 
-    The amplitudes of the waves in what it misses are taken from tiles of the part's size, under a Hann window, without which
-    the jump between opposite borders would pass for short waves.
+    The Fourier amplitudes of what it misses are taken from tiles of the part's size, under a Hann window, without which the
+    jump between opposite borders would pass for high frequencies.
 
     Returns:
       `fit`'s prior_std, prior_length (in cells) and prior_exponent.
@@ -253,7 +253,7 @@ def main() -> None:
         "--targets", type=Path, help="an .npz file with Mitsuba's pictures of jacksboro; made where it is not there"
     )
     parser.add_argument("--parts", nargs="+", default=[f"{row},{column}" for row, column in CORNERS], help="of Jacksboro")
-    parser.add_argument("--independent", action="store_true", help="a prior of jacksboro whose errors do not hang together")
+    parser.add_argument("--independent", action="store_true", help="a prior of jacksboro whose errors are independent")
     parser.add_argument("--out", type=Path, help="a folder for what jacksboro and shadow find, as .npz")
     parser.add_argument("--peers", type=Path, help="folder of common_work.py and of its targets")
     parser.add_argument("--camera", default="D", choices=("A", "B", "C", "D"))

@@ -171,7 +171,7 @@ plt.show()
 # %% [markdown]
 # ## Accuracy against time
 #
-# Fewer steps cost less and leave more error. From coarse to fine (the default levels) against all waves at once; the
+# Fewer steps cost less and leave more error. From coarse to fine (the default levels) against all modes at once; the
 # times are those of compiled programs. And fewer pictures: a very large `noise` takes a picture out of the balance.
 
 # %%

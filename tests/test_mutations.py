@@ -116,23 +116,23 @@ MUTATIONS = {
         'mode="constant"',
         "fitting/test_fit.py::test_what_is_known_beforehand_counts_in_standard_deviations",
     ),
-    "errors of a prior that hang together": Mutation(
+    "correlated errors of a prior": Mutation(
         "fitting/residuals.py",
-        "stiffness * problem.basis.amplitudes(off)",
-        "problem.basis.amplitudes(off)",
-        "fitting/test_fit.py::test_errors_of_a_prior_hang_together_as_whittle_said",
+        "stiffness * problem.basis.transform(off)",
+        "problem.basis.transform(off)",
+        "fitting/test_fit.py::test_errors_of_a_prior_are_correlated_as_whittle_said",
     ),
     "their spread at the border": Mutation(
         "fitting/problem.py",
         "rows.T @ stiffness**-2 @ columns",
         "np.mean(stiffness**-2)",
-        "fitting/test_fit.py::test_errors_of_a_prior_hang_together_as_whittle_said",
+        "fitting/test_fit.py::test_errors_of_a_prior_are_correlated_as_whittle_said",
     ),
     "their slope at the border": Mutation(
         "fitting/problem.py",
         "math.ceil(length / d)",
         "0 * math.ceil(length / d)",
-        "fitting/test_fit.py::test_errors_of_a_prior_hang_together_as_whittle_said",
+        "fitting/test_fit.py::test_errors_of_a_prior_are_correlated_as_whittle_said",
     ),
     "robust weight": Mutation(
         "fitting/robust.py",
@@ -160,14 +160,14 @@ MUTATIONS = {
     ),
     "sign of the damping": Mutation(
         "fitting/solvers.py",
-        "high_constant=4.0, low_constant=_SHORTER",
-        "high_constant=_SHORTER, low_constant=4.0",
+        "high_constant=4.0, low_constant=_REJECTED",
+        "high_constant=_REJECTED, low_constant=4.0",
         "fitting/test_fit.py::test_heights_come_back_from_a_flat_start",
     ),
-    "constant wave at the last level only": Mutation(
+    "mean height at the last level only": Mutation(
         "fitting/basis.py",
-        "kept[0, 0] = cut >= 1",
-        "kept[0, 0] = True",
+        "varied[0, 0] = cutoff >= 1",
+        "varied[0, 0] = True",
         "fitting/test_fit.py::test_the_basis_is_the_cosine_transform",
     ),
     "best heights": Mutation(
@@ -176,10 +176,10 @@ MUTATIONS = {
         "and loss <= math.inf",
         "fitting/test_fit.py::test_a_fit_that_stalls_says_so_and_keeps_the_best",
     ),
-    "impatience": Mutation(
+    "damping after rejections": Mutation(
         "fitting/loop.py",
-        "solver = impatient(self.solver, self._rejected())",
-        "solver = impatient(self.solver, 0)",
+        "solver = with_rejections(self.solver, self._rejections())",
+        "solver = with_rejections(self.solver, 0)",
         "fitting/test_fit.py::test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption",
     ),
     "stalling": Mutation(
@@ -190,20 +190,20 @@ MUTATIONS = {
     ),
     "interval of checkpoints": Mutation(
         "fitting/loop.py",
-        "len(self.history) % self.every == 0",
+        "len(self.history) % self.options.checkpoint_every == 0",
         "len(self.history) % 1000 == 0",
         "fitting/test_fit_checkpoint.py::test_a_killed_process_loses_at_most_one_interval",
     ),
     "damping of a checkpoint": Mutation(
         "fitting/loop.py",
-        "restarted(self.fresh, self.unknowns, state)",
-        "restarted(self.fresh, self.unknowns)",
+        "reset_state(self.initial_state, self.unknowns, state)",
+        "reset_state(self.initial_state, self.unknowns)",
         "fitting/test_fit_checkpoint.py::test_after_ctrl_c_it_goes_on_to_the_same_bits[4]",
     ),
     "prior in the deviations": Mutation(
         "fitting/uncertainty.py",
-        "known(change), rest(change)",
-        "[0 * part for part in known(change)], rest(change)",
+        "prior(change), normalised(change)",
+        "[0 * part for part in prior(change)], normalised(change)",
         "fitting/test_fit.py::test_as_many_heights_lie_within_their_deviations_as_should",
     ),
     "pictures in the deviations": Mutation(

@@ -1,12 +1,10 @@
 """Recovers heights from pictures."""
 
 import dataclasses
-import math
 import os
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,19 +13,19 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float
 
-from ..core.devices import local_mesh
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..core.types import AnyArray
 from ..io.errors import FileError
 from ..io.files import require_folder
 from ..scene.scene import Scene
-from .basis import beyond, make_basis
-from .history import Step, Stop, print_step
-from .loop import Descent, make_stages
-from .problem import Albedo, Asked, Loss, Problem, first_unknowns, make_groups, make_heights, make_prior, prior_margin
+from .basis import Unknowns, make_basis
+from .history import Step, Stop
+from .loop import FitLoop
+from .options import Albedo, FitOptions, Loss, Solver
+from .problem import Problem, make_problem
 from .residuals import pictures_and_influence
-from .solvers import BFGS_UNKNOWNS, Solver, count_unknowns, make_solver
+from .solvers import BFGS_UNKNOWNS, count_unknowns
 from .uncertainty import require_small, standard_deviations
 
 
@@ -98,10 +96,10 @@ def fit(
 
     Minimises Σ ρ((exposure · picture(heights) + offset - target) / noise) + Σ ((heights - prior) / prior_std)² / 2
     + Σ (Laplacian / smoothness)² / 2 over the heights and what else is unknown, from coarse to fine, by Levenberg-Marquardt
-    steps that never form a dense matrix. Every term is in standard deviations, so that the result's are those of the heights.
+    steps that form no dense matrix. Every term is in standard deviations, so the deviations of the result follow from it.
 
-    The derivative is `render`'s, which knows that shadows, silhouettes and the terrain's border move where the settings ask
-    for it by `edge_samples`. What shows in nothing (the height of a plain under a vertical view) stays where it began.
+    The derivative is `render`'s: it includes moving shadows, silhouettes and the terrain's border only where the settings have
+    `edge_samples`. What changes no picture (the height of a plain under a vertical view) stays as it was at the start.
 
     Args:
       scenes: one a picture. Their first heightfields share shape, precision, spacing and origin, and are what is sought.
@@ -115,10 +113,10 @@ def fit(
         first scene. They may have no holes: fill in what is not known; where a picture shows no ground there, give its
         pixels no weight.
       prior: heights known beforehand, as `start`; None: nothing.
-      prior_std: how far they may be off, a number or shape (ny, nx), height units.
-      prior_length: over what distance L they are off together, in units of dx and dy; None: each by itself. For a terrain
+      prior_std: standard deviation of their errors, a number or shape (ny, nx), height units.
+      prior_length: correlation length L of those errors, in units of dx and dy; None: they are independent. For a terrain
         that was smoothed by a Gaussian of standard deviation s, L is about s / √2, see docs/fitting.md.
-      prior_exponent: the amplitudes of the waves in these errors, over prior_std, go as (1 + (L · frequency)²)^(-exponent / 2)
+      prior_exponent: the amplitudes of these errors' DCT modes, over prior_std, go as (1 + (L · frequency)²)^(-exponent / 2)
         (Matérn's family). 2 is Whittle's of 1954, with the correlation (r/L) K₁(r/L) at the distance r; 3 is smoother.
       smoothness: standard deviation of the sum of a height's differences to its four neighbours, height units; None: no
         such term.
@@ -133,7 +131,7 @@ def fit(
       loss_scale: where that begins, in standard deviations.
       solver: "lm"; "bfgs" (4096 unknowns at most) and "lbfgs"; "adam", optax's, for its robustness against a noisy derivative.
       levels: shares of the highest frequency up to which heights are varied, one after the other, the last being 1; None:
-        from 8 waves a side, doubled each time, for "lm", all at once for the others.
+        from 8 modes a side, doubled each time, for "lm", all at once for the others.
       max_steps: over all levels.
       inner_steps: LSMR iterations in one step of Levenberg-Marquardt, at most.
       tolerance: of the relative change of unknowns and residuals in one step at which the fit has converged.
@@ -154,89 +152,42 @@ def fit(
       FileNotFoundError, PermissionError: the checkpoint's folder is not there or cannot be written to, before as well.
       KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
-    scenes, targets, settings = tuple(scenes), tuple(targets), settings or Settings()
-    asked = Asked(
-        weights, noise, prior, prior_std, prior_length, prior_exponent, smoothness, albedo, albedo_smoothness, exposures,
-        offsets, loss, loss_scale,
+    scenes, targets = tuple(scenes), tuple(targets)
+    options = FitOptions(
+        settings=settings or Settings(), weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
+        prior_length=prior_length, prior_exponent=prior_exponent, smoothness=smoothness, albedo=albedo,
+        albedo_smoothness=albedo_smoothness, exposures=exposures, offsets=offsets, loss=loss, loss_scale=loss_scale,
+        solver=solver, levels=levels, max_steps=max_steps, inner_steps=inner_steps, tolerance=tolerance,
+        uncertainty=uncertainty, progress=progress, checkpoint=checkpoint, checkpoint_every=checkpoint_every,
+        resume=resume, mesh=mesh,
     )  # fmt: skip
-    _check_choices(asked, solver, levels, max_steps, inner_steps, checkpoint_every, tolerance, uncertainty)
-    path = None if checkpoint is None else Path(checkpoint)
-    if path is not None:
-        _require_place(path, resume)
-    elif resume:
-        raise ArgumentError("fit", "resume", "must come with a checkpoint to go on from")
-    groups = make_groups(scenes, targets, settings, asked)
-    first = scenes[0]
-    shape, dtype = first.heights.shape, first.heights.dtype
-    if start is None:
-        start = _without_holes(np.asarray(first.heights))
-    heights = make_heights("start", start, shape)
-    known = make_prior(first.heightfields[0], prior, prior_std, prior_length, prior_exponent)
-    margin = prior_margin(first.heightfields[0], prior_length)
-    basis = make_basis(first.heightfields[0], beyond(heights, margin))
-    unknowns = first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), asked)
-    problem = Problem(
-        groups,
-        basis,
-        known,
-        None if smoothness is None else jnp.asarray(1 / smoothness, dtype),
-        None if albedo_smoothness is None else jnp.asarray(1 / albedo_smoothness, dtype),
-        None if loss == "squares" else jnp.asarray(loss_scale, dtype),
-        loss,
-        settings,
-        local_mesh() if mesh is None else mesh,
-    )
-    if solver == "bfgs" and count_unknowns(unknowns) > BFGS_UNKNOWNS:
+    if checkpoint is not None:
+        _require_place(Path(checkpoint), resume)
+    problem, unknowns = make_problem(scenes, targets, options)
+    _require_solvable(problem, unknowns, options)
+    field = scenes[0].heightfields[0]
+    loop = FitLoop(problem, unknowns, field, options)
+    result = loop.run()
+    # At whatever level it stopped, the standard deviations are those of all modes.
+    basis = make_basis(field, np.asarray(loop.problem.basis.surface(loop.unknowns.coefficients)))
+    loop.problem = eqx.tree_at(lambda problem: problem.basis, loop.problem, basis)
+    loop.unknowns = eqx.tree_at(lambda u: u.coefficients, loop.unknowns, jnp.zeros_like(loop.unknowns.coefficients))
+    return _report(loop, result, targets)
+
+
+def _require_solvable(problem: Problem, unknowns: Unknowns, options: FitOptions) -> None:
+    """Refuses what the solver or the standard deviations cannot do with a problem of this size and precision."""
+    if options.solver == "bfgs" and count_unknowns(unknowns) > BFGS_UNKNOWNS:
         raise ArgumentError(
             "fit", "solver", f"bfgs takes at most {BFGS_UNKNOWNS} unknowns, there are {count_unknowns(unknowns)}; take lbfgs"
         )
-    sampled = uncertainty is not None and uncertainty != "exact"
-    if (solver == "lm" or sampled) and dtype == np.float32 and jax.config.jax_enable_x64:  # pyright: ignore
+    sampled = options.uncertainty is not None and options.uncertainty != "exact"
+    single = problem.basis.base.dtype == np.float32
+    if (options.solver == "lm" or sampled) and single and jax.config.jax_enable_x64:  # pyright: ignore
         # lineax's LSMR then mixes single with double precision, a TypeError from deep inside.
         raise ArgumentError("fit", "scenes", "must have float64 heights where JAX's x64 mode is on, theirs are float32")
-    if uncertainty == "exact":
+    if options.uncertainty == "exact":
         require_small(unknowns, problem)
-    run = Descent(
-        problem,
-        unknowns,
-        make_solver(solver, tolerance, inner_steps, known is not None),
-        make_stages(shape, solver, levels, loss),
-        tolerance,
-        max_steps,
-        print_step if progress is True else progress or None,
-        path,
-        checkpoint_every,
-        f"{solver} {levels} {inner_steps} {tolerance}",
-    )
-    result = run.go(first, resume)
-    # Whatever the level at which it stopped, all waves are in doubt.
-    basis = make_basis(first.heightfields[0], np.asarray(run.problem.basis.surface(run.unknowns.waves)))
-    run.problem = eqx.tree_at(lambda problem: problem.basis, run.problem, basis)
-    run.unknowns = eqx.tree_at(lambda unknowns: unknowns.waves, run.unknowns, jnp.zeros_like(run.unknowns.waves))
-    return _report(run, result, targets, uncertainty, inner_steps)
-
-
-def _check_choices(asked, solver, levels, max_steps, inner_steps, every, tolerance, uncertainty) -> None:
-    for name, value, kind in (("solver", solver, Solver), ("loss", asked.loss, Loss), ("albedo", asked.albedo, Albedo)):
-        if value not in get_args(kind):
-            raise ArgumentError("fit", name, f"must be one of {', '.join(get_args(kind))}; it is {value!r}")
-    for name, value in (("max_steps", max_steps), ("inner_steps", inner_steps), ("checkpoint_every", every)):
-        if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-            raise ArgumentError("fit", name, f"must be a whole number from 1 on, it is {value!r}")
-    numbers = {
-        "prior_length": asked.prior_length, "prior_exponent": asked.prior_exponent, "smoothness": asked.smoothness,
-        "albedo_smoothness": asked.albedo_smoothness, "loss_scale": asked.loss_scale, "tolerance": tolerance,
-    }  # fmt: skip
-    for name, value in numbers.items():
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ArgumentError("fit", name, f"must be positive and finite, it is {value!r}")
-    if levels is not None and not (len(levels) and all(0 < level <= 1 for level in levels) and levels[-1] == 1):
-        raise ArgumentError("fit", "levels", f"must be shares above 0, the last of them 1; they are {levels!r}")
-    whole = isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and uncertainty >= 2
-    if not (uncertainty is None or uncertainty == "exact" or whole):
-        raise ArgumentError(
-            "fit", "uncertainty", f"must be None, 'exact' or a number of samples from 2 on, it is {uncertainty!r}"
-        )
 
 
 def _require_place(checkpoint: Path, resume: bool) -> None:
@@ -245,22 +196,8 @@ def _require_place(checkpoint: Path, resume: bool) -> None:
         raise FileError(f"{checkpoint}: this checkpoint is there already; resume=True goes on from it, to begin anew remove it")
 
 
-def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
-    """The first scene's heights, where a fit is to begin with them."""
-    holes = np.argwhere(~np.isfinite(heights))
-    if len(holes):
-        iy, ix = holes[0]
-        raise ArgumentError(
-            "fit",
-            "scenes[0]",
-            f": the heights must have no holes where there is no start, row {iy} column {ix} is "
-            f"{heights[iy, ix]}; fill them, or give a start without holes",
-        )
-    return heights
-
-
-def _report(run: Descent, result: Stop, targets: Sequence[Any], uncertainty: int | str | None, inner_steps: int) -> Fit:
-    problem, unknowns = run.problem, run.unknowns
+def _report(loop: FitLoop, result: Stop, targets: Sequence[Any]) -> Fit:
+    problem, unknowns, uncertainty = loop.problem, loop.unknowns, loop.options.uncertainty
     images: list[np.ndarray] = [np.zeros(())] * problem.count
     differences: list[np.ndarray] = [np.zeros(())] * problem.count
     square, count = 0.0, 0
@@ -271,24 +208,24 @@ def _report(run: Descent, result: Stop, targets: Sequence[Any], uncertainty: int
         with np.errstate(over="ignore"):
             square += float(np.sum((difference * weights) ** 2))
         count += int(np.sum(weights > 0))
-        for place, image, values in zip(group.places, simulated, difference, strict=True):
-            shape = np.shape(targets[place])
-            images[place], differences[place] = image.reshape(shape), values.reshape(shape)
+        for k, image, values in zip(group.indices, simulated, difference, strict=True):
+            shape = np.shape(targets[k])
+            images[k], differences[k] = image.reshape(shape), values.reshape(shape)
     seen = np.asarray(influence) != 0
     std = None
     if uncertainty is not None and result is not Stop.NON_FINITE:
-        std = standard_deviations(unknowns, problem, uncertainty, inner_steps)
+        std = standard_deviations(unknowns, problem, uncertainty, loop.options.inner_steps)
         if problem.prior is None:
             std = np.where(seen, std, np.inf)
     stats = {
-        "steps": len(run.history),
-        "accepted": sum(step.accepted for step in run.history),
-        "seconds": run.seconds + time.perf_counter() - run.begun,
-        "loss": run.best[0],
+        "steps": len(loop.history),
+        "accepted": sum(step.accepted for step in loop.history),
+        "seconds": loop.elapsed(),
+        "loss": loop.best[0],
         "chi2": square / count,
     }
     return Fit(
-        heights=problem.basis.inside(problem.basis.base),
+        heights=problem.basis.crop(problem.basis.base),
         result=result,
         std=std,
         seen=seen,
@@ -298,5 +235,5 @@ def _report(run: Descent, result: Stop, targets: Sequence[Any], uncertainty: int
         images=tuple(images),
         residuals=tuple(differences),
         stats=stats,
-        history=tuple(run.history),
+        history=tuple(loop.history),
     )

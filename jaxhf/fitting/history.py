@@ -19,7 +19,7 @@ class Step(NamedTuple):
 
     Attributes:
       step: counted over all levels, from 1.
-      level: how many waves a side are varied, at most.
+      level: how many DCT modes are varied along the longer side.
       loss: half the sum of squared residuals after it.
       accepted: whether the heights changed.
       damping: Levenberg-Marquardt's λ; 0 for other solvers.
@@ -37,10 +37,10 @@ class Step(NamedTuple):
 
 
 def print_step(step: Step) -> None:
-    word = "" if step.accepted else ", not accepted"
+    suffix = "" if step.accepted else ", not accepted"
     print(
-        f"step {step.step}: {step.level} waves, loss {step.loss:.6g}, λ {step.damping:.2g}, "
-        f"change {step.change:.3g}, {step.seconds:.1f} s{word}",
+        f"step {step.step}: {step.level} modes a side, loss {step.loss:.6g}, λ {step.damping:.2g}, "
+        f"change {step.change:.3g}, {step.seconds:.1f} s{suffix}",
         file=sys.stderr,
         flush=True,
     )

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
+from ..core.devices import local_mesh
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..scene.heightfield import Heightfield
@@ -19,37 +20,41 @@ from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
 from ..trace.world import resolve_settings
-from .basis import Basis, Unknowns, beyond, cosines, resample
+from .basis import Basis, Unknowns, dct_matrix, make_basis, pad, resample
 from .linearise import Linearised
-
-Albedo = Literal["known", "constant", "map"]
-Loss = Literal["squares", "huber", "cauchy", "geman"]
+from .options import FitOptions
 
 
 class Group(eqx.Module):
     """Pictures whose scenes differ in numbers only; they are rendered one after the other by one program.
 
     Attributes:
-      scenes: one scene, whose leaves have a leading axis of n scenes.
+      scenes: what differs from picture to picture: a scene whose leaves have a leading axis of n pictures, None for the others.
+      shared: those others, once for all pictures. The heights that are sought are None in both.
       targets: shape (n, h, w, c), c = 1 for grey.
       weights: 1 / standard deviation of each value, zero where there is none, shape (n, h, w, c).
-      places: which of the caller's pictures these are.
+      indices: the pictures' positions among the caller's.
     """
 
     scenes: Scene
+    shared: Scene
     targets: Float[Array, "n h w c"]
     weights: Float[Array, "n h w c"]
-    places: tuple[int, ...] = eqx.field(static=True)
+    indices: tuple[int, ...] = eqx.field(static=True)
+
+    def complete(self, scene: Scene, heights: Float[Array, "ny nx"]) -> Scene:
+        """One picture's leaves of `scenes`, with those that are shared and these heights."""
+        return _with_heights(eqx.combine(scene, self.shared), heights)
 
 
 class Prior(eqx.Module):
     """Heights that are known beforehand, and how well.
 
     Attributes:
-      heights: shape (my, mx), see `Basis.margin`.
-      weight: 1 / their standard deviation; shape (my, mx). Where errors hang together, times what `stiffness`
-        takes away.
-      stiffness: 1 / the amplitude of each cosine in the errors over their deviation; None: they do not hang together.
+      heights: shape (my, mx), padded as `Basis.base` is.
+      weight: 1 / their standard deviation, shape (my, mx). Where errors are correlated: 1 / the standard deviation that is left
+        when each DCT coefficient of the errors is divided by its amplitude.
+      stiffness: 1 / the amplitude of each DCT coefficient of the errors over their deviation; None: errors are independent.
     """
 
     heights: Float[Array, "my mx"]
@@ -62,16 +67,16 @@ class Problem(eqx.Module):
 
     Attributes:
       groups: the pictures.
-      basis: from waves to heights; another for each level.
+      basis: from DCT coefficients to heights; another for each level.
       prior: see `Prior`.
       smoothness: 1 / the standard deviation of the Laplacian of the heights (a sum of differences to the neighbours).
       albedo_smoothness: the same of the albedo's factors.
-      loss_scale: from where on a residual, in standard deviations, counts less; changes with the level.
-      loss: how much less.
+      loss_scale: the size, in standard deviations, above which a residual counts less; changes with the level.
+      loss: the robust loss, see `soften`.
       settings: how to render.
       mesh: the devices that share the work.
-      linearised: the pictures of each group with their derivatives in the heights, which are taken at the unknowns of which
-        residuals are asked; None: residuals render.
+      linearised: the pictures of each group with their derivatives in the heights, at the very unknowns at which residuals are
+        evaluated; None: evaluating residuals renders the pictures.
     """
 
     groups: tuple[Group, ...]
@@ -87,28 +92,53 @@ class Problem(eqx.Module):
 
     @property
     def count(self) -> int:
-        return sum(len(group.places) for group in self.groups)
+        """How many pictures there are."""
+        return sum(len(group.indices) for group in self.groups)
 
 
-class Asked(NamedTuple):
-    """The caller's arguments that are about the problem; see `fit`."""
+def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOptions) -> tuple[Problem, Unknowns]:
+    """The problem, and the unknowns from which a fit starts.
 
-    weights: Sequence[Any] | None
-    noise: Any
-    prior: Any
-    prior_std: Any
-    prior_length: float | None
-    prior_exponent: float
-    smoothness: float | None
-    albedo: str
-    albedo_smoothness: float | None
-    exposures: bool
-    offsets: bool
-    loss: str
-    loss_scale: float
+    Raises:
+      ValueError: scenes, targets and options do not belong together.
+    """
+    groups = make_groups(scenes, targets, options)
+    first = scenes[0]
+    field, shape, dtype = first.heightfields[0], first.heights.shape, first.heights.dtype
+    start = _without_holes(np.asarray(first.heights)) if options.start is None else options.start
+    heights = make_heights("start", start, shape)
+    prior = make_prior(field, options.prior, options.prior_std, options.prior_length, options.prior_exponent)
+    basis = make_basis(field, pad(heights, prior_padding(field, options.prior_length)))
+    unknowns = first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), options)
+    problem = Problem(
+        groups,
+        basis,
+        prior,
+        None if options.smoothness is None else jnp.asarray(1 / options.smoothness, dtype),
+        None if options.albedo_smoothness is None else jnp.asarray(1 / options.albedo_smoothness, dtype),
+        None if options.loss == "squares" else jnp.asarray(options.loss_scale, dtype),
+        options.loss,
+        options.settings,
+        local_mesh() if options.mesh is None else options.mesh,
+    )
+    return problem, unknowns
 
 
-def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], settings: Settings, asked: Asked) -> tuple[Group, ...]:
+def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
+    """The first scene's heights, where a fit is to begin with them."""
+    holes = np.argwhere(~np.isfinite(heights))
+    if len(holes):
+        iy, ix = holes[0]
+        raise ArgumentError(
+            "fit",
+            "scenes[0]",
+            f": the heights must have no holes where there is no start, row {iy} column {ix} is "
+            f"{heights[iy, ix]}; fill them, or give a start without holes",
+        )
+    return heights
+
+
+def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOptions) -> tuple[Group, ...]:
     """Checks scenes and pictures, and gathers those that one program can render."""
     if len(scenes) == 0:
         raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
@@ -116,34 +146,57 @@ def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], settings: Setti
         raise ArgumentError(
             "fit", "targets", f"must hold a picture for each of the {len(scenes)} scenes, they are {len(targets)}"
         )
-    if asked.weights is not None and len(asked.weights) != len(scenes):
-        raise ArgumentError(
-            "fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(asked.weights)}"
-        )
-    noise = np.asarray(asked.noise, np.float64)
+    weights = options.weights
+    if weights is not None and len(weights) != len(scenes):
+        raise ArgumentError("fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(weights)}")
+    noise = np.asarray(options.noise, np.float64)
     if noise.shape not in ((), (len(scenes),)) or not (np.isfinite(noise) & (noise > 0)).all():
-        raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {asked.noise!r}")
+        raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {options.noise!r}")
     noise = np.broadcast_to(noise, (len(scenes),))
     for k, scene in enumerate(scenes):
         _require_alike(k, scene, scenes[0])
-    found: dict[Any, list[tuple[int, Any, Any, Any]]] = {}
+    found: dict[Any, list[tuple[int, Scene, Any, Any]]] = {}
     for k, scene in enumerate(scenes):
-        weight = None if asked.weights is None else asked.weights[k]
-        target, weight = _picture(k, scene, targets[k], weight)
-        local = localise(scene)
+        target, weight = _picture(k, scene, targets[k], None if weights is None else weights[k])
+        local = _with_heights(localise(scene), None)
         leaves, structure = jax.tree.flatten(local)
-        kind = (structure, resolve_settings(settings, scene).samples, tuple(leaf.shape for leaf in leaves), target.shape)
+        kind = (
+            structure,
+            resolve_settings(options.settings, scene).samples,
+            tuple(leaf.shape for leaf in leaves),
+            target.shape,
+        )
         found.setdefault(kind, []).append((k, local, target, weight / noise[k]))
     dtype = scenes[0].heights.dtype
     return tuple(
         Group(
-            jax.tree.map(lambda *leaves: jnp.stack(leaves), *(local for _, local, _, _ in members)),
+            *_stacked([local for _, local, _, _ in members]),
             jnp.asarray(np.stack([target for *_, target, _ in members]), dtype),
             jnp.asarray(np.stack([weight for *_, weight in members]), dtype),
             tuple(k for k, *_ in members),
         )
         for members in found.values()
     )
+
+
+def _with_heights(scene: Scene, heights: Array | None) -> Scene:
+    """`scene` over other heights of its first heightfield; None where they are to be filled in later."""
+    return eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights, is_leaf=lambda leaf: leaf is None)
+
+
+def _stacked(scenes: Sequence[Scene]) -> tuple[Scene, Scene]:
+    """Cameras, lights and what else differs, stacked; and what all scenes share bit for bit: leaves are None in the other."""
+    first = scenes[0]
+
+    def same(leaf: Any, *others: Any) -> bool:
+        return all(leaf is other or np.asarray(leaf).tobytes() == np.asarray(other).tobytes() for other in others)
+
+    shared = jax.tree.map(same, *scenes)
+    # A loop over pictures needs something to go through also where there is but one.
+    views = jax.tree.map(lambda _: False, (first.camera, first.lights))
+    shared = eqx.tree_at(lambda scene: (scene.camera, scene.lights), shared, views)
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(eqx.filter(scene, shared, inverse=True) for scene in scenes))
+    return stacked, jax.tree.map(jnp.asarray, eqx.filter(first, shared))
 
 
 def _require_alike(k: int, scene: Scene, first: Scene) -> None:
@@ -208,24 +261,24 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, e
         raise ArgumentError(
             "fit", "prior_std", f"must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}"
         )
-    margin = prior_margin(field, length)
-    heights = beyond(make_heights("prior", prior, shape), margin)
-    weight, stiffness = beyond(np.broadcast_to(1 / std, shape), margin), None
+    padding = prior_padding(field, length)
+    heights = pad(make_heights("prior", prior, shape), padding)
+    weight, stiffness = pad(np.broadcast_to(1 / std, shape), padding), None
     if length is not None:
         stiffness = _stiffness(field, heights.shape, length, exponent)
-        rows, columns = (cosines(n) ** 2 for n in heights.shape)
+        rows, columns = (dct_matrix(n) ** 2 for n in heights.shape)
         weight = weight * np.sqrt(rows.T @ stiffness**-2 @ columns)
         stiffness = jnp.asarray(stiffness, dtype)
     return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), stiffness)
 
 
-def prior_margin(field: Heightfield, length: float | None) -> tuple[int, int]:
-    """How many vertices beyond the border take part, so that errors need not be level there as cosines are at their ends.
+def prior_padding(field: Heightfield, length: float | None) -> tuple[int, int]:
+    """How many vertices to add beyond each border, in y and in x: one correlation length, at most half of the terrain's size.
 
-    A border is mirrored in the new end, at twice the margin. Whatever its exponent, Matérn's correlation has its inflection at
-    0 to 2 lengths, where slopes no longer hang together; so one length is enough for them, and less than the distances
-    at which the errors themselves do not (Lindgren, Rue and Lindström, 2011, A.4), which cost more steps. At most
-    half of the terrain's own size.
+    DCT modes have no slope across the edge of their grid, and errors across it are mirrored: at distance zero if the grid
+    ended at the border, at two lengths with this padding. Whatever its exponent, Matérn's correlation has its inflection at 0
+    to 2 lengths, beyond which slopes are no longer correlated; so the slopes at the border are free. The errors themselves are
+    correlated over longer distances (Lindgren, Rue and Lindström, 2011, A.4), but more padding costs more steps.
     """
     if length is None:
         return 0, 0
@@ -235,7 +288,7 @@ def prior_margin(field: Heightfield, length: float | None) -> tuple[int, int]:
 
 
 def _stiffness(field: Heightfield, shape: tuple[int, ...], length: float, exponent: float) -> Float[np.ndarray, "my mx"]:
-    """(1 - length² · Laplacian)^(exponent / 2) of each cosine, the Laplacian being that of second differences."""
+    """(1 - length² · Laplacian)^(exponent / 2) of each DCT mode, the Laplacian being that of second differences."""
     steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, (field.dy, field.dx), strict=True)]
     return (1 + length**2 * (steps[0][:, None] + steps[1][None, :])) ** (exponent / 2)
 
@@ -253,10 +306,10 @@ def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndar
     return heights if heights.shape == shape else resample(heights, shape)
 
 
-def first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, asked: Asked) -> Unknowns:
-    """Those from which a fit starts: no waves, the albedo of the scene, exposure 1 and offset 0."""
+def first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, options: FitOptions) -> Unknowns:
+    """Those from which a fit starts: coefficients 0, the albedo of the scene, exposure 1 and offset 0."""
     shape, dtype = scene.heights.shape, scene.heights.dtype
-    if asked.albedo == "known":
+    if options.albedo == "known":
         albedo = None
     else:
         material = next(obj.material for obj in scene.objects if obj.shape is scene.heightfields[0])
@@ -264,14 +317,14 @@ def first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, asked:
             raise ArgumentError(
                 "fit", "albedo", f"is asked for, the heightfield's material must be Matte, it is {type(material).__name__}"
             )
-        if asked.albedo == "map" and isinstance(material.albedo, ImageTexture):
+        if options.albedo == "map" and isinstance(material.albedo, ImageTexture):
             texels = material.albedo.texels.shape[:2]
         else:
-            texels = shape if asked.albedo == "map" else (1, 1)
+            texels = shape if options.albedo == "map" else (1, 1)
         albedo = jnp.ones((*texels, channels), dtype)
     return Unknowns(
         jnp.zeros_like(basis.base),
         albedo,
-        jnp.ones(count, dtype) if asked.exposures else None,
-        jnp.zeros(count, dtype) if asked.offsets else None,
+        jnp.ones(count, dtype) if options.exposures else None,
+        jnp.zeros(count, dtype) if options.offsets else None,
     )

@@ -27,7 +27,7 @@ def residuals(unknowns: Unknowns, problem: Problem) -> tuple[Any, None]:
     it needs to know nothing of reweighting.
     """
     parts = [soften(part, problem.loss, problem.loss_scale) for part in picture_residuals(unknowns, problem)]
-    return (parts, known_residuals(unknowns, problem)), None
+    return (parts, prior_residuals(unknowns, problem)), None
 
 
 def half_squares(unknowns: Unknowns, problem: Problem) -> tuple[Float[Array, ""], None]:
@@ -44,14 +44,14 @@ def picture_residuals(unknowns: Unknowns, problem: Problem) -> list[Float[Array,
 
 def simulate(unknowns: Unknowns, problem: Problem) -> list[Float[Array, "n h w c"]]:
     """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
-    known = [None] * len(problem.groups) if problem.linearised is None else problem.linearised
-    return [_simulate(unknowns, problem, group, linear) for group, linear in zip(problem.groups, known, strict=True)]
+    linearised = [None] * len(problem.groups) if problem.linearised is None else problem.linearised
+    return [_simulate(unknowns, problem, *pair) for pair in zip(problem.groups, linearised, strict=True)]
 
 
 def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
-    """The problem with its pictures at these unknowns and their derivatives: what compiles from it need not render.
+    """The problem with its pictures at these unknowns and their derivatives, so that its residuals there render nothing.
 
-    Where that cannot be, because of mirrors or an unknown albedo, the problem as it is.
+    With mirrors, or an unknown albedo, there is no such derivative: then the problem as it is.
     """
     if unknowns.albedo is not None:
         return problem
@@ -63,40 +63,42 @@ def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
 
 @eqx.filter_jit
 def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised, ...]:
-    change = _with_unknowns(unknowns, problem)
     pictures = tuple(
-        linearise_each(group.scenes, change, problem.settings, problem.mesh, group.targets.shape[-1])
+        linearise_each(
+            group.scenes, _completion(unknowns, problem, group), problem.settings, problem.mesh, group.targets.shape[-1]
+        )
         for group in problem.groups
     )
     return on_every_device(pictures, problem.mesh)
 
 
-def _with_unknowns(unknowns: Unknowns, problem: Problem) -> Callable[[Scene], Scene]:
-    heights = problem.basis.heights(unknowns.waves)
+def _completion(unknowns: Unknowns, problem: Problem, group: Group) -> Callable[[Scene], Scene]:
+    """Makes the scene of one picture from its own leaves, those that the group shares, and the unknowns."""
+    heights = problem.basis.heights(unknowns.coefficients)
 
-    def changed(scene: Scene) -> Scene:
-        scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights)
-        return scene if unknowns.albedo is None else _painted(scene, unknowns.albedo)
+    def complete(scene: Scene) -> Scene:
+        scene = group.complete(scene, heights)
+        return scene if unknowns.albedo is None else _with_albedo(scene, unknowns.albedo)
 
-    return changed
+    return complete
 
 
-def _simulate(unknowns: Unknowns, problem: Problem, group: Group, known: Linearised | None) -> Float[Array, "n h w c"]:
-    n, change = len(group.places), _with_unknowns(unknowns, problem)
-    if known is not None:
-        image = picture_each(known, group.scenes, change, problem.settings, problem.mesh)
+def _simulate(unknowns: Unknowns, problem: Problem, group: Group, linear: Linearised | None) -> Float[Array, "n h w c"]:
+    n, change = len(group.indices), _completion(unknowns, problem, group)
+    if linear is not None:
+        image = picture_each(linear, group.scenes, change, problem.settings, problem.mesh)
     else:
         image = render_each(group.scenes, change, problem.settings, problem.mesh)
         if group.targets.shape[-1] == 1:
             image = jnp.mean(image, axis=-1, keepdims=True)
     if unknowns.exposures is not None:
-        image = image * jnp.stack([unknowns.exposures[k] for k in group.places]).reshape(n, 1, 1, 1)
+        image = image * jnp.stack([unknowns.exposures[k] for k in group.indices]).reshape(n, 1, 1, 1)
     if unknowns.offsets is not None:
-        image = image + jnp.stack([unknowns.offsets[k] for k in group.places]).reshape(n, 1, 1, 1)
+        image = image + jnp.stack([unknowns.offsets[k] for k in group.indices]).reshape(n, 1, 1, 1)
     return image
 
 
-def _painted(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
+def _with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
     """The scene with the albedo of its first heightfield multiplied."""
     k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
     material = scene.objects[k].material
@@ -109,24 +111,19 @@ def _painted(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
     return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
 
 
-def known_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
-    """What was known before any picture: the prior, and that terrain is smooth."""
-    surface = problem.basis.surface(unknowns.waves)
+def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
+    """Residuals of what is known without the pictures: of the prior heights, and of the smoothness of heights and albedo."""
+    surface = problem.basis.surface(unknowns.coefficients)
     parts: list[Array] = []
     if problem.prior is not None:
         off = problem.prior.weight * (surface - problem.prior.heights)
         stiffness = problem.prior.stiffness
-        parts.append(off if stiffness is None else stiffness * problem.basis.amplitudes(off))
+        parts.append(off if stiffness is None else stiffness * problem.basis.transform(off))
     if problem.smoothness is not None:
-        parts.append(problem.smoothness * laplacian(problem.basis.inside(surface)))
+        parts.append(problem.smoothness * laplacian(problem.basis.crop(surface)))
     if problem.albedo_smoothness is not None and unknowns.albedo is not None:
         parts += [problem.albedo_smoothness * laplacian(unknowns.albedo[..., c]) for c in range(unknowns.albedo.shape[-1])]
     return parts
-
-
-def unusual(unknowns: Unknowns, problem: Problem) -> Float[Array, "my mx"]:
-    """The waves in units of their usual size."""
-    return unknowns.waves / problem.basis.usual
 
 
 def laplacian(values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
@@ -136,10 +133,10 @@ def laplacian(values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
 
 
 def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
-    """The pictures, and how much each height moves a random sum of them; zero, exactly, for one that moves none, (ny, nx).
+    """The pictures, and the derivative of a random weighted sum of them in each height, shape (ny, nx).
 
-    The column of J of a vertex without influence is zero, and so is its product with any vector; that of another vertex with
-    a random vector is zero with probability zero.
+    That derivative is exactly zero for a height on which no picture depends, as its column of the Jacobian is zero; for another
+    height it is zero with probability zero.
     """
     problem = linearised(unknowns, problem)
     return _pictures_and_influence(*on_every_device((unknowns, problem), problem.mesh))
@@ -149,14 +146,14 @@ def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[F
 def _pictures_and_influence(
     unknowns: Unknowns, problem: Problem
 ) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
-    surface = problem.basis.surface(unknowns.waves)
+    surface = problem.basis.surface(unknowns.coefficients)
 
     def pictures(surface: Float[Array, "my mx"]) -> tuple[list[Array], list[Array]]:
         still = eqx.tree_at(lambda p: (p.basis.scale, p.basis.base), problem, (jnp.zeros_like(surface), surface))
         images = simulate(unknowns, still)
         return [group.weights * image for group, image in zip(problem.groups, images, strict=True)], images
 
-    parts, pull_back, images = jax.vjp(pictures, surface, has_aux=True)
+    parts, vjp, images = jax.vjp(pictures, surface, has_aux=True)
     keys = jax.random.split(jax.random.key(0), len(parts))
     draws = [jax.random.normal(key, part.shape, part.dtype) for key, part in zip(keys, parts, strict=True)]
-    return images, problem.basis.inside(pull_back(draws)[0])
+    return images, problem.basis.crop(vjp(draws)[0])

@@ -1,7 +1,7 @@
 """The solvers, all of them optimistix's, behind one step function that is compiled once."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,20 +15,19 @@ from jaxtyping import Array, Float
 from ..core.devices import on_every_device
 from ..core.types import Flag, Scalar
 from .basis import Unknowns
+from .options import FitOptions
 from .problem import Problem
 from .residuals import half_squares, linearised, residuals
-
-Solver = Literal["lm", "bfgs", "lbfgs", "adam"]
 
 # BFGS keeps a dense matrix of this many rows at most: 128 MiB in double precision.
 BFGS_UNKNOWNS = 4096
 _FIRST_DAMPING = 1e-2
-_SHORTER = 0.25  # by how much 1 / λ changes at a rejected step, the first in a row
+_REJECTED = 0.25  # by which 1 / λ is multiplied at a rejected step, the first in a row
 # Of LSMR, as a share of the matrix's Frobenius norm. That is far above what a height changes that no picture shows: where a
 # prior is to say how high it is, such heights wandered off with 1e-3, and came back over twice as many steps as with 1e-4.
 _INNER_TOLERANCE = 1e-3
 _INNER_TOLERANCE_WITH_PRIOR = 1e-4
-_RATE = 0.02  # of Adam, in units of a wave's usual size
+_RATE = 0.02  # of Adam, in the units of the unknowns
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
@@ -52,7 +51,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         # LSMR (Fong and Saunders 2011) works on J itself; conjugate gradients on JᵀJ, whose condition is squared, went
         # non-finite in single precision. Its limit on the condition is lifted: the damping bounds it.
         self.descent = optx.DampedNewtonDescent(lx.LSMR(rtol=inner_tolerance, atol=0.0, max_steps=inner_steps, conlim=1e16))
-        self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=4.0, low_constant=_SHORTER)
+        self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=4.0, low_constant=_REJECTED)
         self.verbose = _silent
 
 
@@ -96,14 +95,14 @@ class BFGS(optx.AbstractBFGS):
         return super().update_hessian(y, y_eval, scaled, f_eval_info, None)[0], hessian_update_state & ~curved
 
 
-def impatient(solver: Any, rejected: int) -> Any:
-    """The solver for a step after so many rejections in a row: the next one raises λ by twice as much as the last.
+def with_rejections(solver: Any, rejections: int) -> Any:
+    """The solver for the next step after so many rejections in a row: each raises λ by twice the factor of the one before.
 
     (Nielsen, Damping parameter in Marquardt's method, 1999.) Solvers without a λ stay as they are.
     """
     if not isinstance(solver, LevenbergMarquardt):
         return solver
-    return eqx.tree_at(lambda solver: solver.search.low_constant, solver, jnp.asarray(_SHORTER / 2**rejected))
+    return eqx.tree_at(lambda solver: solver.search.low_constant, solver, jnp.asarray(_REJECTED / 2**rejections))
 
 
 def _silent(**_: Any) -> None:
@@ -111,7 +110,16 @@ def _silent(**_: Any) -> None:
 
 
 class Outcome(NamedTuple):
-    """What one step did: the half sum of squares where it now stands, and whether it stands elsewhere than before."""
+    """What one step did.
+
+    Attributes:
+      loss: half the sum of squared residuals at `unknowns`.
+      accepted: whether the unknowns changed.
+      converged: whether the solver's tolerance is met.
+      damping: Levenberg-Marquardt's λ for the next step; 0 for other solvers.
+      change: of the heights, root mean square.
+      unknowns: those to which `loss` belongs.
+    """
 
     loss: Scalar
     accepted: Flag
@@ -121,13 +129,13 @@ class Outcome(NamedTuple):
     unknowns: Unknowns
 
 
-def make_solver(name: str, tolerance: float, inner_steps: int, prior: bool) -> Any:
-    """The solver of a name; `prior` is whether the problem has one."""
-    if name == "lm":
-        return LevenbergMarquardt(tolerance, inner_steps, prior)
-    if name == "adam":
+def make_solver(options: FitOptions) -> Any:
+    tolerance = options.tolerance
+    if options.solver == "lm":
+        return LevenbergMarquardt(tolerance, options.inner_steps, options.prior is not None)
+    if options.solver == "adam":
         return optx.OptaxMinimiser(optax.adam(_RATE), rtol=tolerance, atol=tolerance, norm=optx.rms_norm)
-    if name == "bfgs":
+    if options.solver == "bfgs":
         return BFGS(tolerance)
     return optx.LBFGS(rtol=tolerance, atol=tolerance, norm=optx.rms_norm)
 
@@ -140,21 +148,25 @@ _OPTIONS: dict[str, Any] = {}
 _TAGS: frozenset[object] = frozenset()
 
 
-def begin(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
-    """A solver's state before its first step. Its static parts must be those of the one state that is ever made."""
+def init_state(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
+    """A solver's state before its first step.
+
+    Call it once for each fit: a state also holds compiled functions, which compare by identity, so that a step that is given
+    the state of another call would be compiled again. `reset_state` makes later ones.
+    """
     # What enters a compiled step and what leaves it must lie in the same places, or the next step is compiled again for the
-    # other ones: 16 x 16 heights on two devices took 89 s of processor time before the first wave of the last level, not 30.
+    # other ones: 16 x 16 heights on two devices took 89 s of processor time up to the last level, not 30.
     problem = linearised(unknowns, problem)
-    return _begin(solver, *on_every_device((unknowns, problem), problem.mesh))
+    return _init_state(solver, *on_every_device((unknowns, problem), problem.mesh))
 
 
 @eqx.filter_jit
-def _begin(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
+def _init_state(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
     function = _function(solver)
     shape, _ = eqx.filter_eval_shape(function, unknowns, problem)
     state = solver.init(function, unknowns, problem, _OPTIONS, shape, None, _TAGS)
     if isinstance(solver, LevenbergMarquardt):
-        state = _with_step_size(state, jnp.asarray(1 / _FIRST_DAMPING, unknowns.waves.dtype))
+        state = _with_step_size(state, jnp.asarray(1 / _FIRST_DAMPING, unknowns.coefficients.dtype))
     return on_every_device(state, problem.mesh)
 
 
@@ -163,20 +175,20 @@ def _with_step_size(state: Any, step_size: Float[Array, ""]) -> Any:
     return eqx.tree_at(lambda state: state.search_state.step_size, state, step_size)
 
 
-def restarted(fresh: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None = None) -> Any:
-    """A state that stands at `unknowns` and knows nothing of its surroundings yet; `fresh` is what `begin` made.
+def reset_state(initial: Any, unknowns: Unknowns, step_size: Float[Array, ""] | None = None) -> Any:
+    """A solver's state at `unknowns`, before anything is evaluated there; `initial` is what `init_state` made.
 
     The next step of Levenberg-Marquardt evaluates and linearises there, and always accepts: the state is then, to the bit,
     what it was after the step that reached them, if `step_size` is the same. So a checkpoint need not hold linearised pictures.
     """
-    if hasattr(fresh, "y_eval"):
-        fresh = eqx.tree_at(lambda state: state.y_eval, fresh, unknowns)
-    return fresh if step_size is None else _with_step_size(fresh, step_size)
+    if hasattr(initial, "y_eval"):
+        initial = eqx.tree_at(lambda state: state.y_eval, initial, unknowns)
+    return initial if step_size is None else _with_step_size(initial, step_size)
 
 
 def advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tuple[Unknowns, Any, Outcome]:
-    """One step: a trial of new unknowns, which are accepted or not."""
-    problem = linearised(getattr(state, "y_eval", unknowns), problem)  # where the residuals are going to be asked for
+    """One step of the solver: new unknowns, which are the old ones if the step is rejected, the new state, and what it did."""
+    problem = linearised(getattr(state, "y_eval", unknowns), problem)  # where the step evaluates the residuals
     return _advance(*on_every_device((solver, unknowns, state, problem), problem.mesh))
 
 
@@ -185,7 +197,7 @@ def _advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> t
     with jax.numpy_dtype_promotion("standard"):  # optax mixes its 32-bit counters with 64-bit numbers
         new, new_state, _ = solver.step(_function(solver), unknowns, problem, _OPTIONS, state, _TAGS)
     converged, _ = solver.terminate(_function(solver), new, problem, _OPTIONS, new_state, _TAGS)
-    dtype = unknowns.waves.dtype
+    dtype = unknowns.coefficients.dtype
     zero, yes = jnp.zeros((), dtype), jnp.ones((), bool)
     if isinstance(solver, optx.OptaxMinimiser):  # its loss is that of the unknowns before the step
         loss, accepted, damping, evaluated = new_state.f, yes, zero, unknowns
@@ -193,7 +205,7 @@ def _advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> t
         loss, evaluated = new_state.f_info.as_min(), new
         accepted = new_state.num_accepted_steps > state.num_accepted_steps
         damping = 1 / new_state.search_state.step_size if isinstance(solver, LevenbergMarquardt) else zero
-    moved = problem.basis.heights(new.waves) - problem.basis.heights(unknowns.waves)
+    moved = problem.basis.heights(new.coefficients) - problem.basis.heights(unknowns.coefficients)
     change = jnp.sqrt(jnp.mean(moved * moved))
     outcome = Outcome(loss.astype(dtype), accepted, converged, damping.astype(dtype), change, evaluated)
     return on_every_device((new, new_state, outcome), problem.mesh)

@@ -1,4 +1,4 @@
-"""How sure a fit is of its heights: standard deviations from the Gauss-Newton matrix, which is never formed."""
+"""How sure a fit is of its heights: standard deviations from the Gauss-Newton matrix, by samples or by a dense inverse."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from ..core.devices import on_every_device
 from ..core.errors import ArgumentError
 from .basis import Unknowns
 from .problem import Problem
-from .residuals import known_residuals, linearised, picture_residuals, unusual
+from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import robust_weight
 
 EXACT_ENTRIES = 2**24
@@ -29,19 +29,19 @@ def standard_deviations(
 
     The Gauss-Newton matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs them;
     its inverse is the covariance (Laplace's approximation). Albedo, exposures and offsets vary along, so their doubt counts
-    too. Waves have their usual size (`Basis.usual`), and the other unknowns 1, as a prior besides: a direction that no
-    picture tells anything about, such as the height of everything at once, then gets a large deviation, not an infinite one.
+    too. Besides, each DCT coefficient has the prior N(0, `Basis.prior_amplitude`²), and each other unknown N(0, 1): a direction
+    on which no picture depends, such as the mean of all heights, then gets a large deviation, not an infinite one.
 
     Args:
-      samples: "exact" inverts the matrix. A number: so many x = argmin |J x - z|², z normal, are drawn; their covariance is H⁻¹
-        (Papandreou and Yuille, Gaussian sampling by local perturbations, 2010), so each deviation is right to
-        1 / √(2 · samples), however the heights are correlated.
+      samples: "exact" forms J as a dense matrix and inverts H. A number, without any dense matrix: that many
+        x = argmin |J x - z|², z normal, are drawn; their covariance is H⁻¹ (Papandreou and Yuille, Gaussian sampling by local
+        perturbations, 2010), so each deviation is right to 1 / √(2 · samples), however the heights are correlated.
       inner_steps: of LSMR, each; five times as many as in a step of the fit are allowed.
     """
     unknowns, problem = on_every_device((unknowns, linearised(unknowns, problem)), problem.mesh)
     if samples == "exact":
         return np.sqrt(np.asarray(_exact_variance(unknowns, problem)))
-    total = np.zeros(problem.basis.inside(problem.basis.base).shape)
+    total = np.zeros(problem.basis.crop(problem.basis.base).shape)
     for k in range(int(samples)):
         draw = np.asarray(_draw(unknowns, problem, jax.random.key(k), 5 * inner_steps), np.float64)
         total += draw * draw
@@ -61,18 +61,18 @@ def require_small(unknowns: Unknowns, problem: Problem) -> None:
 
 
 def _operator(unknowns: Unknowns, problem: Problem) -> tuple[lx.AbstractLinearOperator, Any]:
-    """J with all its rows, and the shapes of what it makes."""
+    """J of all residuals and of the priors of the unknowns, and the structure of its products."""
     parts, pictures = jax.linearize(lambda u: picture_residuals(u, problem), unknowns)
-    _, known = jax.linearize(lambda u: known_residuals(u, problem), unknowns)
+    _, prior = jax.linearize(lambda u: prior_residuals(u, problem), unknowns)
     roots = [jnp.sqrt(robust_weight(part, problem.loss, problem.loss_scale)) for part in parts]
 
-    def rest(change: Unknowns) -> Unknowns:
-        return eqx.tree_at(lambda change: change.waves, change, unusual(change, problem))
+    def normalised(change: Unknowns) -> Unknowns:
+        return eqx.tree_at(lambda change: change.coefficients, change, change.coefficients / problem.basis.prior_amplitude)
 
-    def rows(change: Unknowns) -> Any:
-        return [root * part for root, part in zip(roots, pictures(change), strict=True)], known(change), rest(change)
+    def product(change: Unknowns) -> Any:
+        return [root * part for root, part in zip(roots, pictures(change), strict=True)], prior(change), normalised(change)
 
-    operator = lx.FunctionLinearOperator(rows, jax.eval_shape(lambda: unknowns))
+    operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: unknowns))
     return operator, operator.out_structure()
 
 
@@ -85,7 +85,7 @@ def _draw(unknowns: Unknowns, problem: Problem, key: PRNGKeyArray, steps: int) -
     # Its tolerance is a share of the matrix's Frobenius norm, far above what a height changes that no picture shows.
     solver = lx.LSMR(rtol=1e-7, atol=0.0, max_steps=steps, conlim=1e16)
     change = lx.linear_solve(operator, z, solver, throw=False).value
-    return _height_change(problem, change.waves)
+    return _height_change(problem, change.coefficients)
 
 
 @eqx.filter_jit
@@ -99,15 +99,15 @@ def _exact_variance(unknowns: Unknowns, problem: Problem) -> Float[Array, "ny nx
         return None, jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(change)])
 
     matrix = lax.scan(column, None, jnp.arange(flat.size))[1].T
-    n = unknowns.waves.size
-    # QᵀQ = 1 of J = QR leaves (JᵀJ)⁻¹ = R⁻¹R⁻ᵀ; waves are the first of the unknowns.
+    n = unknowns.coefficients.size
+    # QᵀQ = 1 of J = QR leaves (JᵀJ)⁻¹ = R⁻¹R⁻ᵀ; coefficients are the first of the unknowns.
     root = jnp.linalg.qr(matrix, mode="r")
     inverse = jax.scipy.linalg.solve_triangular(root, jnp.eye(root.shape[0], dtype=root.dtype))
     scale, rows, columns = problem.basis.scale, problem.basis.rows, problem.basis.columns
-    cosines = (rows[:, None, :, None] * columns[None, :, None, :] * scale[:, :, None, None]).reshape(n, -1)
-    spread = jnp.matmul(cosines.T, inverse[:n], precision=lax.Precision.HIGHEST)
-    return problem.basis.inside(jnp.sum(spread * spread, axis=1).reshape(problem.basis.base.shape))
+    modes = (rows[:, None, :, None] * columns[None, :, None, :] * scale[:, :, None, None]).reshape(n, -1)
+    spread = jnp.matmul(modes.T, inverse[:n], precision=lax.Precision.HIGHEST)
+    return problem.basis.crop(jnp.sum(spread * spread, axis=1).reshape(problem.basis.base.shape))
 
 
-def _height_change(problem: Problem, waves: Float[Array, "my mx"]) -> Float[Array, "ny nx"]:
-    return problem.basis.heights(waves) - problem.basis.inside(problem.basis.base)
+def _height_change(problem: Problem, coefficients: Float[Array, "my mx"]) -> Float[Array, "ny nx"]:
+    return problem.basis.heights(coefficients) - problem.basis.crop(problem.basis.base)

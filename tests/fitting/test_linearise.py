@@ -1,5 +1,7 @@
 """The derivative of a picture as a sparse matrix against that of `render`, which other tests hold against differences."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -37,7 +39,7 @@ def terrains(which: str, material: jaxhf.Matte | jaxhf.Mirror = jaxhf.Matte((0.3
 
 
 def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
-    """Functions of all heights: the picture by its matrix, and by `render`."""
+    """Functions of all heights: the linearised picture, the picture by it, and the picture by `render`."""
     scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], localise(scene))
 
     def change(heights):
@@ -48,70 +50,96 @@ def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
 
         return changed
 
-    def by_matrix(heights):
-        mesh = local_mesh()
-        known = linearise_each(scenes, change(jax.lax.stop_gradient(heights)), settings, mesh, channels)
-        return picture_each(known, scenes, change(heights), settings, mesh)[0]
+    def known(heights):
+        return linearise_each(scenes, change(heights), settings, local_mesh(), channels)
+
+    def by_matrix(known, heights):
+        return picture_each(known, scenes, change(heights), settings, local_mesh())[0]
 
     def by_render(heights):
         image = jaxhf.render(change(heights)(scene), settings)
         return image if channels == 3 else image.mean(-1, keepdims=True)
 
-    return by_matrix, by_render
+    return known, by_matrix, by_render
 
 
 @pytest.mark.parametrize(
-    ("which", "settings", "channels"),
+    ("which", "settings", "channels", "derivative"),
     [
-        ("one", jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3),
-        ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat"), 1),
+        ("one", jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3, "jvp"),
+        ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat"), 1, "vjp"),
     ],
     ids=["smooth with edges", "flat, several objects"],
 )
-def test_matrix_is_the_derivative_of_render(which, settings, channels):
-    """In every height, to rounding."""
+def test_matrix_is_the_derivative_of_render(which, settings, channels, derivative):
+    """In every pixel, or in every height, to rounding; in the other mode by the inner product.
+
+    (The forward derivative of `render` compiles sooner.)
+    """
     scene = terrains(which)
     heights = tuple(jnp.asarray(field.heights) for field in scene.heightfields)
     cotangent = jax.random.normal(jax.random.key(1), (22, 37, channels), heights[0].dtype)
+    tangent = tuple(jax.random.normal(jax.random.key(2 + k), field.shape, field.dtype) for k, field in enumerate(heights))
 
     def both(picture):
-        image, pull = jax.vjp(picture, heights)
-        return image, pull(cotangent)[0]
+        if derivative == "jvp":
+            return jax.jvp(picture, (heights,), (tangent,))
+        image, vjp = jax.vjp(picture, heights)
+        return image, vjp(cotangent)[0]
 
-    by_matrix, by_render = (jax.jit(lambda f=f: both(f))() for f in pictures(scene, settings, channels))
-    for mine, theirs in zip(jax.tree.leaves(by_matrix), jax.tree.leaves(by_render), strict=True):
+    known, by_matrix, by_render = pictures(scene, settings, channels)
+    linear = jax.jit(known)(heights)
+    found = jax.jit(lambda linear: both(functools.partial(by_matrix, linear)))(linear)
+    for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(jax.jit(lambda: both(by_render))()), strict=True):
         assert np.nanmax(np.abs(theirs)) > 1e-3
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-11 * np.nanmax(np.abs(theirs)))
 
+    @jax.jit
+    def products(linear):
+        picture = functools.partial(by_matrix, linear)
+        return jax.jvp(picture, (heights,), (tangent,))[1], jax.vjp(picture, heights)[1](cotangent)[0]
 
-@pytest.mark.parametrize("surface", [1, 2])
-@pytest.mark.parametrize("receiver", [1, 2])
-def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(surface, receiver):
+    forward, reverse = products(linear)
+    backwards = sum(np.nansum(np.asarray(a) * np.asarray(b)) for a, b in zip(reverse, tangent, strict=True))
+    np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def derivatives():
+    """Of a boundary point's place in the picture: in all heights by JAX, and in those of its deciding vertices."""
     settings = jaxhf.Settings(edge_samples=1)
     scene = localise(terrains("all"))
     world, camera = make_world(scene, settings), scene.camera
-    point = BoundarySample(
-        valid=jnp.asarray(True), edge=jnp.int32(0), surface=jnp.int32(surface), light=jnp.int32(0),
-        start=jnp.array([5, 6], jnp.int32), end=jnp.array([6, 7], jnp.int32), s=jnp.asarray(0.3), measure=jnp.asarray(1.0),
-        receiver=jnp.int32(receiver), cell=jnp.array([2, 1], jnp.int32), upper=jnp.asarray(True), t=jnp.asarray(0.4),
-    )  # fmt: skip
 
-    def by_rows(rows):
+    def by_rows(rows, point):
         surfaces = [
             world.surfaces[0],
             *(eqx.tree_at(lambda g: g.rows, g, r) for g, r in zip(world.surfaces[1:], rows, strict=True)),
         ]
         return picture_point(eqx.tree_at(lambda w: w.surfaces, world, tuple(surfaces)), camera, point, point.s)[0]
 
-    expected = jnp.concatenate(
-        jax.jit(jax.jacrev(by_rows))([grid.rows for grid in world.surfaces if isinstance(grid, Grid)]), axis=1
-    )
-
-    def by_five(perturbation):
+    def by_five(perturbation, point):
         return picture_point(world, camera, point, point.s, perturbation=perturbation)[0]
 
-    vertices = deciding_vertices(world, point)
-    found = jnp.zeros_like(expected).at[:, vertices].add(jax.jit(jax.jacrev(by_five))(jnp.zeros(5)))
+    @jax.jit
+    def both(point):
+        rows = [grid.rows for grid in world.surfaces if isinstance(grid, Grid)]
+        expected = jnp.concatenate(jax.jacrev(by_rows)(rows, point), axis=1)
+        vertices = deciding_vertices(world, point)
+        return expected, jnp.zeros_like(expected).at[:, vertices].add(jax.jacrev(by_five)(jnp.zeros(5), point))
+
+    return both
+
+
+@pytest.mark.parametrize("surface", [1, 2])
+@pytest.mark.parametrize("receiver", [1, 2])
+def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(derivatives, surface, receiver):
+    point = BoundarySample(
+        valid=jnp.asarray(True), edge=jnp.int32(0), surface=jnp.int32(surface), light=jnp.int32(0),
+        start=jnp.array([5, 6], jnp.int32), end=jnp.array([6, 7], jnp.int32), s=jnp.asarray(0.3), measure=jnp.asarray(1.0),
+        receiver=jnp.int32(receiver), cell=jnp.array([2, 1], jnp.int32), upper=jnp.asarray(True), t=jnp.asarray(0.4),
+    )  # fmt: skip
+    expected, found = derivatives(point)
     assert np.count_nonzero(expected) == 10
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 

@@ -1,0 +1,77 @@
+"""The keyword arguments of `fit`, as one checked record."""
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, get_args
+
+from jax.sharding import Mesh
+
+from ..core.errors import ArgumentError
+from ..core.settings import Settings
+from .history import Step
+
+Albedo = Literal["known", "constant", "map"]
+Loss = Literal["squares", "huber", "cauchy", "geman"]
+Solver = Literal["lm", "bfgs", "lbfgs", "adam"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class FitOptions:
+    """The keyword arguments of `fit`, which documents them and has their defaults; checked without scenes and targets.
+
+    Raises:
+      ValueError: a value is none of its choices, or out of range.
+    """
+
+    settings: Settings
+    weights: Sequence[Any] | None
+    noise: Any
+    start: Any
+    prior: Any
+    prior_std: Any
+    prior_length: float | int | None
+    prior_exponent: float | int
+    smoothness: float | int | None
+    albedo: Albedo | str
+    albedo_smoothness: float | int | None
+    exposures: bool
+    offsets: bool
+    loss: Loss | str
+    loss_scale: float | int
+    solver: Solver | str
+    levels: Sequence[float] | None
+    max_steps: int
+    inner_steps: int
+    tolerance: float | int
+    uncertainty: int | str | None
+    progress: Callable[[Step], None] | bool
+    checkpoint: str | os.PathLike[str] | None
+    checkpoint_every: int
+    resume: bool
+    mesh: Mesh | None
+
+    def __post_init__(self):
+        for name, kind in (("solver", Solver), ("loss", Loss), ("albedo", Albedo)):
+            value = getattr(self, name)
+            if value not in get_args(kind):
+                raise ArgumentError("fit", name, f"must be one of {', '.join(get_args(kind))}; it is {value!r}")
+        for name in ("max_steps", "inner_steps", "checkpoint_every"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ArgumentError("fit", name, f"must be a whole number from 1 on, it is {value!r}")
+        for name in ("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", "loss_scale", "tolerance"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ArgumentError("fit", name, f"must be positive and finite, it is {value!r}")
+        levels, uncertainty = self.levels, self.uncertainty
+        if levels is not None and not (len(levels) and all(0 < level <= 1 for level in levels) and levels[-1] == 1):
+            raise ArgumentError("fit", "levels", f"must be shares above 0, the last of them 1; they are {levels!r}")
+        whole = isinstance(uncertainty, int) and not isinstance(uncertainty, bool) and uncertainty >= 2
+        if not (uncertainty is None or uncertainty == "exact" or whole):
+            raise ArgumentError(
+                "fit", "uncertainty", f"must be None, 'exact' or a number of samples from 2 on, it is {uncertainty!r}"
+            )
+        if self.resume and self.checkpoint is None:
+            raise ArgumentError("fit", "resume", "must come with a checkpoint to go on from")
