@@ -144,11 +144,11 @@ def _convergence(found: Fit) -> Any:
     for axis, at, name in ((axes[0, 0], "step", "step"), (axes[0, 1], "seconds", "seconds")):
         for level in sorted({step.level for step in steps}):
             chosen = [step for step in steps if step.level == level]
-            places, losses = [getattr(step, at) for step in chosen], [step.loss for step in chosen]
-            (line,) = axis.plot(places, losses, "-", label=f"{level} DCT modes a side")
+            positions, losses = [getattr(step, at) for step in chosen], [step.loss for step in chosen]
+            (line,) = axis.plot(positions, losses, "-", label=f"{level} DCT modes a side")
             for accepted, marker in ((True, "o"), (False, "x")):
                 kept = [k for k, step in enumerate(chosen) if step.accepted == accepted]
-                axis.plot([places[k] for k in kept], [losses[k] for k in kept], marker, ms=4, color=line.get_color())
+                axis.plot([positions[k] for k in kept], [losses[k] for k in kept], marker, ms=4, color=line.get_color())
         axis.set_yscale("log")
         axis.set_xlabel(name)
         axis.set_ylabel("loss")

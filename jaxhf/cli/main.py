@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import NoReturn
 
@@ -19,7 +20,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns its exit code: 0, 2 after an error of the user's, 130 after Ctrl-C."""
     options = _parser().parse_args(arguments)
     try:
-        options.run(options)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides
+            warnings.showwarning = lambda message, *_, **__: print(f"jaxhf: warning: {message}", file=sys.stderr)
+            options.run(options)
     except KeyboardInterrupt as interruption:
         print(f"\njaxhf: {str(interruption) or 'interrupted'}", file=sys.stderr)
         return 130

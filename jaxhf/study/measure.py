@@ -42,8 +42,8 @@ def centre_hits(scene: Scene, settings: Settings) -> Int[np.ndarray, "n 5"]:
     for first in range(0, count, _CAST):
         pixels = np.minimum(np.arange(first, first + _CAST), count - 1)
         hit = jax.device_get(cast_camera(scene, pixels % width + 0.5, pixels // width + 0.5, settings))
-        place = np.stack([hit.object, *hit.cell.T, hit.triangle], -1)
-        parts.append(np.concatenate([np.where(hit.object[:, None] >= 0, place, -1), hit.status[:, None]], -1))
+        where = np.stack([hit.object, *hit.cell.T, hit.triangle], -1)
+        parts.append(np.concatenate([np.where(hit.object[:, None] >= 0, where, -1), hit.status[:, None]], -1))
     return np.concatenate(parts)[:count].astype(np.int32)
 
 

@@ -68,13 +68,13 @@ def _draw_task(axes: Any, rows: Sequence[Configuration]) -> None:
 
 def _draw_knob(axes: Any, knob: str, values: Sequence[tuple[str, Configuration]], errors: Sequence[float]) -> None:
     """Time as bars, error as a line; its axis spans all errors of the task, so that what changes nothing looks level."""
-    places, rows = range(len(values)), [row for _, row in values]
-    axes.bar(places, [row.figures["against_base"] for row in rows], width=0.6, color="0.8")
+    positions, rows = range(len(values)), [row for _, row in values]
+    axes.bar(positions, [row.figures["against_base"] for row in rows], width=0.6, color="0.8")
     axes.set_ylabel("time, of the base", fontsize="small")
-    axes.set_xticks(places, [value for value, _ in values], fontsize="small", rotation=30 if len(values) > 4 else 0)
+    axes.set_xticks(positions, [value for value, _ in values], fontsize="small", rotation=30 if len(values) > 4 else 0)
     axes.set_title(f"{rows[0].task}: {knob}", fontsize="medium")
     decades = [math.floor(math.log10(error)) for error in errors]
     right = axes.twinx()
-    right.plot(places, _points(rows)[1], "o-", color="tab:red", markersize=4)
+    right.plot(positions, _points(rows)[1], "o-", color="tab:red", markersize=4)
     right.set(yscale="log", ylim=(10.0 ** min(decades), 10.0 ** (max(decades) + 1)))
     right.set_ylabel(ERRORS[rows[0].task].replace("_", " "), color="tab:red", fontsize="small")

@@ -59,8 +59,8 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None
     def chain(values: jax.Array) -> jax.Array:
         values = jnp.where(hole, jnp.inf, values)
         block = jnp.maximum(jnp.maximum(values[:-1, :-1], values[1:, :-1]), jnp.maximum(values[:-1, 1:], values[1:, 1:]))
-        beyond = ((0, height - (ny - 1)), (0, width - (nx - 1)))
-        block = jnp.pad(block + outwards, beyond, constant_values=-jnp.inf)
+        padding = ((0, height - (ny - 1)), (0, width - (nx - 1)))
+        block = jnp.pad(block + outwards, padding, constant_values=-jnp.inf)
         rows = [block]
         for _ in range(levels):
             block = jnp.maximum(
