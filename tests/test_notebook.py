@@ -22,6 +22,7 @@ def test_notebook_and_text_agree():
     assert NOTEBOOK.stat().st_size < 2**20
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # of Jupyter's own
 def test_notebook_runs_from_top_to_bottom(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(NOTEBOOK.parents[1]))

@@ -420,7 +420,7 @@ def fit_options(**given) -> FitOptions:
     known = {
         name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items() if item.default is not item.empty
     }
-    return FitOptions(**{**known, **given})
+    return FitOptions(**{**known, "settings": jaxhf.Settings(), **given})
 
 
 @pytest.mark.parametrize(("spread", "stage", "scale"), [(2.0, 1, 6.0), (1.05, 4, 3.0), (0.5, 4, 3.0)])

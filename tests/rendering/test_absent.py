@@ -217,7 +217,8 @@ def test_what_is_absent_leaves_no_trace(name, monkeypatch):
 
 
 def test_max_depth_means_nothing_without_mirrors():
-    programs = {Case(scene(), jaxhf.Settings(max_depth=depth)).program() for depth in (0, 1, 7)}
+    programs = {Case(scene(), jaxhf.Settings(max_depth=depth, shading="flat", shadows=False)).program() for depth in (0, 1, 7)}
     assert len(programs) == 1
     mirror = jaxhf.Scene([jaxhf.Object(FIELD, jaxhf.Mirror())], CAMERA, [SUN])
-    assert Case(mirror, jaxhf.Settings(max_depth=1)).program() != Case(mirror, jaxhf.Settings(max_depth=2)).program()
+    one, two = (jaxhf.Settings(max_depth=depth, shading="flat", shadows=False) for depth in (1, 2))
+    assert Case(mirror, one).program() != Case(mirror, two).program()

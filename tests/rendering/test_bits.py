@@ -37,10 +37,10 @@ def perspective(width: int, height: int) -> jaxhf.Perspective:
 
 @pytest.mark.parametrize(
     ("camera", "whole", "crop"),
-    [(orthographic, (64, 64), (32, 32)), (orthographic, (64, 64), (58, 32)), (perspective, (64, 32), (42, 32))],
+    [(orthographic, (64, 64), (58, 32)), (perspective, (64, 32), (42, 32))],
 )
 def test_a_crop_has_the_bits_of_the_whole(camera, whole, crop):
-    """The same pixels lie in other tiles, at other places in them: crops are shifted by 16, by (3, 16) and by 11 pixels."""
+    """The same pixels lie in other tiles, at other places in them: crops are shifted by (3, 16) and by 11 pixels."""
     left, top = ((a - b) // 2 for a, b in zip(whole, crop, strict=True))
     large, small = seen(camera(*whole)), seen(camera(*crop))
     assert np.ptp(large["image"]) > 0.1
@@ -59,16 +59,14 @@ def test_repeated_runs_have_the_same_bits():
         np.testing.assert_array_equal(value, anew[name], name)
 
 
-@pytest.mark.parametrize("shading", ["smooth", "flat"])
-def test_rays_have_the_same_bits_in_any_order_and_number(shading):
+def test_rays_have_the_same_bits_in_any_order_and_number():
     parts = [aimed.aimed(name, GROUND, 100, seed=4, roundable=True) for name in aimed.FAMILIES]
     o, d = np.concatenate([part.o for part in parts]), np.concatenate([part.d for part in parts])
     field = jaxhf.Heightfield(GROUND.heights.astype(np.float32), *GROUND[1:])
-    settings = dataclasses.replace(SETTINGS, shading=shading)
-    whole = jaxhf.cast(field, o, d, settings)
+    whole = jaxhf.cast(field, o, d, SETTINGS)
     shuffled = np.random.default_rng(5).permutation(len(o))
     for chosen in (shuffled, shuffled[:777], shuffled[:65], np.arange(3, len(o), 7)):  # a single chunk is another program
-        part = jaxhf.cast(field, o[chosen], d[chosen], settings)
+        part = jaxhf.cast(field, o[chosen], d[chosen], SETTINGS)
         for field_ in dataclasses.fields(whole):
             if (values := getattr(whole, field_.name)) is not None:
                 np.testing.assert_array_equal(getattr(part, field_.name), np.asarray(values)[chosen], field_.name)

@@ -15,7 +15,7 @@ SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
-@pytest.mark.parametrize("shape", [(2, 2), (2, 9), (33, 17), (64, 64)])
+@pytest.mark.parametrize("shape", [(2, 2), (2, 9), (33, 17), pytest.param((64, 64), marks=pytest.mark.slow)])
 def test_agrees_with_oracle(shape, dtype):
     for scale in (1e-6, 1.0, 1e6):
         ground = aimed.Ground(aimed.random_heights(shape, scale, seed=1), dx=0.5, dy=2.0, x0=-3.0, y0=10.0)

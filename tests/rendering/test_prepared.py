@@ -8,6 +8,7 @@ from jaxhf.io.procedural import fractal
 
 CORNER = (5e6, 4.5e6)  # far from the origin: the camera has to be moved in double precision
 SETTINGS = jaxhf.Settings(normals="four", chunk=256)
+AOVS = ("normal", "cell")
 
 
 def camera(turn: float, width: int = 40) -> jaxhf.Perspective:
@@ -22,8 +23,8 @@ def scene(turn: float = 0.0) -> jaxhf.Scene:
 
 
 def test_prepared_renders_the_same_bits():
-    image, aovs = jaxhf.render(scene(), SETTINGS, aovs=jaxhf.AOVS)
-    prepared_image, prepared_aovs = jaxhf.render(jaxhf.prepare(scene(), SETTINGS), aovs=jaxhf.AOVS)
+    image, aovs = jaxhf.render(scene(), SETTINGS, aovs=AOVS)
+    prepared_image, prepared_aovs = jaxhf.render(jaxhf.prepare(scene(), SETTINGS), aovs=AOVS)
     np.testing.assert_array_equal(prepared_image, image)
     for name, value in aovs.items():
         np.testing.assert_array_equal(prepared_aovs[name], value, name)

@@ -193,23 +193,22 @@ def test_progress_gives_the_same_bits():
 
 
 def test_samples_are_those_of_a_larger_picture():
-    large = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=2 * WIDTH, height=2 * HEIGHT)
-    image = jaxhf.render(scene(samples=4))
-    blocks = np.asarray(jaxhf.render(scene(camera=large))).reshape(HEIGHT, 2, WIDTH, 2, 3)
-    np.testing.assert_allclose(image, blocks.mean((1, 3)), rtol=ROUNDING)
-
-
-def test_derivative_of_several_samples():
+    """The picture, and its derivative."""
     large = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=2 * WIDTH, height=2 * HEIGHT)
     weights = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, 3))
 
     def loss(heights, scene, weights):
-        return jnp.vdot(weights, jaxhf.render(scene.with_heights(heights), PLAIN))
+        image = jaxhf.render(scene.with_heights(heights), PLAIN)
+        return jnp.vdot(weights, image), image
 
-    small = jax.grad(loss)(scene().heights, scene(samples=4), weights)
+    value_and_grad = jax.value_and_grad(loss, has_aux=True)
+    (_, image), gradient = value_and_grad(scene().heights, scene(samples=4), weights)
     repeated = weights.repeat(2, axis=0).repeat(2, axis=1) / 4
-    np.testing.assert_allclose(small, jax.grad(loss)(scene().heights, scene(camera=large), repeated), atol=1e-10)
-    assert np.abs(small).max() > 1
+    (_, large_image), large_gradient = value_and_grad(scene().heights, scene(camera=large), repeated)
+    blocks = np.asarray(large_image).reshape(HEIGHT, 2, WIDTH, 2, 3)
+    np.testing.assert_allclose(image, blocks.mean((1, 3)), rtol=ROUNDING)
+    np.testing.assert_allclose(gradient, large_gradient, atol=1e-10)
+    assert np.abs(gradient).max() > 1
 
 
 def test_samples_round_up_to_a_square():

@@ -36,7 +36,8 @@ def kinds(scene: jaxhf.Scene) -> np.ndarray:
 def rendered(seeds: Path, name: str, shading: str):
     scene = jaxhf.load_scene(seeds / "scenes" / f"{name}.pbrt")
     settings = jaxhf.Settings(samples=1, shading=cast(Shading, shading))
-    image, aovs = jaxhf.render(scene, settings, aovs=("depth", "uv", "normal", "object", "shadow"))
+    aovs = ("depth", "uv", "normal", "object", "shadow") if shading == "flat" else ("normal", "object")
+    image, aovs = jaxhf.render(scene, settings, aovs=aovs)
     assert image.dtype == jnp.float32
     return scene, np.asarray(image), jax.tree.map(np.asarray, aovs)
 

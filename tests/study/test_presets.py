@@ -46,7 +46,9 @@ def reference(scene: Any) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("preset", PROMISES)
-@pytest.mark.parametrize("scene", [mountains, hills, dunes])
+@pytest.mark.parametrize(
+    "scene", [pytest.param(mountains, marks=pytest.mark.slow), pytest.param(hills, marks=pytest.mark.slow), dunes]
+)
 def test_promise(scene, preset):
     picture = Picture(scene(np.float32), Configuration("picture", settings=getattr(jaxhf.Settings, preset)()))
     assert picture.run().dtype == np.float32
