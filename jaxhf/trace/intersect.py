@@ -121,8 +121,8 @@ def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkRes
 
     The ray is one of `_in_grid`, where t is longer by `scale`; `number` is that of the grid's object. Heights and normals at
     the vertices are fetched before the conditional, which in a reverse derivative would return the derivative of all heights
-    and normals once a tile. What the walk itself says passes by both conditionals, as they would copy it (frames take 0.9 of
-    the time).
+    and normals once a tile. What the walk itself says passes by both conditionals, as they would copy it (frames took
+    up to a tenth longer).
     """
     nx, triangle = grid.shape[1], (found.ix, found.iy, found.upper)
     heights = triangle_corners(grid.rows, nx, *triangle)
