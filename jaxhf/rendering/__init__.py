@@ -1,1 +1,1 @@
-"""From a scene to a picture: the only place where pictures are cut into batches."""
+"""From a scene to a picture: how it is cut into tiles, and what is traced for each."""

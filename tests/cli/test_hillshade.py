@@ -9,9 +9,9 @@ import pytest
 from PIL import Image
 
 import jaxhf
+from jaxhf import Terrain
 from jaxhf.cli.hillshade import hillshade_scene
 from jaxhf.cli.main import main
-from jaxhf.io.terrain import Terrain
 
 
 @pytest.fixture(autouse=True)

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jaxhf import load_image, save_image
 from jaxhf.io.files import MAX_PIXELS
-from jaxhf.io.images import load_image, load_numbers, require_writable, save_image
+from jaxhf.io.images import load_numbers, require_writable
 
 
 @pytest.fixture

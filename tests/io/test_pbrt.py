@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxhf import Cylinder, Directional, Matte, Mirror, Point
-from jaxhf.io.errors import SceneError
+from jaxhf import Cylinder, Directional, Matte, Mirror, Point, SceneError
 from jaxhf.io.pbrt import reader
 from jaxhf.io.pbrt.reader import load_pbrt
 

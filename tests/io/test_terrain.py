@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from jaxhf import Terrain, jacksboro, load_heights, save_heights
 from jaxhf.io.files import MAX_PIXELS
 from jaxhf.io.georeference import metres_per_degree
-from jaxhf.io.load_terrain import jacksboro, load_heights
-from jaxhf.io.save_terrain import save_heights
-from jaxhf.io.terrain import Terrain
 
 # What a file with the north first holds: two rows, the northern one 1 2 3.
 NORTH_FIRST = np.array([[1, 2, 3], [4, 5, 6]], np.uint16)

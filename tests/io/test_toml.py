@@ -10,11 +10,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxhf import Cylinder, Directional, Heightfield, ImageTexture, Matte, Mirror, Orthographic, Perspective, Point, Sky
-from jaxhf.io.errors import SceneError
-from jaxhf.io.load_terrain import load_heights
+from jaxhf import (
+    Cylinder,
+    Directional,
+    Heightfield,
+    ImageTexture,
+    Matte,
+    Mirror,
+    Orthographic,
+    Perspective,
+    Point,
+    SceneError,
+    Sky,
+    load_heights,
+    load_scene,
+)
 from jaxhf.io.procedural import grid
-from jaxhf.io.scenes import load_scene
 from jaxhf.io.toml import tables
 from jaxhf.io.toml.fit import load_case
 from jaxhf.io.toml.lines import line_numbers

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.core.settings import Settings
+from jaxhf import Settings
 
 VERTICES = 9
 ROUGH = np.random.default_rng(3).uniform(size=(VERTICES, VERTICES))
