@@ -1,5 +1,6 @@
 """Strictness for every test: double precision is there, types do not promote by themselves, ranks neither."""
 
+import gc
 import os
 import tempfile
 from collections.abc import Iterator
@@ -11,6 +12,9 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# Tracing makes many objects that live on: with fewer collections of them it takes a fifth less time.
+gc.freeze()
+gc.set_threshold(50_000, 50, 100)
 
 SEEDS = Path(__file__).parents[2] / "shared" / "pbrt"
 PEERS = Path(__file__).parents[2] / "shared" / "peers"
