@@ -9,13 +9,13 @@ from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError
 from ..core.settings import Shading
-from ..core.types import Index
+from ..core.types import Flag, Index
 from ..core.vector import unit
 from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sky
 from ..trace.grid import Grid
 from ..trace.world import World
-from .silhouette import EdgeFlags, Viewpoint, all_edges, lit_lengths, seen_lengths, silhouettes
+from .silhouette import EdgeFlags, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
 _TOTAL_WEIGHT = 2**30
@@ -72,6 +72,23 @@ def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
         total = jnp.sum(lengths)
         weights.append(lengths / jnp.where(total > 0, total, 1))
     return jnp.concatenate(weights)
+
+
+def boundaries_in_sight(world: World, camera: Camera) -> Flag:
+    """Whether a silhouette or the terrain's border may be in the frame, or ground that its own shadow may fall on.
+
+    By the edges alone, without tracing a ray: what hides them does not count.
+    """
+    found = jnp.zeros((), bool)
+    for surface in world.surfaces:
+        if not isinstance(surface, Grid):
+            continue
+        seen = silhouettes(surface, Viewpoint(*camera.viewpoint())) & (seen_lengths(surface, camera) > 0)
+        found = found | seen.any()
+        for light in world.lights if world.settings.shadows else ():
+            if not isinstance(light, Sky):
+                found = found | folds(surface, _viewpoint(light)).any()
+    return found
 
 
 def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], shading: Shading) -> EdgeFlags:

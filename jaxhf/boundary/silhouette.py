@@ -39,6 +39,12 @@ def silhouettes(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     return _between(lower, upper, lambda a, b: a != b)
 
 
+def folds(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
+    """The edges with one triangle that faces the viewpoint and one that faces away."""
+    lower, upper = _facing(grid, viewpoint)
+    return _between(lower, upper, lambda a, b: a * b < 0)
+
+
 def all_edges(grid: Grid) -> EdgeFlags:
     """The edges with at least one triangle."""
     present = _present(grid)

@@ -77,11 +77,19 @@ class Boundaries(eqx.Module):
     resampled: Int[jax.Array, " pixels"]
 
 
-def draw_boundaries(world: World, camera: Camera, key: jax.Array, mesh: Mesh) -> Boundaries:
-    """Draws `edge_samples` samples of boundaries."""
-    settings = world.settings
-    chunks = math.ceil(settings.edge_samples / (_ROUNDS * settings.chunk))
-    size = math.ceil(settings.edge_samples / (_ROUNDS * chunks))
+def draw_boundaries(world: World, camera: Camera, key: jax.Array, mesh: Mesh, resampled: int | None = None) -> Boundaries:
+    """Draws `edge_samples` samples of boundaries.
+
+    Args:
+      world: what is seen.
+      camera: what sees it.
+      key: of the random numbers.
+      mesh: the devices that share the work.
+      resampled: how many pixels are resampled; None: as many as take `edge_samples` samples.
+    """
+    settings, edge_samples = world.settings, world.settings.edge_samples or 0
+    chunks = math.ceil(edge_samples / (_ROUNDS * settings.chunk))
+    size = math.ceil(edge_samples / (_ROUNDS * chunks))
     samples, segments, flows = lax.stop_gradient(_draw_edges(world, camera, key, mesh, chunks, size))
     samples = eqx.tree_at(lambda samples: samples.valid, samples, (flows != 0).any((2, 3)))
     column, row = (segments.x[..., axis].astype(jnp.int32).ravel() for axis in (0, 1))
@@ -89,9 +97,10 @@ def draw_boundaries(world: World, camera: Camera, key: jax.Array, mesh: Mesh) ->
 
     # They are chosen by the boundaries alone: a choice by the picture's own samples would keep what these happen to miss.
     sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(2, 3))).ravel()
-    count = min(math.ceil(settings.edge_samples / resampled_side(settings) ** 2), all_pixels)
-    _, resampled = lax.top_k(jnp.zeros(all_pixels, sizes.dtype).at[pixel].add(sizes), count)
-    return Boundaries(samples, flows, pixel, resampled.astype(jnp.int32))
+    count = min(math.ceil(edge_samples / resampled_side(settings) ** 2), all_pixels)
+    count = count if resampled is None else min(resampled, all_pixels)
+    _, chosen = lax.top_k(jnp.zeros(all_pixels, sizes.dtype).at[pixel].add(sizes), count)
+    return Boundaries(samples, flows, pixel, chosen.astype(jnp.int32))
 
 
 def resampled_side(settings: Settings) -> int:

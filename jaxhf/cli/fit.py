@@ -83,6 +83,7 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
     import numpy as np
 
     from ..fitting.fit import fit
+    from ..fitting.history import Draws
     from ..io.toml.fit import load_case
     from .progress import bar
 
@@ -91,9 +92,12 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
     try:
         with bar(bar_format="{desc}", desc="compiling") as shown:
 
-            def progress(step: "Step") -> None:
-                at = f"step {step.step}: {step.level} DCT modes a side"
-                shown.set_description_str(f"{at}, loss {step.loss:.6g}, {step.seconds:.1f} s")
+            def progress(done: "Step | Draws") -> None:
+                if isinstance(done, Draws):
+                    text = f"deviations: sample {done.drawn} of {done.wanted}, {done.remaining:.0f} s to come (Ctrl-C: enough)"
+                else:
+                    text = f"step {done.step}: {done.level} DCT modes a side, loss {done.loss:.6g}, {done.seconds:.1f} s"
+                shown.set_description_str(text)
 
             found = fit(
                 case.scenes, case.targets, settings=case.settings, weights=case.weights, noise=case.noise,
@@ -109,7 +113,10 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
     outputs.checkpoint.unlink(missing_ok=True)
     ny, nx = found.heights.shape
     count = len(case.targets)
-    lines = [
+    lines = [f"warning: {warning}" for warning in found.warnings]
+    if case.noise is None:
+        lines.append(f"noise, estimated: {', '.join(f'{value:.3g}' for value in found.noise)}")
+    lines += [
         f"{name}: {', '.join(f'{float(value):.6g}' for value in values)}"
         for name, values in (("exposures", found.exposures), ("offsets", found.offsets))
         if values is not None
@@ -140,5 +147,5 @@ def _write(path: str, case: "Case", found: "Fit", outputs: Outputs) -> None:
         factors = np.asarray(found.albedo)[::-1]  # a texture begins at v = 0, an image at its top
         save_image(outputs.albedo, factors if factors.shape[-1] == 3 else factors[..., 0])
     if outputs.report is not None:
-        page = report(f"Heights from {path}", found, field, case.targets, case.noise, case.names)
+        page = report(f"Heights from {path}", found, field, case.targets, found.noise, case.names)
         save_text(outputs.report, page)

@@ -24,7 +24,7 @@ img {{ max-width: 100% }} th {{ text-align: left; padding-right: 2em; font-weigh
 
 
 def report(
-    title: str, found: Fit, field: Heightfield, targets: Sequence[np.ndarray], noise: Sequence[float], names: Sequence[str]
+    title: str, found: Fit, field: Heightfield, targets: Sequence[np.ndarray], noise: np.ndarray, names: Sequence[str]
 ) -> str:
     """An HTML page that needs no other file.
 
@@ -118,7 +118,7 @@ def _symmetric(values: np.ndarray) -> dict[str, float]:
     return {"vmin": -top, "vmax": top}
 
 
-def _pictures(found: Fit, targets: Sequence[np.ndarray], noise: Sequence[float], names: Sequence[str]) -> Any:
+def _pictures(found: Fit, targets: Sequence[np.ndarray], noise: np.ndarray, names: Sequence[str]) -> Any:
     height, width = targets[0].shape[:2]
     figure, axes = _figure(len(targets), 3, 10 / 3 * len(targets) * min(1.5, max(0.5, height / width)) + 0.5)
     for row, target, image, residual, deviation, name in zip(

@@ -60,12 +60,13 @@ class Settings:
     max_depth: int = field(
         default=4, metadata={"help": "mirror bounces of a ray, beyond which the rest counts as black", "metavar": "N"}
     )
-    edge_samples: int = field(
-        default=0,
+    edge_samples: int | None = field(
+        default=None,
         metadata={
             "help": "points on terrain edges, in all, at which the derivative of moving silhouettes and shadow boundaries is "
             "taken, and about as many samples more in the pixels that see them, see docs/gradients.md; 0: the derivative that "
             "each sample has by itself, no more; the picture is the same",
+            "none": "0, but in a fit, which chooses by what its scenes show",
             "metavar": "N",
         },
     )
@@ -99,7 +100,7 @@ class Settings:
             raise ArgumentError("Settings", "shadows", f"must be True or False, it is {self.shadows!r}")
         for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("edge_samples", 0), ("chunk", 64)):
             value = getattr(self, name)
-            if value is None and name in ("max_steps", "samples"):
+            if value is None and name in ("max_steps", "samples", "edge_samples"):
                 continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise ArgumentError("Settings", name, f"must be a whole number from {least} on, it is {value!r}")

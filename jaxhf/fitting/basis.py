@@ -14,6 +14,8 @@ from ..scene.heightfield import Heightfield
 # The height of a terrain's longest modes, as a share of the footprint's longer side. A mode's height falls as 1 / frequency
 # from there: as modes of one slope do.
 _STEEPNESS = 0.25
+# The smallest curvature of the loss along a mode, as a share of the median, that its unit makes up for.
+_LEAST_CURVATURE = 1e-6
 
 
 class Unknowns(eqx.Module):
@@ -34,12 +36,13 @@ class Unknowns(eqx.Module):
 
 
 class Basis(eqx.Module):
-    """Heights as `base` plus a sum of DCT-II modes (products of two cosines), each in units of about one slope.
+    """Heights as `base` plus a sum of DCT-II modes (products of two cosines), each in a unit of its own.
 
-    Shading sees slopes, so modes of one slope change a picture by as much, whatever their wavelength, and the solver's
-    linear problem is well conditioned; neighbouring heights move together. That is preconditioning by smoothness as in Nicolet
-    et al., Large steps in inverse rendering of geometry (2021), whose (I + λL)⁻¹ is diagonal here, with the power that fits
-    shading; as a change of variables it serves solvers that take no preconditioner.
+    Shading sees slopes, so modes of one slope change a picture by as much, whatever their wavelength: in units of one slope
+    the solver's linear problem is well conditioned, and neighbouring heights move together. That is preconditioning by
+    smoothness as in Nicolet et al., Large steps in inverse rendering of geometry (2021), whose (I + λL)⁻¹ is diagonal here,
+    with the power that fits shading. `balanced_units` goes further (Jacobi's preconditioner): units in which the loss has the
+    same curvature along every mode. As a change of variables both serve solvers that take no preconditioner.
 
     The normal derivative of every mode is zero at the edge of the grid. Where that would constrain the heights too much (a
     prior with correlated errors), the grid is padded on each side by vertices that no picture shows.
@@ -84,14 +87,16 @@ def _product(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
-def make_basis(field: Heightfield, base: Float[np.ndarray, "my mx"], cutoff: float = 1.0, mean_scale: float = 1.0) -> Basis:
+def make_basis(
+    field: Heightfield, base: Float[np.ndarray, "my mx"], cutoff: float = 1.0, units: Float[np.ndarray, "my mx"] | None = None
+) -> Basis:
     """The modes up to a share `cutoff` of the highest frequency, about `base`.
 
     Args:
       field: whose heights they are; only its size, spacing and precision count.
       base: may be padded, see `pad`.
       cutoff: modes above are not varied; nor is the mean of all heights, unless it is 1.
-      mean_scale: multiplies the unit of the mean.
+      units: the height of each mode whose coefficient is 1; None: those of one slope.
     """
     ny, nx = base.shape
     padding = ((ny - field.heights.shape[0]) // 2, (nx - field.heights.shape[1]) // 2)
@@ -106,12 +111,42 @@ def make_basis(field: Heightfield, base: Float[np.ndarray, "my mx"], cutoff: flo
     # The mean height shows only in how far things shift and grow in the picture: while high frequencies are left out, what
     # they leave unexplained would be taken for it (0.5 of the footprint in a case of 0.1 relief).
     varied[0, 0] = cutoff >= 1
-    prior_amplitude = 1 / (1 + frequency)
-    scale[0, 0] *= mean_scale
-    prior_amplitude[0, 0] /= mean_scale
-    unit = jnp.asarray(scale * varied, dtype)
+    units = scale if units is None else units
+    prior_amplitude = scale / units / (1 + frequency)
     rows, columns = jnp.asarray(dct_matrix(ny), dtype), jnp.asarray(dct_matrix(nx), dtype)
-    return Basis(rows, columns, unit, jnp.asarray(prior_amplitude, dtype), jnp.asarray(base, dtype), padding)
+    return Basis(
+        rows,
+        columns,
+        jnp.asarray(units * varied, dtype),
+        jnp.asarray(prior_amplitude, dtype),
+        jnp.asarray(base, dtype),
+        padding,
+    )
+
+
+def balanced_units(
+    slope_units: Float[np.ndarray, "my mx"], curvature: Float[np.ndarray, "my mx"], mean_only: bool = False
+) -> Float[np.ndarray, "my mx"]:
+    """Units of the modes in which the loss has curvature 1 along each of them.
+
+    Along the mean of all heights, which pictures hardly show, the curvature in units of one slope is ten thousand times less
+    than along other modes.
+
+    Args:
+      slope_units: `Basis.scale` of all modes in units of one slope.
+      curvature: of the loss along each mode, for a mode of unit height; 0: unknown.
+      mean_only: leave all but the mean in units of one slope, and it in one where its curvature is the median of theirs.
+    """
+    per_slope = curvature * slope_units**2
+    if not (per_slope > 0).any():
+        return slope_units
+    typical = float(np.median(per_slope[per_slope > 0]))
+    balanced = slope_units / np.sqrt(np.maximum(per_slope, _LEAST_CURVATURE * typical))
+    if mean_only:
+        units = slope_units.copy()
+        units[0, 0] = max(balanced[0, 0] * np.sqrt(typical), slope_units[0, 0])
+        return units
+    return balanced
 
 
 def pad(values: Float[np.ndarray, "ny nx"], padding: tuple[int, int]) -> Float[np.ndarray, "my mx"]:

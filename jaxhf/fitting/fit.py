@@ -6,9 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float
@@ -19,14 +17,16 @@ from ..core.types import AnyArray
 from ..io.errors import FileError
 from ..io.files import require_folder
 from ..scene.scene import Scene
-from .basis import Unknowns, make_basis
-from .history import Step, Stop
+from .basis import Unknowns
+from .defaults import choose_settings
+from .diagnosis import Findings, Places, Region, warnings, where_residuals_are, worst_regions
+from .history import Draws, Step, Stop
 from .loop import FitLoop
 from .options import Albedo, FitOptions, Loss, Solver
-from .problem import Problem, make_problem
+from .problem import Problem, make_problem, require_scenes
 from .residuals import pictures_and_influence
 from .solvers import BFGS_UNKNOWNS, count_unknowns
-from .uncertainty import require_small, standard_deviations
+from .uncertainty import require_small, standard_deviations, with_unexplained
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,10 +41,13 @@ class Fit:
       seen: whether a change of the height would change any picture, shape (ny, nx).
       albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c); None where it was known.
       exposures, offsets: of each picture; None where they were known.
+      noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated.
       images: the pictures as they would be measured, (h, w) or (h, w, c) each, as their targets.
       residuals: `images` - targets; 0 where a target has no weight.
-      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals in units of `noise`: about 1
-        where `noise` is right and all is explained.
+      regions: the three blocks of the pictures with the largest residuals.
+      warnings: what speaks against trusting the heights, a sentence each; empty where nothing does.
+      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals in units of `noise`, but for those
+        that are exactly 0: about 1 where `noise` is right and all is explained.
       history: a `Step` for each step.
     """
 
@@ -55,8 +58,11 @@ class Fit:
     albedo: Float[AnyArray, "ty tx c"] | None
     exposures: Float[AnyArray, " pictures"] | None
     offsets: Float[AnyArray, " pictures"] | None
+    noise: Float[np.ndarray, " pictures"]
     images: tuple[np.ndarray, ...]
     residuals: tuple[np.ndarray, ...]
+    regions: tuple[Region, ...]
+    warnings: tuple[str, ...]
     stats: dict[str, int | float]
     history: tuple[Step, ...]
 
@@ -67,7 +73,7 @@ def fit(
     *,
     settings: Settings | None = None,
     weights: Sequence[Any] | None = None,
-    noise: Any = 0.01,
+    noise: Any = None,
     start: Any = None,
     prior: Any = None,
     prior_std: Any = None,
@@ -78,15 +84,15 @@ def fit(
     albedo_smoothness: float | int | None = None,
     exposures: bool = False,
     offsets: bool = False,
-    loss: Loss | str = "squares",
+    loss: Loss | str = "geman",
     loss_scale: float | int = 3.0,
     solver: Solver | str = "lm",
     levels: Sequence[float] | None = None,
     max_steps: int = 100,
     inner_steps: int = 60,
-    tolerance: float | int = 1e-4,
+    tolerance: float | int | None = None,
     uncertainty: int | str | None = None,
-    progress: Callable[[Step], None] | bool = False,
+    progress: Callable[[Step | Draws], None] | bool = False,
     checkpoint: str | os.PathLike[str] | None = None,
     checkpoint_every: int = 10,
     resume: bool = False,
@@ -153,8 +159,10 @@ def fit(
       KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
     scenes, targets = tuple(scenes), tuple(targets)
+    require_scenes(scenes, targets)
+    settings = choose_settings(scenes, settings or Settings(), albedo == "known")
     options = FitOptions(
-        settings=settings or Settings(), weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
+        settings=settings, weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
         prior_length=prior_length, prior_exponent=prior_exponent, smoothness=smoothness, albedo=albedo,
         albedo_smoothness=albedo_smoothness, exposures=exposures, offsets=offsets, loss=loss, loss_scale=loss_scale,
         solver=solver, levels=levels, max_steps=max_steps, inner_steps=inner_steps, tolerance=tolerance,
@@ -168,10 +176,7 @@ def fit(
     field = scenes[0].heightfields[0]
     loop = FitLoop(problem, unknowns, field, options)
     result = loop.run()
-    # At whatever level it stopped, the standard deviations are those of all modes.
-    basis = make_basis(field, np.asarray(loop.problem.basis.surface(loop.unknowns.coefficients)))
-    loop.problem = eqx.tree_at(lambda problem: problem.basis, loop.problem, basis)
-    loop.unknowns = eqx.tree_at(lambda u: u.coefficients, loop.unknowns, jnp.zeros_like(loop.unknowns.coefficients))
+    loop.set_all_modes()
     return _report(loop, result, targets)
 
 
@@ -196,44 +201,116 @@ def _require_place(checkpoint: Path, resume: bool) -> None:
         raise FileError(f"{checkpoint}: this checkpoint is there already; resume=True goes on from it, to begin anew remove it")
 
 
+def _in_shape(image: Float[np.ndarray, "h w c"], shape: tuple[int, ...]) -> np.ndarray:
+    """An image in the shape of its target; a grey one that was given with three channels is compared as one."""
+    return np.broadcast_to(image, (*image.shape[:2], *shape[2:])).copy() if len(shape) == 3 else image[..., 0]
+
+
 def _report(loop: FitLoop, result: Stop, targets: Sequence[Any]) -> Fit:
-    problem, unknowns, uncertainty = loop.problem, loop.unknowns, loop.options.uncertainty
+    problem, unknowns, options = loop.problem, loop.unknowns, loop.options
     images: list[np.ndarray] = [np.zeros(())] * problem.count
     differences: list[np.ndarray] = [np.zeros(())] * problem.count
-    square, count = 0.0, 0
+    in_noise: list[np.ndarray] = [np.zeros(())] * problem.count
     pictures, influence = pictures_and_influence(unknowns, problem)
     for group, simulated in zip(problem.groups, pictures, strict=True):
         simulated, weights = np.asarray(simulated), np.asarray(group.weights)
         difference = np.where(weights > 0, simulated - np.asarray(group.targets), 0)
-        with np.errstate(over="ignore"):
-            square += float(np.sum((difference * weights) ** 2))
-        count += int(np.sum(weights > 0))
-        for k, image, values in zip(group.indices, simulated, difference, strict=True):
+        for k, image, values, weight in zip(group.indices, simulated, difference, weights, strict=True):
             shape = np.shape(targets[k])
-            images[k], differences[k] = image.reshape(shape), values.reshape(shape)
+            images[k], differences[k] = _in_shape(image, shape), _in_shape(values, shape)
+            in_noise[k] = values * weight
+    # A background that is black in picture and target says nothing.
+    counted = np.concatenate([values[values != 0] for values in in_noise])
+    with np.errstate(over="ignore"):
+        chi2 = float(np.mean(np.square(counted, dtype=np.float64))) if len(counted) else 0.0
     seen = np.asarray(influence) != 0
-    std = None
-    if uncertainty is not None and result is not Stop.NON_FINITE:
-        std = standard_deviations(unknowns, problem, uncertainty, loop.options.inner_steps)
+    std, scaled, draws = None, None, None
+    if options.uncertainty is not None and result is not Stop.NON_FINITE:
+        borne_out, scaled = with_unexplained(unknowns, problem)
+        std, drawn = standard_deviations(unknowns, borne_out, options.uncertainty, options.inner_steps, loop.progress)
+        draws = None if drawn is None else (int(options.uncertainty), drawn)
         if problem.prior is None:
             std = np.where(seen, std, np.inf)
+    heights = problem.basis.crop(problem.basis.base)
+    regions = worst_regions(in_noise)
+    findings = Findings(
+        result=result,
+        chi2=chi2,
+        noise_given=options.noise is not None,
+        where=where_residuals_are(in_noise, _places(problem)),
+        regions=regions,
+        help=_what_may_help(problem),
+        strayed=_strayed(problem, np.asarray(heights), seen, options.prior_std),
+        seen=seen,
+        lights=_light_directions(problem),
+        scaled=scaled,
+        draws=draws,
+    )
     stats = {
         "steps": len(loop.history),
         "accepted": sum(step.accepted for step in loop.history),
         "seconds": loop.elapsed(),
         "loss": loop.best[0],
-        "chi2": square / count,
+        "chi2": chi2,
     }
     return Fit(
-        heights=problem.basis.crop(problem.basis.base),
+        heights=heights,
         result=result,
         std=std,
         seen=seen,
         albedo=unknowns.albedo,
         exposures=unknowns.exposures,
         offsets=unknowns.offsets,
+        noise=problem.noise,
         images=tuple(images),
         residuals=tuple(differences),
+        regions=regions,
+        warnings=warnings(findings),
         stats=stats,
         history=tuple(loop.history),
     )
+
+
+def _places(problem: Problem) -> list[Places]:
+    """Where boundaries are in each picture."""
+    found = [Places(np.zeros((1, 1), bool), None)] * problem.count
+    for number, group in enumerate(problem.groups):
+        h, w = group.targets.shape[1:3]
+        known = None if problem.linearised is None else problem.linearised[number]
+        for position, k in enumerate(group.indices):
+            if known is None:
+                found[k] = Places(np.zeros((h, w), bool), None)
+            elif known.edges is None:
+                found[k] = Places(~np.asarray(known.depends[position]), None)
+            else:
+                pixel, kind = np.asarray(known.edges.pixel[position]), np.asarray(known.edges.kind[position])
+                silhouettes, shadows = (np.bincount(pixel[kind == which], minlength=h * w) > 0 for which in (1, 2))
+                found[k] = Places(silhouettes.reshape(h, w), shadows.reshape(h, w))
+    return found
+
+
+def _what_may_help(problem: Problem) -> str:
+    """The one option to try where pictures are left unexplained."""
+    if problem.loss == "squares":
+        return "loss='geman' lets pixels go that the scene cannot explain"
+    if not problem.settings.edge_samples:
+        return "Settings(edge_samples=None), the default, lets the fit move silhouettes, shadows and the terrain's border"
+    if (problem.settings.samples or 1) < 16:
+        return "Settings(samples=16) makes pictures of finer samples; if that changes nothing, mask those pixels by weights"
+    return "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo)"
+
+
+def _strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: Any) -> float | None:
+    if problem.prior is None or not seen.any():
+        return None
+    ratio = (heights - np.asarray(problem.basis.crop(problem.prior.heights))) / np.asarray(prior_std, np.float64)
+    return float(np.sqrt(np.mean(ratio[seen] ** 2)))
+
+
+def _light_directions(problem: Problem) -> int:
+    """How many different sets of lights the pictures have."""
+    found = set()
+    for group in problem.groups:
+        for k in range(len(group.indices)):
+            found.add(b"".join(np.asarray(leaf[k]).tobytes() for leaf in jax.tree.leaves(group.scenes.lights)))
+    return len(found)

@@ -36,7 +36,30 @@ class Step(NamedTuple):
     seconds: float
 
 
-def print_step(step: Step) -> None:
+class Draws(NamedTuple):
+    """How far the samples of the standard deviations are.
+
+    Attributes:
+      drawn, wanted: samples so far, and in all.
+      seconds: that they took.
+      remaining: seconds that the others will take.
+    """
+
+    drawn: int
+    wanted: int
+    seconds: float
+    remaining: float
+
+
+def print_progress(done: Step | Draws) -> None:
+    if isinstance(done, Draws):
+        line = f"sample {done.drawn} of {done.wanted}, {done.seconds:.1f} s, {done.remaining:.1f} s to come"
+        print(line, file=sys.stderr, flush=True)
+    else:
+        _print_step(done)
+
+
+def _print_step(step: Step) -> None:
     suffix = "" if step.accepted else ", not accepted"
     print(
         f"step {step.step}: {step.level} modes a side, loss {step.loss:.6g}, λ {step.damping:.2g}, "

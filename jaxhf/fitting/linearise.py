@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.sharding import Mesh
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..boundary.guiding import edge_sets
 from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
@@ -37,13 +37,17 @@ from ..trace.world import World, make_world, resolve_settings
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
 _TOGETHER = 1024
+# Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
+_POINTS_PER_PIXEL = 4
 
 
 class Linearised(eqx.Module):
     """A picture, and its derivative in the heights and normals at the vertices of its scene.
 
     Attributes:
-      image: shape (h, w, c).
+      image: shape (h, w, c). Pixels that are resampled have the mean of those samples: where a boundary crosses a pixel, few
+        samples make a staircase, on which no step along the derivative leads down.
+      depends: whether any of a pixel's samples changes with the heights, shape (h, w).
       slopes: derivatives of each sample, (chunks, c, 3 or 12, samples): in the three heights, then, vertex by vertex, in the
         normals.
       vertices: the numbers of those three vertices over all grids, (chunks, 3, samples).
@@ -51,6 +55,7 @@ class Linearised(eqx.Module):
     """
 
     image: Float[jax.Array, "*n h w c"]
+    depends: Bool[jax.Array, "*n h w"]
     slopes: Float[jax.Array, "*n chunks c k samples"]
     vertices: Int[jax.Array, "*n chunks 3 samples"]
     edges: "LinearisedEdges | None"
@@ -63,12 +68,14 @@ class LinearisedEdges(eqx.Module):
       slopes: derivatives of the light in five heights, (chunks, c, 5, size).
       vertices: the numbers of their vertices, (chunks, 5, size).
       pixel: which pixel each boundary sample is in; they are numbered row by row.
+      kind: 0 where a sample does not count, 1 where its edge is seen where it stands, 2 where its shadow is.
       resampled: the pixels that are resampled, by samples after the picture's.
     """
 
     slopes: Float[jax.Array, "*n chunks c 5 size"]
     vertices: Int[jax.Array, "*n chunks 5 size"]
     pixel: Int[jax.Array, "*n points"]
+    kind: Int[jax.Array, "*n points"]
     resampled: Int[jax.Array, "*n pixels"]
 
 
@@ -110,7 +117,7 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int) -> L
     key = default_key(None, world.settings, mesh)
     drawn = None
     if key is not None and edge_sets(world):
-        drawn = draw_boundaries(world, camera, key, mesh)
+        drawn = draw_boundaries(world, camera, key, mesh, math.ceil((world.settings.edge_samples or 0) / _POINTS_PER_PIXEL))
     points = _sample_points(camera, world.settings)
     if drawn is not None:
         points = _in_a_row(points, _resampled_points(camera, world.settings, drawn))
@@ -119,8 +126,13 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int) -> L
     if drawn is not None:
         followed = functools.partial(_boundary_samples, channels)
         edge_slopes, edge_vertices = map_over(mesh, followed, (world, camera), (drawn.samples, drawn.flows))
-        edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, drawn.resampled)
-    return Linearised(image, slopes, vertices, edges)
+        kind = jnp.where(drawn.samples.valid, jnp.where(drawn.samples.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
+        edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled)
+        finer = _resampled_means(light, edges, camera, world.settings)
+        image = image.reshape(-1, channels).at[drawn.resampled].set(finer, unique_indices=True).reshape(image.shape)
+    moving = (slopes != 0).any(axis=(1, 2)).astype(light.dtype)[..., None]
+    depends = _in_pixels(moving, camera, world.settings)[..., 0] > 0
+    return Linearised(image, depends, slopes, vertices, edges)
 
 
 def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "h w c"]:
@@ -130,10 +142,7 @@ def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) ->
     change = _in_pixels(moved, scene.camera, settings)
     if known.edges is not None:
         edges, flat = known.edges, change.reshape(-1, change.shape[-1])
-        tiling, samples = Tiling(scene.camera, settings), settings.samples
-        assert samples is not None
-        shape = (edges.resampled.shape[0], resampled_side(settings) ** 2)
-        finer = moved[tiling.count * samples :].reshape(-1, moved.shape[-1])[: shape[0] * shape[1]].reshape(*shape, -1).mean(1)
+        finer = _resampled_means(moved, edges, scene.camera, settings)
         heights = at_vertices[:, 0].at[edges.vertices].get(mode="promise_in_bounds")
         light = jnp.moveaxis(jnp.sum(edges.slopes * heights[:, None], axis=2), 1, -1)
         flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, flat.shape[1]))
@@ -147,6 +156,16 @@ def _in_pixels(values: Float[jax.Array, "chunks n c"], camera: Camera, settings:
     assert samples is not None
     tiles = values[: tiling.count * samples].reshape(tiling.count, samples, *values.shape[1:])
     return tiling.assemble(tiles.sum(1) / samples)
+
+
+def _resampled_means(
+    values: Float[jax.Array, "chunks n c"], edges: LinearisedEdges, camera: Camera, settings: Settings
+) -> Float[jax.Array, "pixels c"]:
+    """The means over the samples of the pixels that are resampled."""
+    tiling, samples = Tiling(camera, settings), settings.samples
+    assert samples is not None
+    shape = (edges.resampled.shape[0], resampled_side(settings) ** 2)
+    return values[tiling.count * samples :].reshape(-1, values.shape[-1])[: shape[0] * shape[1]].reshape(*shape, -1).mean(1)
 
 
 def _channels(light: Float[jax.Array, "*rest 3"], channels: int) -> Float[jax.Array, "*rest c"]:

@@ -5,6 +5,7 @@ import hashlib
 import itertools
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,31 +13,36 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..io.checkpoint import load_arrays, load_facts, save_checkpoint
 from ..io.errors import FileError
 from ..scene.heightfield import Heightfield
-from .basis import Unknowns, make_basis
-from .history import Step, Stop, print_step
+from .basis import Unknowns, balanced_units, make_basis
+from .history import Step, Stop, print_progress
 from .options import FitOptions
-from .problem import Problem
-from .residuals import pictures_and_influence
-from .solvers import Outcome, advance, init_state, make_solver, reset_state, with_rejections
+from .problem import Problem, mode_curvature
+from .residuals import heights_of, linearised, pictures_and_influence
+from .solvers import DEFAULT_TOLERANCE, Outcome, advance, evaluated_at, init_state, make_solver, reset_state, with_rejections
 
-_REJECTIONS = 5  # in a row: the last trial had 4 · 8 · 16 · 32 times the damping of the first
+_REJECTIONS = 3  # in a row: the last trial had 10 · 20 · 40 times the damping of the first
 _HALVINGS = 50  # in a row, in a line search, whose first step is the whole gradient
 _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
-_NEAR_FINAL = 1.1  # a robust loss's scale within this factor of the final one is taken for it
-_ROBUST_STAGES = 3  # over which the scale of a robust loss comes down to its own
+_FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviation that their noise leaves them with
+_COARSE_GAIN = 0.02  # of the loss, where another stage follows
+_COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
+_SETTLED = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
+_LAST_STAGES = 3  # at most, over which the scale of a robust loss comes down to its own, or the noise settles
+_PROBES = 4  # of the pictures' curvature
 
 
 def make_stages(shape: tuple[int, ...], options: FitOptions) -> list[float]:
-    """The share of the highest frequency that each stage varies: the levels, then 1 while a robust loss's scale comes down."""
+    """The share of the highest frequency that each stage varies: the levels, then 1 while loss and noise settle."""
     levels = options.levels
     if levels is None:
         doublings = max(0, math.floor(math.log2(max(shape) / 8))) if options.solver == "lm" else 0
         levels = [0.5**k for k in range(doublings, -1, -1)]
-    return [*levels, *[1.0] * (0 if options.loss == "squares" else _ROBUST_STAGES)]
+    return [*levels, *[1.0] * (0 if options.loss == "squares" and options.noise is not None else _LAST_STAGES)]
 
 
 class FitLoop:
@@ -50,21 +56,24 @@ class FitLoop:
         self.solver = make_solver(options)
         self.stages = make_stages(field.heights.shape, options)
         self.path = None if options.checkpoint is None else Path(options.checkpoint)
-        self.progress = print_step if options.progress is True else options.progress or None
+        self.progress = print_progress if options.progress is True else options.progress or None
         self.stage = -1
         self.history: list[Step] = []
         self.stage_start = 0  # steps taken before this stage
         self.best = (math.inf, unknowns)
         self.converged = False  # the last step says so
+        self.predicted = math.inf  # gain of the next step
         self.snapshot: tuple[dict[str, Any], Any] | None = None  # for the next checkpoint
         self.final_loss_scale = None if problem.loss_scale is None else float(problem.loss_scale)
-        self.mean_scale = 1.0  # see `make_basis`
+        self.noise = problem.noise
+        self.units: np.ndarray | None = None  # see `make_basis`
+        self.views: list[tuple[list[np.ndarray], Any]] = []  # linearised pictures, with the unknowns that they belong to
         self.seconds = 0.0  # spent before a resumption
 
     def run(self) -> Stop:
         self.started = time.perf_counter()
         self.fingerprint = _fingerprint(self.problem, self.options) if self.path else ""
-        self.initial_state = init_state(self.solver, self.unknowns, self.problem)
+        self.initial_state = init_state(self.solver, self.unknowns, self.known(self.unknowns))
         self.state = self.initial_state
         if self.path and self.options.resume and self.path.exists():
             self._load()
@@ -74,11 +83,10 @@ class FitLoop:
             while True:
                 stop = self._stage_ended()
                 while stop is not None:
-                    if stop in (Stop.MAX_STEPS, Stop.NON_FINITE) or self.stage + 1 == len(self.stages):
+                    if stop in (Stop.MAX_STEPS, Stop.NON_FINITE) or not self._next_stage():
                         self._save()  # what comes now, standard deviations, may take long
                         self.unknowns = self.best[1]
                         return stop
-                    self._next_stage()
                     stop = self._stage_ended()
                 self._step()
                 if len(self.history) % self.options.checkpoint_every == 0:
@@ -87,61 +95,107 @@ class FitLoop:
             self._save()
             raise
 
+    def known(self, unknowns: Unknowns) -> Problem:
+        """The problem, `linearised` at these unknowns; the pictures of the best unknowns and of the last ones are kept."""
+        heights = np.asarray(heights_of(unknowns, self.problem.basis))
+        others = eqx.tree_at(lambda u: u.coefficients, unknowns, None, is_leaf=lambda leaf: leaf is None)
+        at = [heights, *map(np.asarray, jax.tree.leaves(others))]
+        found = next((found for place, found in self.views if all(map(np.array_equal, place, at))), None)
+        if found is None:
+            found = linearised(unknowns, self.problem).linearised
+        best = [view for view in self.views if view[1] is not found and np.array_equal(view[0][0], self._best_heights())]
+        self.views = [(at, found), *best[:1]]
+        return dataclasses.replace(self.problem, linearised=found)
+
+    def _best_heights(self) -> np.ndarray:
+        return np.asarray(heights_of(self.best[1], self.problem.basis))
+
     def elapsed(self) -> float:
         """Seconds since the fit began, with those before a resumption."""
         return self.seconds + time.perf_counter() - self.started
 
-    def _next_stage(self) -> None:
-        """Makes the best surface the base, and varies more modes about it, or lowers the scale of the robust loss."""
-        self.unknowns = self.best[1]
-        surface = self.problem.basis.surface(self.unknowns.coefficients)
-        self.unknowns = eqx.tree_at(lambda u: u.coefficients, self.unknowns, jnp.zeros_like(self.unknowns.coefficients))
-        self.stage += 1
-        self.stage_start = len(self.history)
-        self._set_basis(np.asarray(surface))
-        pictures, influence = pictures_and_influence(self.unknowns, self.problem)
-        spread = _spread(pictures, self.problem)
-        if self.stages[self.stage] == 1:
-            self.mean_scale = self._mean_scale(pictures, np.asarray(influence))
-            self._set_basis(np.asarray(surface))
+    def _next_stage(self) -> bool:
+        """Makes the best surface the base, and varies more modes about it, or lets the loss and the noise settle.
+
+        Returns whether there is such a stage: not after the last, nor where it would repeat the one before.
+        """
+        if self.stage + 1 == len(self.stages):
+            return False
+        unknowns = self.best[1]
+        surface = np.asarray(self.problem.basis.surface(unknowns.coefficients))
+        unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, jnp.zeros_like(unknowns.coefficients))
+        share, repeats = self.stages[self.stage + 1], self.stage >= 0 and self.stages[self.stage] == 1
+        known = self.known(self.best[1])
+        probes = [pictures_and_influence(self.best[1], known, key) for key in range(_PROBES)]
+        spreads = _spreads(probes[0][0], known)
+        noise = self._settled_noise(spreads, share)
+        spread = float(np.max(spreads * self.noise / noise)) if self.options.noise is None else _pooled(spreads)
+        scale = None
         if self.final_loss_scale is not None:
-            if min(self.stages[self.stage :]) == 1 and 3 * spread <= _NEAR_FINAL * self.final_loss_scale:
-                self.stage = len(self.stages) - 1  # those between would be this one again
-            last = self.stage + 1 == len(self.stages)
-            scale = jnp.asarray(self.final_loss_scale if last else max(self.final_loss_scale, 3 * spread), surface.dtype)
-            self.problem = eqx.tree_at(lambda problem: problem.loss_scale, self.problem, scale)
+            scale = max(self.final_loss_scale, 3 * spread)
+            if scale <= _SETTLED * self.final_loss_scale or self.stage + 2 == len(self.stages):
+                scale = self.final_loss_scale
+        if repeats and np.array_equal(noise, self.noise) and (scale is None or scale == self._loss_scale()):
+            return False
+        self.stage += 1
+        self.unknowns, self.stage_start = unknowns, len(self.history)
+        self.set_noise(noise)
+        self.units = self._measured_units([np.asarray(influence) for _, influence in probes])
+        self._set_basis(surface)
+        if scale is not None:
+            self.problem = dataclasses.replace(self.problem, loss_scale=jnp.asarray(scale, self.field.heights.dtype))
         self.best = (math.inf, self.unknowns)
         self.state = reset_state(self.initial_state, self.unknowns)
         self._take_snapshot()
+        return True
+
+    def _loss_scale(self) -> float | None:
+        return None if self.problem.loss_scale is None else float(self.problem.loss_scale)
 
     def _set_basis(self, base: np.ndarray) -> None:
-        basis = make_basis(self.field, base, self.stages[self.stage], self.mean_scale)
+        basis = make_basis(self.field, base, self.stages[self.stage], self.units)
         self.problem = eqx.tree_at(lambda problem: problem.basis, self.problem, basis)
 
-    def _mean_scale(self, pictures: list[jax.Array], influence: np.ndarray) -> float:
-        """Sensitivity of the pictures to a typical DCT mode divided by that to the mean height, from 1 to 1000.
+    def set_noise(self, noise: np.ndarray) -> None:
+        """Weighs the residuals of each picture by another standard deviation."""
+        if not np.array_equal(noise, self.noise):
+            self.problem = self.problem.with_noise(noise)
+            self.noise = noise
 
-        Without it the solver's linear problem has one direction that is a hundred times weaker than the rest.
+    def _settled_noise(self, spreads: np.ndarray, share: float) -> np.ndarray:
+        """The noise of each picture by its residuals, where none is given; unchanged where it would hardly change.
+
+        Args:
+          spreads: of each picture's residuals, in units of the present noise.
+          share: of the modes that the stage to come varies.
         """
+        if self.options.noise is not None:
+            return self.noise
+        noise = np.maximum(spreads * self.noise, self.problem.least_noise)
+        changes = np.maximum(noise / self.noise, self.noise / noise)
+        return self.noise if share == 1 and changes.max() < _SETTLED else noise
+
+    def _measured_units(self, influences: Sequence[np.ndarray]) -> np.ndarray:
+        """Units of the modes by the curvature of the loss, see `balanced_units`."""
         basis = make_basis(self.field, np.asarray(self.problem.basis.base))
-        scale, rows, columns = np.asarray(basis.scale), np.asarray(basis.rows), np.asarray(basis.columns)
-        gradient = rows @ np.pad(influence, [(n, n) for n in basis.padding]) @ columns.T
-        typical = np.sqrt(np.median((scale * gradient) ** 2) / 0.455)  # the median of a squared normal
-        height = math.sqrt(np.finfo(scale.dtype).eps) * scale[0, 0]
-        raised = eqx.tree_at(
-            lambda u: u.coefficients, self.unknowns, self.unknowns.coefficients.at[0, 0].add(height / scale[0, 0])
+        curvature = mode_curvature(self.problem, influences)
+        return balanced_units(np.asarray(basis.scale, np.float64), curvature, mean_only=self.options.solver != "lm")
+
+    def set_all_modes(self) -> None:
+        """Varies all modes about the present surface, whatever the level at which the fit stopped."""
+        surface = np.asarray(self.problem.basis.surface(self.unknowns.coefficients))
+        known = self.known(self.unknowns)
+        self.units = self._measured_units(
+            [np.asarray(pictures_and_influence(self.unknowns, known, key)[1]) for key in range(_PROBES)]
         )
-        moved, _ = pictures_and_influence(raised, eqx.tree_at(lambda p: p.basis, self.problem, basis))
-        pairs = zip(self.problem.groups, moved, pictures, strict=True)
-        change = np.concatenate([np.ravel(group.weights * (a - b)) for group, a, b in pairs]) / (height / scale[0, 0])
-        # A few pixels on edges jump: their share is bounded by that of the others.
-        bound = 10 * np.median(np.abs(change[change != 0])) if change.any() else 0.0
-        of_mean = float(np.linalg.norm(np.clip(change, -bound, bound)))
-        return float(np.clip(typical / of_mean, 1.0, 1e3)) if of_mean > 0 else 1.0
+        basis = make_basis(self.field, surface, 1.0, self.units)
+        self.problem = dataclasses.replace(known, basis=basis)
+        self.unknowns = eqx.tree_at(lambda u: u.coefficients, self.unknowns, jnp.zeros_like(self.unknowns.coefficients))
 
     def _step(self) -> None:
         solver = with_rejections(self.solver, self._rejections())
-        self.unknowns, self.state, outcome = advance(solver, self.unknowns, self.state, self.problem)
+        known = self.known(evaluated_at(self.unknowns, self.state))
+        self.unknowns, self.state, outcome = advance(solver, self.unknowns, self.state, known)
         self._record(outcome)
 
     def _rejections(self) -> int:
@@ -158,37 +212,54 @@ class FitLoop:
         step = Step(len(self.history) + 1, level, loss, accepted, damping, change, self.elapsed())
         self.history.append(step)
         self.converged = bool(outcome.converged)
+        self.predicted = float(outcome.predicted) if self.options.solver == "lm" else math.inf
         self._take_snapshot()
         if self.progress:
             self.progress(step)
 
     def _stage_ended(self) -> Stop | None:
-        """Why this stage is over, or None; all stages but the last have a tolerance of at least 0.02."""
+        """Why this stage is over, or None; one that another follows ends sooner."""
         steps = self.history[self.stage_start :]
         if not steps:
             return None if len(self.history) < self.options.max_steps else Stop.MAX_STEPS
         if not math.isfinite(steps[-1].loss):
             return Stop.NON_FINITE
-        last = self.stage + 1 == len(self.stages)
-        tolerance = self.options.tolerance if last else max(self.options.tolerance, 0.02)
-        gains = [(a.loss - b.loss) / max(a.loss, 1e-300) for a, b in itertools.pairwise(steps) if b.accepted]
+        settled = self._loss_scale() == self.final_loss_scale
+        fine = self.stage + 1 == len(self.stages) or (self.stages[self.stage] == 1 and settled)
         rejections = self._rejections()
-        if self.converged and len(steps) > 1:  # the first only evaluates where the stage begins
-            return Stop.CONVERGED
-        count = _FLAT_STEPS if last else 1
-        if len(gains) >= count and rejections == 0 and max(map(abs, gains[-count:])) < tolerance:
+        if len(steps) > 1 and self._flat(steps, fine):  # the first only evaluates where the stage begins
             return Stop.CONVERGED
         damped = hasattr(self.initial_state, "num_steps_since_acceptance")
-        if rejections >= ((_REJECTIONS if last else 2) if damped else _HALVINGS):
+        if rejections >= ((_REJECTIONS if fine else 2) if damped else _HALVINGS):
             return Stop.STALLED
+        if not fine and damped and len(steps) > _COARSE_STEPS:
+            return Stop.CONVERGED
         return Stop.MAX_STEPS if len(self.history) >= self.options.max_steps else None
+
+    def _flat(self, steps: Sequence[Step], fine: bool) -> bool:
+        """Whether steps hardly lower the loss any more."""
+        tolerance, loss = self.options.tolerance, steps[-1].loss
+        if tolerance is None and self.options.solver != "lm":
+            tolerance = DEFAULT_TOLERANCE
+        gains = [a.loss - b.loss for a, b in itertools.pairwise(steps) if b.accepted]
+        if tolerance is None:
+            enough = _FLAT_GAIN * self.field.heights.size if fine else _COARSE_GAIN * loss
+            if self.predicted < enough:
+                return True
+            count = 1
+        else:
+            enough = (tolerance if fine else max(tolerance, _COARSE_GAIN)) * loss
+            if self.converged:
+                return True
+            count = _FLAT_STEPS if fine else 1
+        return len(gains) >= count and self._rejections() == 0 and max(map(abs, gains[-count:])) < enough
 
     def _arrays(self) -> Any:
         """The arrays of a checkpoint; of the state of Levenberg-Marquardt only 1 / λ, as one step makes the rest anew."""
         lm = hasattr(self.state, "num_steps_since_acceptance")
         state = self.state.search_state.step_size if lm else eqx.filter(self.state, eqx.is_array)
-        basis = (self.problem.basis.base, self.problem.loss_scale)
-        return self.unknowns, self.best[1], basis, state
+        place = (self.problem.basis.base, self.problem.loss_scale, self.noise, self.units)
+        return self.unknowns, self.best[1], place, state
 
     def _take_snapshot(self) -> None:
         """Holds on to the present position for the next checkpoint; only after a whole step or change of stage.
@@ -203,8 +274,8 @@ class FitLoop:
             "stage": self.stage,
             "stage_start": self.stage_start,
             "best": self.best[0],
-            "mean_scale": self.mean_scale,
             "converged": self.converged,
+            "predicted": self.predicted,
             "seconds": self.elapsed(),
             "history": [list(step) for step in self.history],
         }
@@ -220,29 +291,42 @@ class FitLoop:
         facts = load_facts(self.path)
         if facts["fingerprint"] != self.fingerprint:
             raise FileError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
-        self.unknowns, best, (base, loss_scale), state = load_arrays(self.path, self._arrays())
+        self.units = np.zeros(self.problem.basis.base.shape)
+        self.unknowns, best, (base, loss_scale, noise, self.units), state = load_arrays(self.path, self._arrays())
         self.stage, self.stage_start, self.converged = facts["stage"], facts["stage_start"], facts["converged"]
-        self.best, self.seconds = (facts["best"], best), facts["seconds"]
+        self.best, self.seconds, self.predicted = (facts["best"], best), facts["seconds"], facts["predicted"]
         self.history = [Step(*line) for line in facts["history"]]
-        self.mean_scale = facts["mean_scale"]
         self._set_basis(np.asarray(base))
+        self.set_noise(noise)
         self.problem = dataclasses.replace(self.problem, loss_scale=loss_scale)
         if hasattr(self.initial_state, "num_steps_since_acceptance"):
             self.state = reset_state(self.initial_state, self.unknowns, state)
             if len(self.history) > self.stage_start:
                 solver = with_rejections(self.solver, 0)
-                self.unknowns, self.state, _ = advance(solver, self.unknowns, self.state, self.problem)
+                known = self.known(evaluated_at(self.unknowns, self.state))
+                self.unknowns, self.state, _ = advance(solver, self.unknowns, self.state, known)
         else:
             self.state = eqx.combine(state, self.initial_state)
 
 
-def _spread(pictures: list[jax.Array], problem: Problem) -> float:
-    """The standard deviation of the pictures' residuals, by their median: the few that are far off do not count."""
-    sizes = []
-    for picture, group in zip(pictures, problem.groups, strict=True):
-        weights = np.asarray(group.weights)
-        sizes.append(np.abs(weights * (np.asarray(picture) - np.asarray(group.targets)))[weights > 0])
-    return float(1.4826 * np.median(np.concatenate(sizes)))
+def _spreads(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarray, " pictures"]:
+    """The standard deviation of each picture's residuals, by their median: the few that are far off do not count.
+
+    Nor do pixels that do not change with the heights, such as the background.
+    """
+    spreads = np.ones(problem.count)
+    for number, (picture, group) in enumerate(zip(pictures, problem.groups, strict=True)):
+        sizes, weights = np.abs(group.weights * (picture - group.targets)), np.asarray(group.weights)
+        shown = weights > 0
+        if problem.linearised is not None:
+            shown &= np.asarray(problem.linearised[number].depends)[..., None]
+        for index, size, counts, weighted in zip(group.indices, np.asarray(sizes), shown, weights > 0, strict=True):
+            spreads[index] = 1.4826 * np.median(size[counts if counts.any() else weighted])
+    return spreads
+
+
+def _pooled(spreads: Float[np.ndarray, " pictures"]) -> float:
+    return float(np.sqrt(np.mean(np.square(spreads))))
 
 
 def _fingerprint(problem: Problem, options: FitOptions) -> str:

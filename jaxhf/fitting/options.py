@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
-from .history import Step
+from .history import Draws, Step
 
 Albedo = Literal["known", "constant", "map"]
 Loss = Literal["squares", "huber", "cauchy", "geman"]
@@ -44,9 +44,9 @@ class FitOptions:
     levels: Sequence[float] | None
     max_steps: int
     inner_steps: int
-    tolerance: float | int
+    tolerance: float | int | None
     uncertainty: int | str | None
-    progress: Callable[[Step], None] | bool
+    progress: Callable[[Step | Draws], None] | bool
     checkpoint: str | os.PathLike[str] | None
     checkpoint_every: int
     resume: bool

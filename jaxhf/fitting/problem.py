@@ -1,5 +1,6 @@
 """What a fit is given, checked and laid out for tracing."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -23,6 +24,9 @@ from ..trace.world import resolve_settings
 from .basis import Basis, Unknowns, dct_matrix, make_basis, pad, resample
 from .linearise import Linearised
 from .options import FitOptions
+
+_FIRST_NOISE = 0.01  # of a picture's brightness, where none is given
+_LEAST_NOISE = 5e-4  # of it: about the rounding of a picture with 8 bits
 
 
 class Group(eqx.Module):
@@ -73,6 +77,8 @@ class Problem(eqx.Module):
       albedo_smoothness: the same of the albedo's factors.
       loss_scale: the size, in standard deviations, above which a residual counts less; changes with the level.
       loss: the robust loss, see `soften`.
+      noise: standard deviation of each picture's values at weight 1, by which the groups' weights are divided.
+      least_noise: below which no estimate of it may fall.
       settings: how to render.
       mesh: the devices that share the work.
       linearised: the pictures of each group with their derivatives in the heights, at the very unknowns at which residuals are
@@ -85,6 +91,8 @@ class Problem(eqx.Module):
     smoothness: Float[Array, ""] | None
     albedo_smoothness: Float[Array, ""] | None
     loss_scale: Float[Array, ""] | None
+    noise: Float[np.ndarray, " pictures"]
+    least_noise: Float[np.ndarray, " pictures"]
     loss: str = eqx.field(static=True)
     settings: Settings = eqx.field(static=True)
     mesh: Mesh = eqx.field(static=True)
@@ -94,6 +102,14 @@ class Problem(eqx.Module):
     def count(self) -> int:
         """How many pictures there are."""
         return sum(len(group.indices) for group in self.groups)
+
+    def with_noise(self, noise: Float[np.ndarray, " pictures"]) -> "Problem":
+        """The same problem with another standard deviation of each picture's values."""
+        groups = []
+        for group in self.groups:
+            factors = (self.noise / noise)[list(group.indices)].reshape(-1, 1, 1, 1)
+            groups.append(dataclasses.replace(group, weights=group.weights * jnp.asarray(factors, group.weights.dtype)))
+        return dataclasses.replace(self, groups=tuple(groups), noise=noise)
 
 
 def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOptions) -> tuple[Problem, Unknowns]:
@@ -110,6 +126,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
     prior = make_prior(field, options.prior, options.prior_std, options.prior_length, options.prior_exponent)
     basis = make_basis(field, pad(heights, prior_padding(field, options.prior_length)))
     unknowns = first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), options)
+    noise = _noise(options.noise, targets)
     problem = Problem(
         groups,
         basis,
@@ -117,6 +134,8 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
         None if options.smoothness is None else jnp.asarray(1 / options.smoothness, dtype),
         None if options.albedo_smoothness is None else jnp.asarray(1 / options.albedo_smoothness, dtype),
         None if options.loss == "squares" else jnp.asarray(options.loss_scale, dtype),
+        noise,
+        _brightness(targets) * _LEAST_NOISE,
         options.loss,
         options.settings,
         local_mesh() if options.mesh is None else options.mesh,
@@ -138,23 +157,24 @@ def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny
     return heights
 
 
-def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOptions) -> tuple[Group, ...]:
-    """Checks scenes and pictures, and gathers those that one program can render."""
+def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any]) -> None:
+    """Checks that there is a scene for each picture, and that all have the same first heightfield but for its heights."""
     if len(scenes) == 0:
         raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
     if len(targets) != len(scenes):
         raise ArgumentError(
             "fit", "targets", f"must hold a picture for each of the {len(scenes)} scenes, they are {len(targets)}"
         )
+    for k, scene in enumerate(scenes):
+        _require_alike(k, scene, scenes[0])
+
+
+def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOptions) -> tuple[Group, ...]:
+    """Checks scenes and pictures, and gathers those that one program can render."""
     weights = options.weights
     if weights is not None and len(weights) != len(scenes):
         raise ArgumentError("fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(weights)}")
-    noise = np.asarray(options.noise, np.float64)
-    if noise.shape not in ((), (len(scenes),)) or not (np.isfinite(noise) & (noise > 0)).all():
-        raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {options.noise!r}")
-    noise = np.broadcast_to(noise, (len(scenes),))
-    for k, scene in enumerate(scenes):
-        _require_alike(k, scene, scenes[0])
+    noise = _noise(options.noise, targets)
     found: dict[Any, list[tuple[int, Scene, Any, Any]]] = {}
     for k, scene in enumerate(scenes):
         target, weight = _picture(k, scene, targets[k], None if weights is None else weights[k])
@@ -177,6 +197,22 @@ def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOpt
         )
         for members in found.values()
     )
+
+
+def _noise(given: Any, targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
+    """The standard deviation of each picture's values; where none is given, one from which an estimate begins."""
+    if given is None:
+        return _FIRST_NOISE * _brightness(targets)
+    noise = np.asarray(given, np.float64)
+    if noise.shape not in ((), (len(targets),)) or not (np.isfinite(noise) & (noise > 0)).all():
+        raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {given!r}")
+    return np.broadcast_to(noise, (len(targets),)).copy()
+
+
+def _brightness(targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
+    """Of each picture, the value that 1 % of it exceeds; 1 for a black one."""
+    bright = [np.nanpercentile(np.asarray(target, np.float64), 99) for target in targets]
+    return np.where(np.asarray(bright) > 0, bright, 1.0)
 
 
 def _with_heights(scene: Scene, heights: Array | None) -> Scene:
@@ -237,6 +273,8 @@ def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray
             "fit", f"weights[{k}]", f"must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}"
         )
     weight = np.broadcast_to(weight.reshape(*size, -1), target.shape)
+    if target.shape[-1] == 3 and _is_grey(target, weight):
+        target, weight = target[..., :1], weight[..., :1]
     bad = ~np.isfinite(target) & (weight > 0)
     if bad.any():
         y, x, c = np.argwhere(bad)[0]
@@ -244,6 +282,12 @@ def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray
             "fit", f"targets[{k}]", f"must be finite where it has a weight; row {y} column {x} channel {c} is {target[y, x, c]}"
         )
     return np.where(weight > 0, target, 0), weight
+
+
+def _is_grey(target: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w 3"]) -> bool:
+    """Whether its channels are one measurement, stored three times."""
+    counts = (weight > 0).all(axis=-1)
+    return bool(np.all(target[counts] == target[counts][:, :1]) and np.all(weight == weight[..., :1]))
 
 
 def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, exponent: float) -> Prior | None:
@@ -270,6 +314,40 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, e
         weight = weight * np.sqrt(rows.T @ stiffness**-2 @ columns)
         stiffness = jnp.asarray(stiffness, dtype)
     return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), stiffness)
+
+
+def mode_curvature(problem: Problem, influences: Sequence[np.ndarray]) -> Float[np.ndarray, "my mx"]:
+    """The curvature of the loss along each DCT mode of unit height.
+
+    That of the pictures, the diagonal of JᵀJ, is the mean square of Jᵀz over draws of z, and over neighbouring modes; in that
+    of the prior, weights count by their mean square.
+
+    Args:
+      problem: see there.
+      influences: Jᵀz in the heights, (ny, nx) each, see `pictures_and_influence`.
+    """
+    basis = problem.basis
+    rows, columns = np.asarray(basis.rows, np.float64), np.asarray(basis.columns, np.float64)
+    padding = [(n, n) for n in basis.padding]
+    squares = np.mean([(rows @ np.pad(influence, padding) @ columns.T) ** 2 for influence in influences], axis=0)
+    curvature = _over_neighbours(squares)
+    curvature[0, 0] = squares[0, 0]  # unlike any other
+    if problem.prior is not None:
+        weight = float(np.mean(np.square(np.asarray(problem.prior.weight))))
+        stiffness = 1.0 if problem.prior.stiffness is None else np.asarray(problem.prior.stiffness, np.float64)
+        curvature += weight * stiffness**2
+    if problem.smoothness is not None:
+        y, x = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in curvature.shape)
+        curvature += (float(problem.smoothness) * (y[:, None] + x[None, :])) ** 2
+    return curvature
+
+
+def _over_neighbours(values: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "my mx"]:
+    """The mean over 3 x 3 values, without [0, 0] but in its own."""
+    padded = np.pad(values, 1, mode="reflect")
+    padded[1, 1] = np.mean([values[0, 1], values[1, 0]])
+    ny, nx = values.shape
+    return np.mean([padded[y : y + ny, x : x + nx] for y in range(3) for x in range(3)], axis=0)
 
 
 def prior_padding(field: Heightfield, length: float | None) -> tuple[int, int]:

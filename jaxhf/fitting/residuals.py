@@ -1,5 +1,6 @@
 """How far a terrain is from its pictures and from what is known beforehand, in standard deviations."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -7,14 +8,16 @@ import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.sharding import Mesh
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..core.devices import on_every_device
+from ..core.settings import Settings
 from ..rendering.render import render_each
 from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
-from .basis import Unknowns
+from .basis import Basis, Unknowns
 from .linearise import Linearised, can_be_linearised, linearise_each, picture_each
 from .problem import Group, Problem
 from .robust import soften
@@ -42,10 +45,19 @@ def picture_residuals(unknowns: Unknowns, problem: Problem) -> list[Float[Array,
     return [group.weights * (image - group.targets) for group, image in zip(problem.groups, images, strict=True)]
 
 
-def simulate(unknowns: Unknowns, problem: Problem) -> list[Float[Array, "n h w c"]]:
-    """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
+def simulate(
+    unknowns: Unknowns, problem: Problem, heights: Float[Array, "ny nx"] | None = None
+) -> list[Float[Array, "n h w c"]]:
+    """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels.
+
+    Args:
+      unknowns: of the fit.
+      problem: see `Problem.linearised`.
+      heights: in place of those of `unknowns`.
+    """
+    heights = problem.basis.heights(unknowns.coefficients) if heights is None else heights
     linearised = [None] * len(problem.groups) if problem.linearised is None else problem.linearised
-    return [_simulate(unknowns, problem, *pair) for pair in zip(problem.groups, linearised, strict=True)]
+    return [_simulate(unknowns, problem, heights, *pair) for pair in zip(problem.groups, linearised, strict=True)]
 
 
 def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
@@ -57,24 +69,31 @@ def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
         return problem
     if not all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
         return problem
-    found = _linearised(*on_every_device((unknowns, problem), problem.mesh))
-    return eqx.tree_at(lambda problem: problem.linearised, problem, found, is_leaf=lambda leaf: leaf is None)
+    heights = heights_of(unknowns, problem.basis)
+    heights, unknowns, groups = on_every_device((heights, unknowns, problem.groups), problem.mesh)
+    found = _linearised(heights, unknowns, groups, problem.settings, problem.mesh)
+    return dataclasses.replace(problem, linearised=found)
 
 
 @eqx.filter_jit
-def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised, ...]:
+def heights_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "ny nx"]:
+    """The heights, from one program, so that they can be compared bit for bit."""
+    return basis.heights(unknowns.coefficients)
+
+
+@eqx.filter_jit
+def _linearised(
+    heights: Float[Array, "ny nx"], unknowns: Unknowns, groups: tuple[Group, ...], settings: Settings, mesh: Mesh
+) -> tuple[Linearised, ...]:
     pictures = tuple(
-        linearise_each(
-            group.scenes, _completion(unknowns, problem, group), problem.settings, problem.mesh, group.targets.shape[-1]
-        )
-        for group in problem.groups
+        linearise_each(group.scenes, _completion(unknowns, group, heights), settings, mesh, group.targets.shape[-1])
+        for group in groups
     )
-    return on_every_device(pictures, problem.mesh)
+    return on_every_device(pictures, mesh)
 
 
-def _completion(unknowns: Unknowns, problem: Problem, group: Group) -> Callable[[Scene], Scene]:
-    """Makes the scene of one picture from its own leaves, those that the group shares, and the unknowns."""
-    heights = problem.basis.heights(unknowns.coefficients)
+def _completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
+    """Makes the scene of one picture from its own leaves, those that the group shares, these heights and the unknowns."""
 
     def complete(scene: Scene) -> Scene:
         scene = group.complete(scene, heights)
@@ -83,8 +102,10 @@ def _completion(unknowns: Unknowns, problem: Problem, group: Group) -> Callable[
     return complete
 
 
-def _simulate(unknowns: Unknowns, problem: Problem, group: Group, linear: Linearised | None) -> Float[Array, "n h w c"]:
-    n, change = len(group.indices), _completion(unknowns, problem, group)
+def _simulate(
+    unknowns: Unknowns, problem: Problem, heights: Float[Array, "ny nx"], group: Group, linear: Linearised | None
+) -> Float[Array, "n h w c"]:
+    n, change = len(group.indices), _completion(unknowns, group, heights)
     if linear is not None:
         image = picture_each(linear, group.scenes, change, problem.settings, problem.mesh)
     else:
@@ -132,28 +153,33 @@ def laplacian(values: Float[Array, "ny nx"]) -> Float[Array, "ny nx"]:
     return padded[2:, 1:-1] + padded[:-2, 1:-1] + padded[1:-1, 2:] + padded[1:-1, :-2] - 4 * values
 
 
-def pictures_and_influence(unknowns: Unknowns, problem: Problem) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
-    """The pictures, and the derivative of a random weighted sum of them in each height, shape (ny, nx).
+def pictures_and_influence(
+    unknowns: Unknowns, problem: Problem, key: int = 0
+) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
+    """The pictures, and the derivative in each height of a sum of their residuals with random normal factors, shape (ny, nx).
 
-    That derivative is exactly zero for a height on which no picture depends, as its column of the Jacobian is zero; for another
-    height it is zero with probability zero.
+    That derivative is exactly zero for a height on which no picture depends, as its column of the Jacobian J is zero; for
+    another height it is zero with probability zero. Its covariance over the factors is JᵀJ.
+
+    Args:
+      unknowns: of the fit.
+      problem: `linearised` at these unknowns, or it is here.
+      key: of the random factors.
     """
-    problem = linearised(unknowns, problem)
-    return _pictures_and_influence(*on_every_device((unknowns, problem), problem.mesh))
+    if problem.linearised is None:
+        problem = linearised(unknowns, problem)
+    return _pictures_and_influence(*on_every_device((unknowns, problem, jax.random.key(key)), problem.mesh))
 
 
 @eqx.filter_jit
 def _pictures_and_influence(
-    unknowns: Unknowns, problem: Problem
+    unknowns: Unknowns, problem: Problem, key: PRNGKeyArray
 ) -> tuple[list[Float[Array, "n h w c"]], Float[Array, "ny nx"]]:
-    surface = problem.basis.surface(unknowns.coefficients)
-
-    def pictures(surface: Float[Array, "my mx"]) -> tuple[list[Array], list[Array]]:
-        still = eqx.tree_at(lambda p: (p.basis.scale, p.basis.base), problem, (jnp.zeros_like(surface), surface))
-        images = simulate(unknowns, still)
+    def pictures(heights: Float[Array, "ny nx"]) -> tuple[list[Array], list[Array]]:
+        images = simulate(unknowns, problem, heights)
         return [group.weights * image for group, image in zip(problem.groups, images, strict=True)], images
 
-    parts, vjp, images = jax.vjp(pictures, surface, has_aux=True)
-    keys = jax.random.split(jax.random.key(0), len(parts))
+    parts, vjp, images = jax.vjp(pictures, problem.basis.heights(unknowns.coefficients), has_aux=True)
+    keys = jax.random.split(key, len(parts))
     draws = [jax.random.normal(key, part.shape, part.dtype) for key, part in zip(keys, parts, strict=True)]
-    return images, problem.basis.crop(vjp(draws)[0])
+    return images, vjp(draws)[0]

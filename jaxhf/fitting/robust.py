@@ -1,6 +1,9 @@
 """Robust losses."""
 
+from typing import Any
+
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 
@@ -33,3 +36,20 @@ def robust_weight(residual: Array, loss: str, scale: Float[Array, ""] | None) ->
     if loss == "huber":
         return 1 / jnp.sqrt(jnp.maximum(square, 1))
     return 1 / (1 + square) if loss == "cauchy" else 1 / (1 + square) ** 2
+
+
+def influence_function(
+    residual: Float[np.ndarray, " n"], loss: str, scale: Any
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """ψ = ρ', its derivative, and the weight ψ / r of residuals."""
+    if loss == "squares" or scale is None:
+        return residual, np.ones_like(residual), np.ones_like(residual)
+    square = (residual / float(scale)) ** 2
+    if loss == "huber":
+        weight = 1 / np.sqrt(np.maximum(square, 1))
+        return residual * weight, (square <= 1).astype(float), weight
+    if loss == "cauchy":
+        weight = 1 / (1 + square)
+        return residual * weight, (1 - square) * weight**2, weight
+    weight = 1 / (1 + square) ** 2
+    return residual * weight, (1 - 3 * square) / (1 + square) ** 3, weight

@@ -22,11 +22,12 @@ from .residuals import half_squares, linearised, residuals
 # BFGS keeps a dense matrix of this many rows at most: 128 MiB in double precision.
 BFGS_UNKNOWNS = 4096
 _FIRST_DAMPING = 1e-2
-_REJECTED = 0.25  # by which 1 / λ is multiplied at a rejected step, the first in a row
+_REJECTED = 0.1  # by which 1 / λ is multiplied at a rejected step, the first in a row
 # Of LSMR, as a share of the matrix's Frobenius norm. That is far above what a height changes that no picture shows: where a
 # prior is to say how high it is, such heights wandered off with 1e-3, and came back over twice as many steps as with 1e-4.
 _INNER_TOLERANCE = 1e-3
 _INNER_TOLERANCE_WITH_PRIOR = 1e-4
+DEFAULT_TOLERANCE = 1e-4
 _RATE = 0.02  # of Adam, in the units of the unknowns
 
 
@@ -119,6 +120,7 @@ class Outcome(NamedTuple):
       damping: Levenberg-Marquardt's λ for the next step; 0 for other solvers.
       change: of the heights, root mean square.
       unknowns: those to which `loss` belongs.
+      predicted: by how much the next step would lower the loss if the pictures were linear; 0 for other solvers.
     """
 
     loss: Scalar
@@ -127,10 +129,11 @@ class Outcome(NamedTuple):
     damping: Scalar
     change: Scalar
     unknowns: Unknowns
+    predicted: Scalar
 
 
 def make_solver(options: FitOptions) -> Any:
-    tolerance = options.tolerance
+    tolerance = DEFAULT_TOLERANCE if options.tolerance is None else options.tolerance
     if options.solver == "lm":
         return LevenbergMarquardt(tolerance, options.inner_steps, options.prior is not None)
     if options.solver == "adam":
@@ -156,7 +159,8 @@ def init_state(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
     """
     # What enters a compiled step and what leaves it must lie in the same places, or the next step is compiled again for the
     # other ones: 16 x 16 heights on two devices took 89 s of processor time up to the last level, not 30.
-    problem = linearised(unknowns, problem)
+    if problem.linearised is None:
+        problem = linearised(unknowns, problem)
     return _init_state(solver, *on_every_device((unknowns, problem), problem.mesh))
 
 
@@ -186,9 +190,18 @@ def reset_state(initial: Any, unknowns: Unknowns, step_size: Float[Array, ""] | 
     return initial if step_size is None else _with_step_size(initial, step_size)
 
 
+def evaluated_at(unknowns: Unknowns, state: Any) -> Unknowns:
+    """Where the next step evaluates the residuals."""
+    return getattr(state, "y_eval", unknowns)
+
+
 def advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tuple[Unknowns, Any, Outcome]:
-    """One step of the solver: new unknowns, which are the old ones if the step is rejected, the new state, and what it did."""
-    problem = linearised(getattr(state, "y_eval", unknowns), problem)  # where the step evaluates the residuals
+    """One step of the solver: new unknowns, which are the old ones if the step is rejected, the new state, and what it did.
+
+    The problem is `linearised` at `evaluated_at`, or it is here.
+    """
+    if problem.linearised is None:
+        problem = linearised(evaluated_at(unknowns, state), problem)
     return _advance(*on_every_device((solver, unknowns, state, problem), problem.mesh))
 
 
@@ -207,8 +220,19 @@ def _advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> t
         damping = 1 / new_state.search_state.step_size if isinstance(solver, LevenbergMarquardt) else zero
     moved = problem.basis.heights(new.coefficients) - problem.basis.heights(unknowns.coefficients)
     change = jnp.sqrt(jnp.mean(moved * moved))
-    outcome = Outcome(loss.astype(dtype), accepted, converged, damping.astype(dtype), change, evaluated)
+    predicted = _predicted_gain(new, new_state) if isinstance(solver, LevenbergMarquardt) else zero
+    outcome = Outcome(
+        loss.astype(dtype), accepted, converged, damping.astype(dtype), change, evaluated, predicted.astype(dtype)
+    )
     return on_every_device((new, new_state, outcome), problem.mesh)
+
+
+def _predicted_gain(unknowns: Unknowns, state: Any) -> Scalar:
+    """By how much a step to where the state evaluates next lowers half the sum of squares of linear residuals."""
+    info = state.f_info
+    step = jax.tree.map(lambda new, old: new - old, state.y_eval, unknowns)
+    pairs = zip(jax.tree.leaves(info.residual), jax.tree.leaves(info.jac.mv(step)), strict=True)
+    return -sum((jnp.sum(change * (r + change / 2)) for r, change in pairs), start=jnp.zeros((), unknowns.coefficients.dtype))
 
 
 def count_unknowns(unknowns: Unknowns) -> int:

@@ -1,5 +1,8 @@
 """How sure a fit is of its heights: standard deviations from the Gauss-Newton matrix, by samples or by a dense inverse."""
 
+import dataclasses
+import time
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -14,17 +17,23 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ..core.devices import on_every_device
 from ..core.errors import ArgumentError
 from .basis import Unknowns
+from .history import Draws
 from .problem import Problem
 from .residuals import linearised, picture_residuals, prior_residuals
-from .robust import robust_weight
+from .robust import influence_function, robust_weight
 
+_INNER_TOLERANCE = 1e-6
 EXACT_ENTRIES = 2**24
 """Up to so many residuals times unknowns the matrix is formed where "exact" is asked for: 128 MiB in double precision."""
 
 
 def standard_deviations(
-    unknowns: Unknowns, problem: Problem, samples: int | str, inner_steps: int
-) -> Float[np.ndarray, "ny nx"]:
+    unknowns: Unknowns,
+    problem: Problem,
+    samples: int | str,
+    inner_steps: int,
+    report: Callable[[Draws], None] | None = None,
+) -> tuple[Float[np.ndarray, "ny nx"], int | None]:
     """The standard deviation of each height, given what the pictures and the prior say; shape (ny, nx), height units.
 
     The Gauss-Newton matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs them;
@@ -33,19 +42,60 @@ def standard_deviations(
     on which no picture depends, such as the mean of all heights, then gets a large deviation, not an infinite one.
 
     Args:
+      unknowns: at which the fit ended; all modes are varied.
+      problem: `linearised` there, or it is here.
       samples: "exact" forms J as a dense matrix and inverts H. A number, without any dense matrix: that many
         x = argmin |J x - z|², z normal, are drawn; their covariance is H⁻¹ (Papandreou and Yuille, Gaussian sampling by local
         perturbations, 2010), so each deviation is right to 1 / √(2 · samples), however the heights are correlated.
-      inner_steps: of LSMR, each; five times as many as in a step of the fit are allowed.
+      inner_steps: of LSMR, each, at most twice as many as in a step of the fit.
+      report: called after each sample.
+
+    Returns:
+      The deviations; and how many samples were drawn: fewer than asked for after Ctrl-C, None for "exact".
+
+    Raises:
+      KeyboardInterrupt: Ctrl-C before there were two samples.
     """
-    unknowns, problem = on_every_device((unknowns, linearised(unknowns, problem)), problem.mesh)
+    if problem.linearised is None:
+        problem = linearised(unknowns, problem)
+    unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
     if samples == "exact":
-        return np.sqrt(np.asarray(_exact_variance(unknowns, problem)))
-    total = np.zeros(problem.basis.crop(problem.basis.base).shape)
-    for k in range(int(samples)):
-        draw = np.asarray(_draw(unknowns, problem, jax.random.key(k), 5 * inner_steps), np.float64)
-        total += draw * draw
-    return np.sqrt(total / int(samples))
+        return np.sqrt(np.asarray(_exact_variance(unknowns, problem))), None
+    total, drawn, count = np.zeros(problem.basis.crop(problem.basis.base).shape), 0, int(samples)
+    begin = time.perf_counter()
+    try:
+        while drawn < count:
+            draw = np.asarray(_draw(unknowns, problem, jax.random.key(drawn), 2 * inner_steps), np.float64)
+            total, drawn = total + draw * draw, drawn + 1
+            if report is not None:
+                seconds = time.perf_counter() - begin
+                report(Draws(drawn, count, seconds, seconds / drawn * (count - drawn)))
+    except KeyboardInterrupt:
+        if drawn < 2:
+            raise
+    return np.sqrt(total / drawn), drawn
+
+
+def with_unexplained(unknowns: Unknowns, problem: Problem) -> tuple[Problem, float]:
+    """The problem with the noise that its residuals bear out, and the factor on the noise, at least 1.
+
+    An M-estimate's covariance is f² (JᵀWJ)⁻¹, with f² = N / (N - p) · mean(ψ²) · mean(w) / mean(ψ')² over the N residuals r in
+    units of the noise, ψ = ρ', w = ψ / r, p unknowns (Huber, Robust statistics, 1981, section 7.6; for least squares it is
+    chi2 by degree of freedom, Birge's ratio squared, Physical Review 40, 207, 1932). The noise is multiplied by f, the scale of
+    the loss divided, so that W stays; the prior keeps its own deviations.
+    """
+    parts = [np.asarray(part, np.float64) for part in picture_residuals(unknowns, problem)]
+    counted = np.concatenate([part[np.asarray(group.weights) > 0] for part, group in zip(parts, problem.groups, strict=True)])
+    counted = counted[counted != 0]  # a background that is black in both says nothing
+    if len(counted) == 0:
+        return problem, 1.0
+    psi, slope, weight = influence_function(counted, problem.loss, problem.loss_scale)
+    free = max(1 - problem.basis.crop(problem.basis.base).size / len(counted), 0.5)
+    factor = float(np.sqrt(np.mean(psi**2) * np.mean(weight) / np.mean(slope) ** 2 / free))
+    if not factor > 1:
+        return problem, 1.0
+    scale = None if problem.loss_scale is None else problem.loss_scale / factor
+    return dataclasses.replace(problem.with_noise(factor * problem.noise), loss_scale=scale), factor
 
 
 def require_small(unknowns: Unknowns, problem: Problem) -> None:
@@ -82,8 +132,9 @@ def _draw(unknowns: Unknowns, problem: Problem, key: PRNGKeyArray, steps: int) -
     leaves, tree = jax.tree.flatten(structure)
     keys = jax.random.split(key, len(leaves))
     z = jax.tree.unflatten(tree, [jax.random.normal(k, leaf.shape, leaf.dtype) for k, leaf in zip(keys, leaves, strict=True)])
-    # Its tolerance is a share of the matrix's Frobenius norm, far above what a height changes that no picture shows.
-    solver = lx.LSMR(rtol=1e-7, atol=0.0, max_steps=steps, conlim=1e16)
+    # A share of the matrix's Frobenius norm, far above what a height changes that no picture shows. In balanced units it leaves
+    # an error of a hundredth in a sample.
+    solver = lx.LSMR(rtol=_INNER_TOLERANCE, atol=0.0, max_steps=steps, conlim=1e16)
     change = lx.linear_solve(operator, z, solver, throw=False).value
     return _height_change(problem, change.coefficients)
 

@@ -52,7 +52,7 @@ class World(eqx.Module):
 def resolve_settings(settings: Settings, scene: Scene) -> Settings:
     """The settings with what they leave to the scene filled in."""
     samples = scene.samples if settings.samples is None else settings.samples
-    return dataclasses.replace(settings, samples=grid_side(samples) ** 2)
+    return dataclasses.replace(settings, samples=grid_side(samples) ** 2, edge_samples=settings.edge_samples or 0)
 
 
 def make_world(scene: Scene, settings: Settings) -> World:

@@ -47,7 +47,7 @@ _PICTURE: Keys = {
 }
 # Those of `fit` and of `Settings`, whose defaults they have and who check their values.
 _FIT: Keys = {
-    "noise": Key(number, 0.01),
+    "noise": Key(number, None),
     **{name: Key(or_word(number), None) for name in ("start", "prior", "prior_std")},
     **{
         name: Key(number, None)
@@ -81,7 +81,7 @@ class Case:
     scenes: tuple[Scene, ...]
     targets: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray | None, ...]
-    noise: tuple[float, ...]
+    noise: tuple[float, ...] | None
     settings: Settings
     options: dict[str, Any]
     names: tuple[str, ...]
@@ -133,7 +133,7 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
     chosen = part.at("fit", table=values["fit"])
     options = _given(chosen, _FIT)
-    noise = options.pop("noise", _FIT["noise"].default)
+    noise = options.pop("noise", None)
     for name in ("start", "prior", "prior_std"):
         if isinstance(options.get(name), str):
             known = known_deviations if name == "prior_std" else known_heights
@@ -142,7 +142,7 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     for k, picture_table in enumerate(values["pictures"]):
         picture = part.at("pictures", k, table=picture_table)
         given = picture.read(_PICTURE)
-        target = _target(picture, given["image"])
+        target = _read(picture, "image", load_image, given["image"])
         lights = base.lights if given["lights"] is None else read_lights(picture, given["lights"])
         camera = _camera(picture, given["camera"], base, target.shape[:2])
         scenes.append(picture.made(Scene, base.objects, camera, lights, base.samples))
@@ -150,11 +150,16 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         weights.append(_weights(picture, given, target.shape[:2]))
         noises.append(noise if given["noise"] is None else given["noise"])
         names.append(given["image"])
-        if not noises[-1] > 0:
+        if noises[-1] is not None and not noises[-1] > 0:
             place = (chosen if given["noise"] is None else picture).at("noise")
             raise place.error(f"{place.name} must be positive, it is {noises[-1]:g}")
+    known = [value for value in noises if value is not None]
+    if known and len(known) < len(noises):
+        place = part.at("pictures", noises.index(None))
+        raise place.error(f"{place.name} must have a noise, as another picture has one; or none, then it is estimated")
     return Case(
-        tuple(scenes), tuple(targets), tuple(weights), tuple(noises), settings, options, tuple(names), base.sought.like, part
+        tuple(scenes), tuple(targets), tuple(weights), tuple(known) or None, settings, options, tuple(names),
+        base.sought.like, part,
     )  # fmt: skip
 
 
@@ -210,13 +215,6 @@ def _placed(field: Heightfield, given: dict[str, float]) -> Terrain:
 def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any:
     """What `reader` makes of the file whose `name` is the value of `key`."""
     return part.at(key).made(lambda: reader(named_file(part, name)))
-
-
-def _target(picture: Part, name: str) -> np.ndarray:
-    """(h, w, 3), or (h, w) for a grey picture: it is compared with the mean over the channels, once, not three times."""
-    image = _read(picture, "image", load_image, name)
-    grey = all(np.array_equal(image[..., 0], image[..., c], equal_nan=True) for c in (1, 2))
-    return image[..., 0] if grey else image
 
 
 def _weights(picture: Part, given: dict[str, Any], size: tuple[int, ...]) -> Float32[np.ndarray, "h w"] | None:

@@ -1,0 +1,174 @@
+"""What a fit says about its result: where the pictures are left unexplained, and what its heights cannot be trusted for."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .history import Stop
+
+_FAR_FROM_ONE = 1.5  # by which factor chi2 may differ from 1
+_STRAYED = 2.0  # standard deviations of the prior, root mean square
+_UNSEEN = 0.01  # share of the heights
+_REGIONS = 3
+_BLOCKS = 16  # along a picture's longer side
+_LEAST_BLOCK = 4  # pixels
+
+
+class Region(NamedTuple):
+    """A block of a picture.
+
+    Attributes:
+      picture: its number, from 0.
+      row, column: the top left pixel.
+      height, width: pixels.
+      rms: root mean square of its residuals, in standard deviations of the noise.
+    """
+
+    picture: int
+    row: int
+    column: int
+    height: int
+    width: int
+    rms: float
+
+    def __str__(self) -> str:
+        rows, columns = f"{self.row}-{self.row + self.height - 1}", f"{self.column}-{self.column + self.width - 1}"
+        return f"picture {self.picture} rows {rows} columns {columns} ({self.rms:.2g} times the noise)"
+
+
+def worst_regions(residuals: Sequence[Float[np.ndarray, "h w c"]]) -> tuple[Region, ...]:
+    """The three blocks, of a sixteenth of a picture's side, with the largest residuals; they do not overlap.
+
+    Args:
+      residuals: of each picture, in standard deviations of the noise; 0 where a pixel does not count.
+    """
+    found = []
+    for number, residual in enumerate(residuals):
+        squares = np.mean(np.square(residual, dtype=np.float64), axis=-1)
+        size = max(_LEAST_BLOCK, max(squares.shape) // _BLOCKS)
+        for row in range(0, squares.shape[0], size):
+            for column in range(0, squares.shape[1], size):
+                block = squares[row : row + size, column : column + size]
+                height, width = block.shape
+                found.append(Region(number, row, column, height, width, float(np.sqrt(block.mean()))))
+    return tuple(sorted(found, key=lambda region: -region.rms)[:_REGIONS])
+
+
+class Places(NamedTuple):
+    """Where a picture's boundaries are, (h, w) each; where a fit takes no points on edges, `shadows` is None.
+
+    Attributes:
+      silhouettes: pixels at the terrain's border and at silhouettes. Without points on edges: beside what does not depend on
+        the heights, be it background or in shadow.
+      shadows: pixels at the edges of shadows.
+    """
+
+    silhouettes: Bool[np.ndarray, "h w"]
+    shadows: Bool[np.ndarray, "h w"] | None
+
+
+def where_residuals_are(residuals: Sequence[Float[np.ndarray, "h w c"]], places: Sequence[Places]) -> str:
+    """The shares of the squared residuals at silhouettes, at shadows and elsewhere, in words."""
+    total = at_silhouettes = at_shadows = 0.0
+    for residual, place in zip(residuals, places, strict=True):
+        squares = np.sum(np.square(residual, dtype=np.float64), axis=-1)
+        near = widened(place.silhouettes)
+        total += float(squares.sum())
+        at_silhouettes += float(squares[near].sum())
+        if place.shadows is not None:
+            at_shadows += float(squares[widened(place.shadows) & ~near].sum())
+    if total == 0:
+        return "they are all 0"
+    rest = f"{(total - at_silhouettes - at_shadows) / total:.0%} elsewhere"
+    if all(place.shadows is None for place in places):
+        return f"{at_silhouettes / total:.0%} of their squares lie beside the background or shadows, {rest}"
+    return (
+        f"{at_silhouettes / total:.0%} of their squares lie at the terrain's border and silhouettes, "
+        f"{at_shadows / total:.0%} at the edges of shadows, {rest}"
+    )
+
+
+def widened(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The pixels of a mask with their eight neighbours."""
+    padded = np.pad(mask, 1)
+    h, w = mask.shape
+    return np.any([padded[y : y + h, x : x + w] for y in range(3) for x in range(3)], axis=0)
+
+
+class Findings(NamedTuple):
+    """What `warnings` are made from.
+
+    Attributes:
+      result: why the fit stopped.
+      chi2: see `Fit.stats`.
+      noise_given: whether the noise is the user's, not estimated.
+      where: see `where_residuals_are`.
+      regions: see `worst_regions`.
+      help: what to try where the pictures are not explained.
+      strayed: root mean square of (heights - prior) / prior_std over the heights that are seen; None: no prior.
+      seen: which heights the pictures show.
+      lights: how many directions light comes from, over all pictures.
+      scaled: by what the noise was multiplied for the standard deviations; None: there are none.
+      draws: asked for, made; None: none were asked for.
+    """
+
+    result: Stop
+    chi2: float
+    noise_given: bool
+    where: str
+    regions: Sequence[Region]
+    help: str
+    strayed: float | None
+    seen: Bool[np.ndarray, "ny nx"]
+    lights: int
+    scaled: float | None
+    draws: tuple[int, int] | None
+
+
+def warnings(found: Findings) -> tuple[str, ...]:
+    """What a user should know before trusting the heights; empty where nothing speaks against it."""
+    said = []
+    unexplained = found.chi2 > _FAR_FROM_ONE
+    if unexplained:
+        worst = "; ".join(map(str, found.regions))
+        said.append(
+            f"chi2 is {found.chi2:.3g}, not about 1: the pictures differ from the measured ones by {found.chi2**0.5:.2g} times "
+            f"the noise, root mean square; {found.where}. Worst: {worst}"
+        )
+    elif found.noise_given and found.chi2 < 1 / _FAR_FROM_ONE:
+        said.append(
+            f"chi2 is {found.chi2:.3g}, not about 1: the noise that was given is {found.chi2**-0.5:.2g} times what is left, so "
+            "standard deviations are too large and the prior counts for too much; without a noise the fit estimates it"
+        )
+    if found.result is Stop.MAX_STEPS:
+        said.append("the fit was stopped by max_steps before it had converged: allow it more")
+    elif found.result is Stop.NON_FINITE:
+        said.append("a loss was not finite; the heights are those before it")
+    elif unexplained:
+        said.append(f"{'it stalled' if found.result is Stop.STALLED else 'it came no nearer'}: {found.help}")
+    if found.strayed is not None and found.strayed > _STRAYED:
+        said.append(
+            f"the heights differ from the prior by {found.strayed:.2g} times prior_std, root mean square: either prior_std is "
+            "too small or the heights are wrong"
+        )
+    hidden = int((~found.seen).sum())
+    if hidden > _UNSEEN * found.seen.size:
+        kept = "the start" if found.strayed is None else "what the prior makes of their neighbours"
+        said.append(f"no picture shows {hidden} of {found.seen.size} heights ({hidden / found.seen.size:.0%}): they are {kept}")
+    if found.strayed is None and found.lights == 1:
+        said.append(
+            "all pictures have the same light and there is no prior: of slopes across the light only silhouettes and shadows "
+            "tell; give a prior, or pictures with other lights"
+        )
+    if found.scaled is not None and found.scaled > 1.05:
+        said.append(
+            f"the standard deviations allow for what is left unexplained: they are those of {found.scaled:.2g} times the noise "
+            "(M-estimator's covariance, Huber, Robust statistics, 1981, section 7.6; see docs/fitting.md)"
+        )
+    if found.draws is not None and found.draws[1] < found.draws[0]:
+        said.append(
+            f"interrupted after {found.draws[1]} of {found.draws[0]} samples of the standard deviations: they are less sure"
+        )
+    return tuple(said)
