@@ -63,7 +63,7 @@ class FitLoop:
 
     def run(self) -> Stop:
         self.started = time.perf_counter()
-        self.fingerprint = _fingerprint(self.problem, self.options) if self.path else ""
+        self.fingerprint = _fingerprint(self.problem, self.unknowns, self.options) if self.path else ""
         self.initial_state = init_state(self.solver, self.unknowns, self.problem)
         self.state = self.initial_state
         if self.path and self.options.resume and self.path.exists():
@@ -245,11 +245,22 @@ def _spread(pictures: list[jax.Array], problem: Problem) -> float:
     return float(1.4826 * np.median(np.concatenate(sizes)))
 
 
-def _fingerprint(problem: Problem, options: FitOptions) -> str:
-    """A hash of all that decides on the steps: fits of the same fingerprint take the same ones."""
+def _fingerprint(problem: Problem, unknowns: Unknowns, options: FitOptions) -> str:
+    """A hash of all that decides on the steps: fits of the same fingerprint take the same ones, in whatever process.
+
+    Args:
+      problem, unknowns: those at the start; the structure of their pytrees says of what classes and sizes all parts are, and
+        how many samples a scene asks for. The mesh does not count: another machine may go on.
+      options: for what is not in the problem.
+    """
+    parts: dict[bool, list[Any]] = {True: [], False: []}
+    for field in dataclasses.fields(problem):
+        if field.name != "mesh":
+            parts[field.metadata.get("static", False)].append(getattr(problem, field.name))
+    leaves, structure = jax.tree.flatten((parts[False], unknowns))
     levels = None if options.levels is None else list(options.levels)
-    choices = (options.solver, levels, options.inner_steps, options.tolerance, problem.loss, problem.settings)
+    choices = (parts[True], structure, options.solver, levels, options.inner_steps, options.tolerance)
     digest = hashlib.sha256(repr(choices).encode())
-    for leaf in jax.tree.leaves(problem):
-        digest.update(np.asarray(leaf).tobytes())
+    for leaf in map(np.asarray, leaves):
+        digest.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
     return digest.hexdigest()
