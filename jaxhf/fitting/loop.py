@@ -23,7 +23,7 @@ from .problem import Problem
 from .residuals import pictures_and_influence
 from .solvers import Outcome, advance, init_state, make_solver, reset_state, with_rejections
 
-_REJECTIONS = 5  # in a row: the last trial had 4 · 8 · 16 · 32 times the damping of the first
+_REJECTIONS = 2  # in a row, at a coarse level: the next one may do better
 _HALVINGS = 50  # in a row, in a line search, whose first step is the whole gradient
 _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
 _NEAR_FINAL = 1.1  # a robust loss's scale within this factor of the final one is taken for it
@@ -56,6 +56,7 @@ class FitLoop:
         self.stage_start = 0  # steps taken before this stage
         self.best = (math.inf, unknowns)
         self.converged = False  # the last step says so
+        self.predicted = 0.0  # share of the loss by which the last step was to lower it
         self.snapshot: tuple[dict[str, Any], Any] | None = None  # for the next checkpoint
         self.final_loss_scale = None if problem.loss_scale is None else float(problem.loss_scale)
         self.mean_scale = 1.0  # see `make_basis`
@@ -110,7 +111,7 @@ class FitLoop:
             last = self.stage + 1 == len(self.stages)
             scale = jnp.asarray(self.final_loss_scale if last else max(self.final_loss_scale, 3 * spread), surface.dtype)
             self.problem = eqx.tree_at(lambda problem: problem.loss_scale, self.problem, scale)
-        self.best = (math.inf, self.unknowns)
+        self.best = (self.best[0], self.unknowns)
         self.state = reset_state(self.initial_state, self.unknowns)
         self._take_snapshot()
 
@@ -151,13 +152,14 @@ class FitLoop:
 
     def _record(self, outcome: Outcome) -> None:
         loss, accepted = float(outcome.loss), bool(outcome.accepted)
-        if math.isfinite(loss) and loss <= self.best[0]:
+        first = len(self.history) == self.stage_start  # another stage's loss may have another scale
+        if math.isfinite(loss) and (first or loss <= self.best[0]):
             self.best = (loss, outcome.unknowns)
         level = math.ceil(max(self.problem.basis.base.shape) * self.stages[self.stage])
         damping, change = float(outcome.damping), float(outcome.change)
         step = Step(len(self.history) + 1, level, loss, accepted, damping, change, self.elapsed())
         self.history.append(step)
-        self.converged = bool(outcome.converged)
+        self.converged, self.predicted = bool(outcome.converged), float(outcome.predicted)
         self._take_snapshot()
         if self.progress:
             self.progress(step)
@@ -178,8 +180,11 @@ class FitLoop:
         count = _FLAT_STEPS if last else 1
         if len(gains) >= count and rejections == 0 and max(map(abs, gains[-count:])) < tolerance:
             return Stop.CONVERGED
-        damped = hasattr(self.initial_state, "num_steps_since_acceptance")
-        if rejections >= ((_REJECTIONS if last else 2) if damped else _HALVINGS):
+        if rejections and hasattr(self.initial_state, "num_steps_since_acceptance"):
+            # Damping that grows with each rejection leaves less and less to be gained, until that would not count.
+            if self.predicted < tolerance or (rejections >= _REJECTIONS and not last):
+                return Stop.CONVERGED if rejections == 1 else Stop.STALLED
+        elif rejections >= _HALVINGS:
             return Stop.STALLED
         return Stop.MAX_STEPS if len(self.history) >= self.options.max_steps else None
 
@@ -205,6 +210,7 @@ class FitLoop:
             "best": self.best[0],
             "mean_scale": self.mean_scale,
             "converged": self.converged,
+            "predicted": self.predicted,
             "seconds": self.elapsed(),
             "history": [list(step) for step in self.history],
         }
@@ -221,7 +227,8 @@ class FitLoop:
         if facts["fingerprint"] != self.fingerprint:
             raise FileError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
         self.unknowns, best, (base, loss_scale), state = load_arrays(self.path, self._arrays())
-        self.stage, self.stage_start, self.converged = facts["stage"], facts["stage_start"], facts["converged"]
+        self.stage, self.stage_start = facts["stage"], facts["stage_start"]
+        self.converged, self.predicted = facts["converged"], facts["predicted"]
         self.best, self.seconds = (facts["best"], best), facts["seconds"]
         self.history = [Step(*line) for line in facts["history"]]
         self.mean_scale = facts["mean_scale"]

@@ -116,6 +116,7 @@ class Outcome(NamedTuple):
       loss: half the sum of squared residuals at `unknowns`.
       accepted: whether the unknowns changed.
       converged: whether the solver's tolerance is met.
+      predicted: the share of the loss by which Levenberg-Marquardt's linear model lowers it in this step; 0 for other solvers.
       damping: Levenberg-Marquardt's λ for the next step; 0 for other solvers.
       change: of the heights, root mean square.
       unknowns: those to which `loss` belongs.
@@ -124,6 +125,7 @@ class Outcome(NamedTuple):
     loss: Scalar
     accepted: Flag
     converged: Flag
+    predicted: Scalar
     damping: Scalar
     change: Scalar
     unknowns: Unknowns
@@ -205,10 +207,20 @@ def _advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> t
         loss, evaluated = new_state.f_info.as_min(), new
         accepted = new_state.num_accepted_steps > state.num_accepted_steps
         damping = 1 / new_state.search_state.step_size if isinstance(solver, LevenbergMarquardt) else zero
+    predicted = _predicted(solver, unknowns, state) if isinstance(solver, LevenbergMarquardt) else zero
     moved = problem.basis.heights(new.coefficients) - problem.basis.heights(unknowns.coefficients)
     change = jnp.sqrt(jnp.mean(moved * moved))
-    outcome = Outcome(loss.astype(dtype), accepted, converged, damping.astype(dtype), change, evaluated)
+    outcome = Outcome(
+        loss.astype(dtype), accepted, converged, predicted.astype(dtype), damping.astype(dtype), change, evaluated
+    )
     return on_every_device((new, new_state, outcome), problem.mesh)
+
+
+def _predicted(solver: LevenbergMarquardt, unknowns: Unknowns, state: Any) -> Scalar:
+    """See `Outcome.predicted`; in the first step, before there is a linear model, 0."""
+    step = jax.tree.map(lambda new, old: new - old, state.y_eval, unknowns)
+    loss = state.f_info.as_min()
+    return -solver.search.predict_reduction(step, state.f_info) / jnp.where(loss > 0, loss, 1)
 
 
 def count_unknowns(unknowns: Unknowns) -> int:

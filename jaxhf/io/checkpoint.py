@@ -11,7 +11,7 @@ import equinox as eqx
 from .errors import FileError
 from .files import PathLike, replacing, require_file
 
-_MAGIC = b"jaxhf checkpoint 1\n"
+_MAGIC = b"jaxhf checkpoint 2\n"
 
 
 def save_checkpoint(path: PathLike, facts: dict[str, Any], arrays: Any) -> None:

@@ -181,7 +181,7 @@ def without_pictures(setattr: Callable[..., None]) -> None:
     def advance(solver, unknowns, state, problem):
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, unknowns.coefficients + jnp.sin(state))
         loss, yes = 1 / (1 + state), jnp.asarray(True)
-        return unknowns, state + 1, Outcome(loss, yes, ~yes, loss, loss, unknowns)
+        return unknowns, state + 1, Outcome(loss, yes, ~yes, loss, loss, loss, unknowns)
 
     setattr(_loop, "init_state", lambda solver, unknowns, problem: jnp.zeros(()))
     setattr(_loop, "reset_state", lambda initial, unknowns: initial)
