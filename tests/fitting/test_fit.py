@@ -279,7 +279,7 @@ def test_a_fit_that_stalls_says_so_and_keeps_the_best(targets, monkeypatch):
         if loss is not None:
             unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, unknowns.coefficients.at[1, 2].add(0.01))
         number = jnp.asarray(loss or 6.0)
-        share, no = jnp.asarray(next(predicted)), jnp.asarray(False)
+        share, no = jnp.asarray(next(predicted, 0.0)), jnp.asarray(False)
         return unknowns, state, Outcome(number, jnp.asarray(loss is not None), no, share, number, number, unknowns)
 
     monkeypatch.setattr(_loop, "advance", advance)
