@@ -172,8 +172,8 @@ MUTATIONS = {
     ),
     "best heights": Mutation(
         "fitting/loop.py",
-        "and loss <= self.best[0]",
-        "and loss <= math.inf",
+        "(first or loss <= self.best[0])",
+        "True",
         "fitting/test_fit.py::test_a_fit_that_stalls_says_so_and_keeps_the_best",
     ),
     "damping after rejections": Mutation(
@@ -184,8 +184,8 @@ MUTATIONS = {
     ),
     "stalling": Mutation(
         "fitting/loop.py",
-        "_REJECTIONS = 5",
-        "_REJECTIONS = 200",
+        "if self.predicted < tolerance or",
+        "if self.predicted < 0 or",
         "fitting/test_fit.py::test_a_fit_that_stalls_says_so_and_keeps_the_best",
     ),
     "interval of checkpoints": Mutation(

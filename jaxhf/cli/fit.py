@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import ArgumentError
-from . import arguments
+from . import arguments, interruption
 
 if TYPE_CHECKING:
     from ..fitting.fit import Fit
@@ -89,6 +89,7 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
 
     case = load_case(path, np.dtype(precision))
     options: dict[str, Any] = {"checkpoint": outputs.checkpoint, "resume": outputs.resume, **case.options}
+    interruption.raise_from_now_on()
     try:
         with bar(bar_format="{desc}", desc="compiling") as shown:
 

@@ -1,31 +1,31 @@
-"""The command line: a parser with one module a command, and how errors end. JAX is imported only when a command runs."""
+"""The command line: how it begins and how errors end. Ctrl-C is looked after first; all else is imported after that."""
 
-import argparse
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import NoReturn
 
-from ..core.errors import UserError
-from ..core.version import __version__
-from . import convert, fit, hillshade, info, render, tradeoff
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+from . import interruption
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns its exit code: 0, 2 after an error of the user's, 130 after Ctrl-C."""
-    options = _parser().parse_args(arguments)
+    """Runs one command; returns its exit code: 0, 2 after an error of the user's, 130 after Ctrl-C.
+
+    Args:
+      arguments: None: those of this process, which then is the command's, also in what Ctrl-C does to it.
+    """
+    if arguments is None:
+        interruption.end_at_once()
+    from ..core.errors import UserError
+    from .parser import make_parser
+
+    options = make_parser().parse_args(arguments)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides
             warnings.showwarning = lambda message, *_, **__: print(f"jaxhf: warning: {message}", file=sys.stderr)
             options.run(options)
-    except KeyboardInterrupt as interruption:
-        print(f"\njaxhf: {str(interruption) or 'interrupted'}", file=sys.stderr)
+    except KeyboardInterrupt as stopped:
+        print(f"\njaxhf: {str(stopped) or 'interrupted'}", file=sys.stderr)
         return 130
     except (UserError, OSError) as error:
         print(f"jaxhf: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -39,12 +39,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         return 2
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="jaxhf", description="Renders heightfields, and recovers them from pictures.")
-    parser.add_argument("--version", action="version", version=f"jaxhf {__version__}")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (render, fit, hillshade, convert, info, tradeoff):
-        command.add(commands)
-    return parser

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ..core.settings import Settings
-from . import arguments
+from . import arguments, interruption
 
 if TYPE_CHECKING:
     from ..scene.scene import Scene
@@ -42,6 +42,7 @@ def draw(options: argparse.Namespace, load: "Callable[[], Scene]", **saving: Any
     settings = arguments.settings(options)
     arguments.set_up_jax(options.precision, options.devices)
     image, report = _timed_render(load(), settings)
+    interruption.raise_from_now_on()
     save_image(options.output, image, **saving)
     print(f"{options.output}: {report}")
 

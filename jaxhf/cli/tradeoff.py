@@ -4,6 +4,8 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
+from . import interruption
+
 if TYPE_CHECKING:
     from ..study.plan import Sweep
 
@@ -45,6 +47,7 @@ def run(options: argparse.Namespace) -> None:
         options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick,
         fits=options.fit,
     )  # fmt: skip
+    interruption.raise_from_now_on()
     failures = _watched(sweep, options.repeats) if sweep.missing() else []
     measured = sweep.measured()
     if failures:

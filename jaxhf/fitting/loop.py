@@ -25,7 +25,7 @@ from .problem import Problem, mode_curvature
 from .residuals import heights_of, linearised, pictures_and_influence
 from .solvers import DEFAULT_TOLERANCE, Outcome, advance, evaluated_at, init_state, make_solver, reset_state, with_rejections
 
-_REJECTIONS = 3  # in a row: the last trial had 10 · 20 · 40 times the damping of the first
+_REJECTIONS = 2  # in a row, at a coarse level: the next one may do better
 _HALVINGS = 50  # in a row, in a line search, whose first step is the whole gradient
 _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
 _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviation that their noise leaves them with
@@ -62,7 +62,7 @@ class FitLoop:
         self.stage_start = 0  # steps taken before this stage
         self.best = (math.inf, unknowns)
         self.converged = False  # the last step says so
-        self.predicted = math.inf  # gain of the next step
+        self.predicted = 0.0  # see `Outcome`
         self.snapshot: tuple[dict[str, Any], Any] | None = None  # for the next checkpoint
         self.final_loss_scale = None if problem.loss_scale is None else float(problem.loss_scale)
         self.noise = problem.noise
@@ -72,7 +72,7 @@ class FitLoop:
 
     def run(self) -> Stop:
         self.started = time.perf_counter()
-        self.fingerprint = _fingerprint(self.problem, self.options) if self.path else ""
+        self.fingerprint = _fingerprint(self.problem, self.unknowns, self.options) if self.path else ""
         self.initial_state = init_state(self.solver, self.unknowns, self.known(self.unknowns))
         self.state = self.initial_state
         if self.path and self.options.resume and self.path.exists():
@@ -144,7 +144,7 @@ class FitLoop:
         self._set_basis(surface)
         if scale is not None:
             self.problem = dataclasses.replace(self.problem, loss_scale=jnp.asarray(scale, self.field.heights.dtype))
-        self.best = (math.inf, self.unknowns)
+        self.best = (self.best[0], self.unknowns)
         self.state = reset_state(self.initial_state, self.unknowns)
         self._take_snapshot()
         return True
@@ -205,14 +205,15 @@ class FitLoop:
 
     def _record(self, outcome: Outcome) -> None:
         loss, accepted = float(outcome.loss), bool(outcome.accepted)
-        if math.isfinite(loss) and loss <= self.best[0]:
+        first = len(self.history) == self.stage_start  # another stage's loss may have another scale
+        if math.isfinite(loss) and (first or loss <= self.best[0]):
             self.best = (loss, outcome.unknowns)
         level = math.ceil(max(self.problem.basis.base.shape) * self.stages[self.stage])
         damping, change = float(outcome.damping), float(outcome.change)
         step = Step(len(self.history) + 1, level, loss, accepted, damping, change, self.elapsed())
         self.history.append(step)
         self.converged = bool(outcome.converged)
-        self.predicted = float(outcome.predicted) if self.options.solver == "lm" else math.inf
+        self.predicted = float(outcome.predicted)
         self._take_snapshot()
         if self.progress:
             self.progress(step)
@@ -229,30 +230,38 @@ class FitLoop:
         rejections = self._rejections()
         if len(steps) > 1 and self._flat(steps, fine):  # the first only evaluates where the stage begins
             return Stop.CONVERGED
-        damped = hasattr(self.initial_state, "num_steps_since_acceptance")
-        if rejections >= ((_REJECTIONS if fine else 2) if damped else _HALVINGS):
+        if rejections and self._damped():
+            # Damping that grows with each rejection leaves less and less to be gained, until that would not count.
+            if self.predicted < self._enough(steps[-1].loss, fine) or (rejections >= _REJECTIONS and not fine):
+                return Stop.CONVERGED if rejections == 1 else Stop.STALLED
+        elif rejections >= _HALVINGS:
             return Stop.STALLED
-        if not fine and damped and len(steps) > _COARSE_STEPS:
+        if not fine and self._damped() and len(steps) > _COARSE_STEPS:
             return Stop.CONVERGED
         return Stop.MAX_STEPS if len(self.history) >= self.options.max_steps else None
 
+    def _damped(self) -> bool:
+        """Whether rejected steps raise a λ."""
+        return hasattr(self.initial_state, "num_steps_since_acceptance")
+
     def _flat(self, steps: Sequence[Step], fine: bool) -> bool:
-        """Whether steps hardly lower the loss any more."""
-        tolerance, loss = self.options.tolerance, steps[-1].loss
-        if tolerance is None and self.options.solver != "lm":
-            tolerance = DEFAULT_TOLERANCE
-        gains = [a.loss - b.loss for a, b in itertools.pairwise(steps) if b.accepted]
-        if tolerance is None:
-            enough = _FLAT_GAIN * self.field.heights.size if fine else _COARSE_GAIN * loss
-            if self.predicted < enough:
-                return True
-            count = 1
+        """Whether accepted steps hardly lower the loss any more."""
+        enough, rejections = self._enough(steps[-1].loss, fine), self._rejections()
+        if self.options.tolerance is None and self._damped():
+            count, ended = 1, rejections == 0 and self.predicted < enough
         else:
-            enough = (tolerance if fine else max(tolerance, _COARSE_GAIN)) * loss
-            if self.converged:
-                return True
-            count = _FLAT_STEPS if fine else 1
-        return len(gains) >= count and self._rejections() == 0 and max(map(abs, gains[-count:])) < enough
+            count, ended = _FLAT_STEPS if fine else 1, self.converged
+        gains = [a.loss - b.loss for a, b in itertools.pairwise(steps) if b.accepted]
+        return ended or (len(gains) >= count and rejections == 0 and max(map(abs, gains[-count:])) < enough)
+
+    def _enough(self, loss: float, fine: bool) -> float:
+        """By how much a step must lower the loss to count."""
+        tolerance = self.options.tolerance
+        if tolerance is None:
+            if self._damped():
+                return _FLAT_GAIN * self.field.heights.size if fine else _COARSE_GAIN * loss
+            tolerance = DEFAULT_TOLERANCE
+        return (tolerance if fine else max(tolerance, _COARSE_GAIN)) * loss
 
     def _arrays(self) -> Any:
         """The arrays of a checkpoint; of the state of Levenberg-Marquardt only 1 / λ, as one step makes the rest anew."""
@@ -329,11 +338,22 @@ def _pooled(spreads: Float[np.ndarray, " pictures"]) -> float:
     return float(np.sqrt(np.mean(np.square(spreads))))
 
 
-def _fingerprint(problem: Problem, options: FitOptions) -> str:
-    """A hash of all that decides on the steps: fits of the same fingerprint take the same ones."""
+def _fingerprint(problem: Problem, unknowns: Unknowns, options: FitOptions) -> str:
+    """A hash of all that decides on the steps: fits of the same fingerprint take the same ones, in whatever process.
+
+    Args:
+      problem, unknowns: those at the start; the structure of their pytrees says of what classes and sizes all parts are, and
+        how many samples a scene asks for. The mesh does not count: another machine may go on.
+      options: for what is not in the problem.
+    """
+    parts: dict[bool, list[Any]] = {True: [], False: []}
+    for field in dataclasses.fields(problem):
+        if field.name != "mesh":
+            parts[field.metadata.get("static", False)].append(getattr(problem, field.name))
+    leaves, structure = jax.tree.flatten((parts[False], unknowns))
     levels = None if options.levels is None else list(options.levels)
-    choices = (options.solver, levels, options.inner_steps, options.tolerance, problem.loss, problem.settings)
+    choices = (parts[True], structure, options.solver, levels, options.inner_steps, options.tolerance)
     digest = hashlib.sha256(repr(choices).encode())
-    for leaf in jax.tree.leaves(problem):
-        digest.update(np.asarray(leaf).tobytes())
+    for leaf in map(np.asarray, leaves):
+        digest.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
     return digest.hexdigest()

@@ -117,19 +117,19 @@ class Outcome(NamedTuple):
       loss: half the sum of squared residuals at `unknowns`.
       accepted: whether the unknowns changed.
       converged: whether the solver's tolerance is met.
+      predicted: by how much the linear model of Levenberg-Marquardt's next step lowers the loss; 0 for other solvers.
       damping: Levenberg-Marquardt's λ for the next step; 0 for other solvers.
       change: of the heights, root mean square.
       unknowns: those to which `loss` belongs.
-      predicted: by how much the next step would lower the loss if the pictures were linear; 0 for other solvers.
     """
 
     loss: Scalar
     accepted: Flag
     converged: Flag
+    predicted: Scalar
     damping: Scalar
     change: Scalar
     unknowns: Unknowns
-    predicted: Scalar
 
 
 def make_solver(options: FitOptions) -> Any:
@@ -218,21 +218,18 @@ def _advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> t
         loss, evaluated = new_state.f_info.as_min(), new
         accepted = new_state.num_accepted_steps > state.num_accepted_steps
         damping = 1 / new_state.search_state.step_size if isinstance(solver, LevenbergMarquardt) else zero
+    predicted = _predicted_gain(solver, new, new_state) if isinstance(solver, LevenbergMarquardt) else zero
     moved = problem.basis.heights(new.coefficients) - problem.basis.heights(unknowns.coefficients)
     change = jnp.sqrt(jnp.mean(moved * moved))
-    predicted = _predicted_gain(new, new_state) if isinstance(solver, LevenbergMarquardt) else zero
-    outcome = Outcome(
-        loss.astype(dtype), accepted, converged, damping.astype(dtype), change, evaluated, predicted.astype(dtype)
-    )
+    loss, damping, predicted = (value.astype(dtype) for value in (loss, damping, predicted))
+    outcome = Outcome(loss, accepted, converged, predicted, damping, change, evaluated)
     return on_every_device((new, new_state, outcome), problem.mesh)
 
 
-def _predicted_gain(unknowns: Unknowns, state: Any) -> Scalar:
-    """By how much a step to where the state evaluates next lowers half the sum of squares of linear residuals."""
-    info = state.f_info
+def _predicted_gain(solver: LevenbergMarquardt, unknowns: Unknowns, state: Any) -> Scalar:
+    """See `Outcome.predicted`."""
     step = jax.tree.map(lambda new, old: new - old, state.y_eval, unknowns)
-    pairs = zip(jax.tree.leaves(info.residual), jax.tree.leaves(info.jac.mv(step)), strict=True)
-    return -sum((jnp.sum(change * (r + change / 2)) for r, change in pairs), start=jnp.zeros((), unknowns.coefficients.dtype))
+    return -solver.search.predict_reduction(step, state.f_info)
 
 
 def count_unknowns(unknowns: Unknowns) -> int:

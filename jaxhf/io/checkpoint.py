@@ -11,13 +11,13 @@ import equinox as eqx
 from .errors import FileError
 from .files import PathLike, replacing, require_file
 
-_MAGIC = b"jaxhf checkpoint 1\n"
+_MAGIC = b"jaxhf checkpoint 2\n"
 
 
 def save_checkpoint(path: PathLike, facts: dict[str, Any], arrays: Any) -> None:
     """Writes a checkpoint: facts (what JSON can hold) and a pytree's arrays.
 
-    A kill at any moment leaves the old file or the new one, which takes the old one's place in one step, when it is whole.
+    A kill or a power failure at any moment leaves the old file or the new one, see `replacing`.
     """
     stream = io.BytesIO()
     stream.write(json.dumps(facts).encode() + b"\n")

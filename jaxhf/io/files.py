@@ -71,14 +71,30 @@ def require_folder(path: Path, what: str) -> None:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong."""
+    """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong.
+
+    The new content is on the disk before it gets the name, and the name when this ends: a power failure leaves the old file
+    or the new one, not an empty one (Pillai et al., All file systems are not created equal, 2014).
+    """
     path = path.resolve()  # what a link points to is replaced, not the link
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield temporary
+        with temporary.open("rb+") as file:
+            os.fsync(file.fileno())
         os.replace(temporary, path)
+        with contextlib.suppress(OSError):  # Windows opens no folders, some network file systems synchronise none
+            _synchronise_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _synchronise_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def require_writable_text(path: PathLike, ending: str) -> Path:

@@ -253,9 +253,10 @@ def test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption(tmp_pat
     targets = [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in scenes()]
     whole = jaxhf.fit(scenes(), targets, **OPTIONS)
     assert whole.result is jaxhf.Stop.STALLED
-    assert [step.accepted for step in whole.history[-6:]] == [True] + 5 * [False]
-    damping = np.array([step.damping for step in whole.history[-6:]])
-    np.testing.assert_allclose(damping[1:] / damping[:-1], [4, 8, 16, 32, 64], rtol=1e-12)
+    last = max(k for k, step in enumerate(whole.history) if step.accepted)
+    damping = np.array([step.damping for step in whole.history[last:]])
+    assert len(damping) > 5
+    np.testing.assert_allclose(damping[1:] / damping[:-1], 2.0 ** np.arange(2, len(damping) + 1), rtol=1e-12)
 
     def interrupt(step):
         if step.step == len(whole.history) - 2:
@@ -271,13 +272,15 @@ def test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption(tmp_pat
 def test_a_fit_that_stalls_says_so_and_keeps_the_best(targets, monkeypatch):
     """Steps as a solver may make them: to a better place, to a worse one, then nowhere any more."""
     losses = iter([7.0, 5.0, 6.0])
+    predicted = iter([0.3, 0.2, 0.1, 0.03, 1e-2, 1e-3, 1e-5, 1e-9])  # the tolerance is 1e-8
 
     def advance(solver, unknowns, state, problem):
         loss = next(losses, None)
         if loss is not None:
             unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, unknowns.coefficients.at[1, 2].add(0.01))
         number = jnp.asarray(loss or 6.0)
-        return unknowns, state, Outcome(number, jnp.asarray(loss is not None), jnp.asarray(False), number, number, unknowns)
+        share, no = jnp.asarray(next(predicted, 0.0)), jnp.asarray(False)
+        return unknowns, state, Outcome(number, jnp.asarray(loss is not None), no, share, number, number, unknowns)
 
     monkeypatch.setattr(_loop, "advance", advance)
     found = jaxhf.fit(scenes(), targets, **OPTIONS)

@@ -1,6 +1,7 @@
 """A fit that is cut short goes on from its checkpoint, to the same bits."""
 
 import contextlib
+import inspect
 import signal
 import subprocess
 import sys
@@ -14,6 +15,8 @@ import pytest
 
 import jaxhf
 from jaxhf.fitting import fit as _fit, loop as _loop
+from jaxhf.fitting.options import FitOptions
+from jaxhf.fitting.problem import make_problem
 from jaxhf.fitting.solvers import Outcome
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
@@ -178,7 +181,7 @@ def without_pictures(setattr: Callable[..., None]) -> None:
     def advance(solver, unknowns, state, problem):
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, unknowns.coefficients + jnp.sin(state))
         loss, yes = 1 / (1 + state), jnp.asarray(True)
-        return unknowns, state + 1, Outcome(loss, yes, ~yes, loss, loss, unknowns)
+        return unknowns, state + 1, Outcome(loss, yes, ~yes, loss, loss, loss, unknowns)
 
     setattr(_loop, "init_state", lambda solver, unknowns, problem: jnp.zeros(()))
     setattr(_loop, "reset_state", lambda initial, unknowns: initial)
@@ -209,6 +212,50 @@ def test_a_killed_process_loses_at_most_one_interval(tmp_path, monkeypatch):
     agree(jaxhf.fit(*problem(), **options, checkpoint=path, resume=True, progress=again.append), whole)
     assert len(whole.history) == 12
     assert 4 <= again[0].step - 1 <= 5  # kept after 4, or a step later than it was told
+
+
+def fingerprint(size=(4, 6), material: jaxhf.Matte | jaxhf.Mirror | None = None, samples: int = 1, **options) -> str:
+    """That of a fit of one black picture, by the sampling that its scene asks for."""
+    height, width = size
+    camera = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.0, width=width, height=height)
+    terrain = jaxhf.Object(jaxhf.Heightfield(np.zeros((3, 3))), material or jaxhf.Matte(0.5))
+    scene = jaxhf.Scene([terrain], camera, [jaxhf.Directional((1, 2, 3))], samples=samples)
+    defaults = {name: option.default for name, option in list(inspect.signature(jaxhf.fit).parameters.items())[2:]}
+    chosen = FitOptions(**{**defaults, "settings": jaxhf.Settings(), **options})
+    return _loop._fingerprint(*make_problem([scene], [np.zeros(size)], chosen), chosen)
+
+
+def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():
+    """Pictures of 4 x 6 and 6 x 4 zeros, a reflected share of 0.5, ...: the bytes of all arrays are the same."""
+    found = [
+        fingerprint(),
+        fingerprint(samples=4),
+        fingerprint(material=jaxhf.Mirror(0.5)),
+        fingerprint(size=(6, 4)),
+        fingerprint(settings=jaxhf.Settings(samples=4)),
+        fingerprint(solver="adam"),
+        fingerprint(levels=[0.5, 1.0]),
+        fingerprint(inner_steps=50),
+        fingerprint(tolerance=1e-5),
+        fingerprint(exposures=True),
+        fingerprint(offsets=True),
+        fingerprint(albedo="constant"),
+        fingerprint(loss="cauchy"),
+        fingerprint(loss="huber"),
+    ]
+    assert len(set(found)) == len(found)
+    assert fingerprint(max_steps=7, checkpoint_every=3, uncertainty=5) == found[0]  # what does not decide on the steps
+
+
+def test_another_process_finds_the_same_fingerprint():
+    script = (
+        "import sys, jax; jax.config.update('jax_enable_x64', True); sys.path[:0] = sys.argv[1:]\n"
+        "from test_fit_checkpoint import *; print(fingerprint(albedo='map', loss='geman', levels=[0.5, 1.0]))"
+    )
+    here = Path(__file__).parent
+    command = [sys.executable, "-c", script, str(here.parents[1]), str(here)]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert found.stdout.strip() == fingerprint(albedo="map", loss="geman", levels=[0.5, 1.0])
 
 
 def test_a_damaged_checkpoint_and_that_of_another_fit_are_refused(tmp_path):

@@ -1,0 +1,95 @@
+"""Ctrl-C ends a command whenever it comes: each time in a process of its own."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to another process")
+
+ROOT = Path(__file__).parents[2]
+SCENE = ROOT / "scenes" / "debug4x4.toml"  # 320 x 240
+START = "import gc, signal, sys; from jaxhf.cli.main import main\n"
+
+
+def started(script: str, *arguments: object) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", script, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        cwd=ROOT,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.1, 0.2, 0.35, 0.6, 1.0])
+def test_ctrl_c_in_the_first_second_ends_it_with_one_line(delay, tmp_path):
+    """From the first line of `main` on; before it is Python's own start."""
+    process = started(START + "print('ready', flush=True); sys.exit(main())", "render", SCENE, "-o", tmp_path / "out.npy")
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(delay)
+        process.send_signal(2)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (130, "", "\njaxhf: interrupted\n")
+    assert not list(tmp_path.iterdir())
+
+
+COLLECTED = """
+def collected(phase, info):
+    if "jax" in sys.modules:
+        gc.callbacks.remove(collected)
+        signal.raise_signal(signal.SIGINT)
+gc.callbacks.append(collected)
+sys.exit(main())
+"""
+
+
+def test_ctrl_c_while_garbage_is_collected_during_an_import(tmp_path):
+    """Python drops what such a callback raises, and JAX has one that runs for a part of the time in which it is imported."""
+    process = started(START + COLLECTED, "render", SCENE, "-o", tmp_path / "out.npy")
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (130, "", "\njaxhf: interrupted\n")
+
+
+DROPPED = """
+import gc, signal, time
+from jaxhf.cli import interruption
+interruption.end_at_once()
+interruption.raise_from_now_on()
+gc.callbacks.append(lambda *_: signal.raise_signal(signal.SIGINT))
+try:
+    gc.collect()
+    gc.callbacks.clear()
+    time.sleep(20)
+except KeyboardInterrupt:
+    print("obeyed")
+"""
+
+
+def test_ctrl_c_that_python_drops_comes_again():
+    process = started(DROPPED)
+    assert process.communicate(timeout=60) == ("obeyed\n", "")
+
+
+IGNORED = """
+import signal
+from jaxhf.cli import interruption
+signal.signal(signal.SIGINT, signal.SIG_IGN)
+interruption.end_at_once()
+interruption.raise_from_now_on()
+signal.raise_signal(signal.SIGINT)
+print("went on")
+"""
+
+
+def test_where_ctrl_c_is_ignored_it_stays_so():
+    """As in the background of a shell's script."""
+    process = started(IGNORED)
+    assert process.communicate(timeout=60) == ("went on\n", "")
+
+
+def test_little_is_imported_before_ctrl_c_is_looked_after():
+    process = started("import sys, jaxhf.cli.main; print({'argparse', 'importlib.metadata', 'numpy', 'jax'} & {*sys.modules})")
+    assert process.communicate(timeout=60) == ("set()\n", "")

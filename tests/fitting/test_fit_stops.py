@@ -1,0 +1,45 @@
+"""Why a fit stops, and what it then says of itself: rough terrain, which the derivative describes only nearby."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+import jaxhf
+
+SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
+# Slopes up to 3, seen from above in one picture of one light; the prior is the terrain smoothed, and says little.
+TRUTH = 0.05 * np.random.default_rng(0).standard_normal((16, 16))
+PRIOR = np.pad(TRUTH, 1, mode="edge")
+PRIOR = (PRIOR[:-2] + 2 * PRIOR[1:-1] + PRIOR[2:]) / 4
+PRIOR = (PRIOR[:, :-2] + 2 * PRIOR[:, 1:-1] + PRIOR[:, 2:]) / 4
+
+
+def scene(heights: np.ndarray) -> jaxhf.Scene:
+    camera = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.0, width=24, height=24)
+    return jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera, [jaxhf.Directional((1, 2, 3))])
+
+
+def fitted(**options: Any) -> jaxhf.Fit:
+    target = np.asarray(jaxhf.render(scene(TRUTH), SETTINGS))
+    return jaxhf.fit([scene(PRIOR)], [target], settings=SETTINGS, prior=PRIOR, **options)
+
+
+def test_rejected_steps_are_damped_until_one_is_short_enough():
+    """Where the loss is 1e5 standard deviations squared, a damping of 160 still lets steps through that are too long."""
+    found = fitted(prior_std=0.2, levels=[1.0])
+    assert found.result is not jaxhf.Stop.MAX_STEPS
+    assert sum(step.accepted for step in found.history[1:]) > 3
+    assert found.stats["loss"] < 0.3 * found.history[0].loss
+    assert max(step.damping for step in found.history if step.accepted) > 160
+
+
+def test_the_loss_is_that_of_the_last_step_where_max_steps_end_a_level():
+    steps = fitted(prior_std=0.2, max_steps=20).history
+    level = max(k for k, step in enumerate(steps) if step.level == 8) + 1
+    assert level < len(steps)
+    found = fitted(prior_std=0.2, max_steps=level)
+    assert found.result is jaxhf.Stop.MAX_STEPS
+    assert len(found.history) == level
+    assert math.isfinite(found.stats["loss"])
+    assert found.stats["loss"] == min(step.loss for step in found.history)
