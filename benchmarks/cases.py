@@ -135,9 +135,9 @@ def surveyed(
     extent = ((truth.shape[1] - 1) * spacing[0], (truth.shape[0] - 1) * spacing[1])
     middle = np.array([extent[0] / 2, extent[1] / 2, prior.mean()])
     views: list[View] = []
-    for turn in np.radians((180, 60, 300))[: len(suns)]:
+    for turn in np.radians((190, 80, 280))[: len(suns)]:
         offset = 1.38 * max(extent) * np.array([np.sin(turn), np.cos(turn), 1.64])
-        views.append(((middle + offset).tolist(), middle.tolist(), 24.0))
+        views.append(((middle + offset).tolist(), middle.tolist(), 28.0))
     lights = [jaxhf.Directional.from_angles(azimuth=azimuth, altitude=altitude) for azimuth, altitude in suns]
     exact = sources.pictures(
         name,
