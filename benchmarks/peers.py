@@ -38,6 +38,8 @@ View = tuple[Sequence[float], Sequence[float], float]
 class MitsubaScene(NamedTuple):
     """A terrain in Mitsuba 3 (pip install mitsuba; it needs LLVM's library, see DRJIT_LIBLLVM_PATH).
 
+    Dr.Jit 1.5 with LLVM 15 ends in "Cannot select: fminimum" on x86; LLVM 22 does not.
+
     Attributes:
       dr, mi: its modules; they are in none of our extras.
       scene: what it renders.
