@@ -22,11 +22,11 @@ def common_work(peers: Path) -> Any:
 
 
 def mesh_of(heights: np.ndarray, extent: tuple[float, float] = (1.0, 1.0)) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (n, 3) of a square array of heights over a footprint of this extent in x and y, and triangles (m, 3)."""
-    size = len(heights)
-    x, y = np.meshgrid(np.linspace(0, extent[0], size), np.linspace(0, extent[1], size))
-    corner = (np.arange(size - 1)[:, None] * size + np.arange(size - 1)).ravel()
-    lower, upper = [corner, corner + 1, corner + size + 1], [corner, corner + size + 1, corner + size]
+    """Vertices (n, 3) of heights (ny, nx) over a footprint of this extent in x and y, and triangles (m, 3)."""
+    ny, nx = heights.shape
+    x, y = np.meshgrid(np.linspace(0, extent[0], nx), np.linspace(0, extent[1], ny))
+    corner = (np.arange(ny - 1)[:, None] * nx + np.arange(nx - 1)).ravel()
+    lower, upper = [corner, corner + 1, corner + nx + 1], [corner, corner + nx + 1, corner + nx]
     faces = np.concatenate([np.stack(lower, 1), np.stack(upper, 1)])
     return np.stack([x, y, heights], -1).astype(np.float32).reshape(-1, 3), faces.astype(np.int32)
 
@@ -37,6 +37,8 @@ View = tuple[Sequence[float], Sequence[float], float]
 
 class MitsubaScene(NamedTuple):
     """A terrain in Mitsuba 3 (pip install mitsuba; it needs LLVM's library, see DRJIT_LIBLLVM_PATH).
+
+    Dr.Jit 1.5 with LLVM 15 ends in "Cannot select: fminimum" on x86; LLVM 22 does not.
 
     Attributes:
       dr, mi: its modules; they are in none of our extras.
@@ -82,6 +84,7 @@ def mitsuba_scene(
     if albedo is not None:
         mesh.set_bsdf(mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": albedo}}))
     eye, target, fov = view
+    distance = float(np.linalg.norm(np.subtract(target, eye)))
     scene = mi.load_dict(
         {
             "type": "scene",
@@ -91,7 +94,8 @@ def mitsuba_scene(
             "sensor": {
                 "type": "perspective",
                 "fov": fov,
-                "far_clip": 1e6,  # its default is 1e4
+                "near_clip": 0.01 * distance,  # its defaults, 0.01 and 1e4, cut off terrains in metres
+                "far_clip": 100 * distance,
                 "to_world": mi.ScalarTransform4f().look_at(origin=list(eye), target=list(target), up=[0, 0, 1]),
                 "film": {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}},
                 "sampler": {"type": "independent", "sample_count": samples},

@@ -3,12 +3,14 @@
 `flat`: noise-free pictures of our own, four lights, no shadows. `common`: the common recovery of `--peers`, whose pictures
 Mitsuba made, or makes for other cameras and sizes (pip install mitsuba). `jacksboro`: parts of the Jacksboro terrain from a
 map smoothed over 8 cells and three noisy pictures that Mitsuba made (`--targets` keeps them). `shadow`: a hill that no
-picture shows, from its shadow. One case a process: the times include compilation, as a user meets it.
+picture shows, from its shadow. `cases`: what the default call makes of the cases of cases.py, or with `--held-out` of those
+of held_out.py. One case a process: the times include compilation, as a user meets it.
 """
 
 import argparse
 import os
 import resource
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -16,12 +18,11 @@ from typing import Any
 import jax
 import numpy as np
 import scipy.optimize
+from cases import CASES, Case, Missing, Sources, flat as flat_case, smoothed
+from held_out import HELD_OUT
 from peers import View, common_work, mitsuba_picture
 
 import jaxhf
-from jaxhf.io.procedural import fractal
-
-LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6), (-0.3, -0.5, 0.6))
 
 
 def report(name: str, found: jaxhf.Fit, truth: np.ndarray, seconds: float, **more: Any) -> None:
@@ -49,27 +50,16 @@ def timed(*arguments: Any, **options: Any) -> tuple[jaxhf.Fit, float]:
 
 def flat(options: argparse.Namespace) -> None:
     """Smooth terrain seen from straight above, nothing hidden: what is left is the solver's own error."""
-    n = 64
-    truth = fractal([n, n], seed=3, exponent=3.0, range=(0.0, 0.1)).astype(options.dtype)
-    # Its frame ends just inside the terrain, whose border would move with the heights in a way that only edge derivatives know.
-    fov = 2 * np.degrees(np.arctan(0.4995 / 5.0))
-    camera = jaxhf.Perspective.look_at((0.5, 0.5, 5.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=fov, width=128, height=128)
-    settings = jaxhf.Settings(shadows=False, samples=1)
-
-    def scenes(heights: np.ndarray) -> list[jaxhf.Scene]:
-        field = jaxhf.Object(jaxhf.Heightfield(heights))
-        return [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]
-
-    targets = [np.asarray(jaxhf.render(scene, settings))[..., 0] for scene in scenes(truth)]
+    case = flat_case(Sources(), options.precision)
     found, seconds = timed(
-        scenes(np.full_like(truth, 0.05)),
-        targets,
-        settings=settings,
+        case.scenes,
+        case.targets,
+        settings=jaxhf.Settings(shadows=False, samples=1),
         tolerance=1e-9,
         max_steps=options.max_steps,
         progress=options.verbose,
     )
-    report("flat start, noise-free, 4 images:", found, truth, seconds)
+    report("flat start, noise-free, 4 images:", found, case.truth, seconds)
 
 
 def common(options: argparse.Namespace) -> None:
@@ -236,25 +226,68 @@ def shadow(options: argparse.Namespace) -> None:
             np.savez(options.out / f"shadow {points}.npz", **kept)
 
 
-def smoothed(heights: np.ndarray, cells: float) -> np.ndarray:
-    """A Gaussian of this standard deviation over the vertices that there are."""
-    for axis, n in enumerate(heights.shape):
-        at = np.arange(n)
-        kernel = np.exp(-0.5 * ((at[:, None] - at) / cells) ** 2)
-        kernel /= kernel.sum(1, keepdims=True)
-        heights = np.moveaxis(np.tensordot(kernel, heights, (1, axis)), 0, axis)
-    return heights
+def judged(options: argparse.Namespace) -> None:
+    """The default call on each case: how much better than what was known before, or whether it warns."""
+    definitions = HELD_OUT if options.held_out else CASES
+    sources = Sources(options.targets, options.peers, options.hfield)
+    names = definitions if options.names is None else options.names
+    if unknown := set(names) - set(definitions):
+        raise SystemExit(f"there is no case {', '.join(sorted(unknown))} among {', '.join(definitions)}")
+    for name in names:
+        definition = definitions[name]
+        jax.config.update("jax_enable_x64", definition.precision == "float64")
+        try:
+            case = definition.make(sources)
+        except Missing as reason:
+            print(f"{name}: skipped, {reason}", flush=True)
+            continue
+        found, seconds = timed(
+            case.scenes, case.targets, uncertainty=options.uncertainty, progress=options.verbose, **case.given
+        )
+        judge(name, case, found, seconds)
+        if options.out is not None:
+            kept = {"heights": found.heights, "truth": case.truth, "reference": case.reference, "seen": found.seen}
+            np.savez(options.out / f"{name}.npz", **kept, std=0 if found.std is None else found.std)
+
+
+def judge(name: str, case: Case, found: jaxhf.Fit, seconds: float) -> None:
+    error, before = np.asarray(found.heights, np.float64) - case.truth, case.reference - case.truth
+    numbers: dict[str, Any] = {}
+    for where, mask in (("", np.ones_like(found.seen)), (" seen", found.seen)):
+        old, new = (np.sqrt(np.mean(values[mask] ** 2)) for values in (before, error))
+        numbers |= {f"before{where}": old, f"after{where}": new, f"ratio{where}": old / new}
+    numbers |= {"chi2": found.stats["chi2"], "steps": found.stats["steps"], "seconds": seconds}
+    if found.std is not None:
+        fitting = found.history[-1].seconds if found.history else 0.0
+        numbers |= {"seconds to the last step": fitting, "seconds of deviations": seconds - fitting}
+        for k in (1, 2):
+            inside = np.abs(error) <= k * found.std
+            numbers |= {f"within {k} std": np.mean(inside), f"within {k} std seen": np.mean(inside[found.seen])}
+    warnings = getattr(found, "warnings", ())
+    verdict = "beats by 3" if numbers["ratio"] >= 3 else "warns" if warnings else "SILENT"
+    print(f"{name}: {verdict} |", ", ".join(f"{key} {value:.3g}" for key, value in numbers.items()), "|", found.result.value)
+    for warning in warnings:
+        print(f"  {warning}")
+    sys.stdout.flush()
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("case", choices=("flat", "common", "jacksboro", "shadow"))
+    parser.add_argument("case", choices=("flat", "common", "jacksboro", "shadow", "cases"))
     parser.add_argument(
-        "--targets", type=Path, help="an .npz file with Mitsuba's pictures of jacksboro; made where it is not there"
+        "--targets", type=Path, help="Mitsuba's pictures, an .npz file [cases: a folder]; made where they are not there"
+    )
+    parser.add_argument("--names", nargs="+", help=f"of cases [all: {', '.join(CASES)}]; one a process for times")
+    parser.add_argument("--held-out", action="store_true", help="cases that were not looked at while the fit was built")
+    parser.add_argument(
+        "--hfield",
+        type=Path,
+        help="assets/hfield.png in the folder mujoco_playground/_src/locomotion/go1/xmls of the wheel that "
+        "pip download --no-deps playground fetches",
     )
     parser.add_argument("--parts", nargs="+", default=[f"{row},{column}" for row, column in CORNERS], help="of Jacksboro")
     parser.add_argument("--independent", action="store_true", help="a prior of jacksboro whose errors are independent")
-    parser.add_argument("--out", type=Path, help="a folder for what jacksboro and shadow find, as .npz")
+    parser.add_argument("--out", type=Path, help="a folder for what jacksboro, shadow and cases find, as .npz")
     parser.add_argument("--peers", type=Path, help="folder of common_work.py and of its targets")
     parser.add_argument("--camera", default="D", choices=("A", "B", "C", "D"))
     parser.add_argument("--size", type=int, default=64, help="heights a side of the common recovery")
@@ -276,7 +309,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", options.precision == "float64")
     jax.config.update("jax_num_cpu_devices", options.devices)
     options.dtype = np.dtype(options.precision)
-    {"flat": flat, "common": common, "jacksboro": jacksboro, "shadow": shadow}[options.case](options)
+    {"flat": flat, "common": common, "jacksboro": jacksboro, "shadow": shadow, "cases": judged}[options.case](options)
 
 
 if __name__ == "__main__":
