@@ -126,10 +126,10 @@ class FitLoop:
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, jnp.zeros_like(unknowns.coefficients))
         share, repeats = self.stages[self.stage + 1], self.stage >= 0 and self.stages[self.stage] == 1
         known = self.known(self.best[1])
-        probes = [pictures_and_influence(self.best[1], known, key) for key in range(_PROBES)]
-        spreads = _spreads(probes[0][0], known)
+        pictures, _ = pictures_and_influence(self.best[1], known)
+        spreads = _spreads(pictures, known)  # radiance
         noise = self._settled_noise(spreads, share)
-        spread = float(np.max(spreads * self.noise / noise)) if self.options.noise is None else _pooled(spreads)
+        spread = float(np.sqrt(np.mean(np.square(spreads / noise))))
         scale = None
         if self.final_loss_scale is not None:
             scale = max(self.final_loss_scale, 3 * spread)
@@ -139,8 +139,9 @@ class FitLoop:
             return False
         self.stage += 1
         self.unknowns, self.stage_start = unknowns, len(self.history)
-        self.set_noise(noise)
-        self.units = self._measured_units([np.asarray(influence) for _, influence in probes])
+        self.set_noise(noise, known)
+        probes = [pictures_and_influence(self.best[1], self.known(self.best[1]), key)[1] for key in range(_PROBES)]
+        self.units = self._measured_units([np.asarray(influence) for influence in probes])
         self._set_basis(surface)
         if scale is not None:
             self.problem = dataclasses.replace(self.problem, loss_scale=jnp.asarray(scale, self.field.heights.dtype))
@@ -156,22 +157,21 @@ class FitLoop:
         basis = make_basis(self.field, base, self.stages[self.stage], self.units)
         self.problem = eqx.tree_at(lambda problem: problem.basis, self.problem, basis)
 
-    def set_noise(self, noise: np.ndarray) -> None:
-        """Weighs the residuals of each picture by another standard deviation."""
-        if not np.array_equal(noise, self.noise):
-            self.problem = self.problem.with_noise(noise)
-            self.noise = noise
+    def set_noise(self, noise: np.ndarray, known: Problem) -> None:
+        """Weighs residuals by this noise and by the error of the samples of the pictures that are known."""
+        self.problem = dataclasses.replace(known.with_noise(noise), linearised=None)
+        self.noise = noise
 
     def _settled_noise(self, spreads: np.ndarray, share: float) -> np.ndarray:
         """The noise of each picture by its residuals, where none is given; unchanged where it would hardly change.
 
         Args:
-          spreads: of each picture's residuals, in units of the present noise.
+          spreads: of each picture's residuals, radiance.
           share: of the modes that the stage to come varies.
         """
         if self.options.noise is not None:
             return self.noise
-        noise = np.maximum(spreads * self.noise, self.problem.least_noise)
+        noise = np.maximum(spreads, self.problem.least_noise)
         changes = np.maximum(noise / self.noise, self.noise / noise)
         return self.noise if share == 1 and changes.max() < _SETTLED else noise
 
@@ -306,7 +306,8 @@ class FitLoop:
         self.best, self.seconds, self.predicted = (facts["best"], best), facts["seconds"], facts["predicted"]
         self.history = [Step(*line) for line in facts["history"]]
         self._set_basis(np.asarray(base))
-        self.set_noise(noise)
+        base_unknowns = eqx.tree_at(lambda u: u.coefficients, best, jnp.zeros_like(best.coefficients))
+        self.set_noise(np.asarray(noise), self.known(base_unknowns))
         self.problem = dataclasses.replace(self.problem, loss_scale=loss_scale)
         if hasattr(self.initial_state, "num_steps_since_acceptance"):
             self.state = reset_state(self.initial_state, self.unknowns, state)
@@ -319,23 +320,24 @@ class FitLoop:
 
 
 def _spreads(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarray, " pictures"]:
-    """The standard deviation of each picture's residuals, by their median: the few that are far off do not count.
+    """The standard deviation of each picture's values at weight 1, by the median of its residuals; radiance.
 
-    Nor do pixels that do not change with the heights, such as the background.
+    Pixels that do not change with the heights, such as the background, do not count, nor the half of the others whose samples
+    differ most.
     """
-    spreads = np.ones(problem.count)
+    spreads = np.zeros(problem.count)
     for number, (picture, group) in enumerate(zip(pictures, problem.groups, strict=True)):
-        sizes, weights = np.abs(group.weights * (picture - group.targets)), np.asarray(group.weights)
-        shown = weights > 0
-        if problem.linearised is not None:
-            shown &= np.asarray(problem.linearised[number].depends)[..., None]
-        for index, size, counts, weighted in zip(group.indices, np.asarray(sizes), shown, weights > 0, strict=True):
-            spreads[index] = 1.4826 * np.median(size[counts if counts.any() else weighted])
+        residuals, given = np.abs(np.asarray(group.given * (picture - group.targets))), np.asarray(group.given)
+        known = None if problem.linearised is None else problem.linearised[number]
+        for position, k in enumerate(group.indices):
+            counted = given[position] > 0
+            if known is not None:
+                shown = counted & np.asarray(known.depends[position])[..., None]
+                if shown.any():
+                    sampling = np.broadcast_to(np.asarray(known.sampling[position])[..., None], shown.shape)
+                    counted = shown & (sampling <= np.median(sampling[shown]))
+            spreads[k] = 1.4826 * np.median(residuals[position][counted])
     return spreads
-
-
-def _pooled(spreads: Float[np.ndarray, " pictures"]) -> float:
-    return float(np.sqrt(np.mean(np.square(spreads))))
 
 
 def _fingerprint(problem: Problem, unknowns: Unknowns, options: FitOptions) -> str:

@@ -36,6 +36,7 @@ class Group(eqx.Module):
       scenes: what differs from picture to picture: a scene whose leaves have a leading axis of n pictures, None for the others.
       shared: those others, once for all pictures. The heights that are sought are None in both.
       targets: shape (n, h, w, c), c = 1 for grey.
+      given: the user's weights, by which the noise is divided, zero where a value does not count, shape (n, h, w, c).
       weights: 1 / standard deviation of each value, zero where there is none, shape (n, h, w, c).
       indices: the pictures' positions among the caller's.
     """
@@ -43,6 +44,7 @@ class Group(eqx.Module):
     scenes: Scene
     shared: Scene
     targets: Float[Array, "n h w c"]
+    given: Float[Array, "n h w c"]
     weights: Float[Array, "n h w c"]
     indices: tuple[int, ...] = eqx.field(static=True)
 
@@ -104,11 +106,19 @@ class Problem(eqx.Module):
         return sum(len(group.indices) for group in self.groups)
 
     def with_noise(self, noise: Float[np.ndarray, " pictures"]) -> "Problem":
-        """The same problem with another standard deviation of each picture's values."""
+        """The same problem with another standard deviation of each picture's values at weight 1.
+
+        To it comes, where pictures are `linearised`, the error of their samples.
+        """
         groups = []
-        for group in self.groups:
-            factors = (self.noise / noise)[list(group.indices)].reshape(-1, 1, 1, 1)
-            groups.append(dataclasses.replace(group, weights=group.weights * jnp.asarray(factors, group.weights.dtype)))
+        for number, group in enumerate(self.groups):
+            variance = jnp.asarray(noise[list(group.indices)], group.given.dtype).reshape(-1, 1, 1, 1) ** 2
+            counts = group.given > 0
+            variance = variance / jnp.where(counts, group.given, 1) ** 2
+            if self.linearised is not None:
+                variance = variance + self.linearised[number].sampling[..., None] ** 2
+            weights = jnp.where(counts, 1 / jnp.sqrt(variance), 0)
+            groups.append(dataclasses.replace(group, weights=weights))
         return dataclasses.replace(self, groups=tuple(groups), noise=noise)
 
 
@@ -186,17 +196,22 @@ def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOpt
             tuple(leaf.shape for leaf in leaves),
             target.shape,
         )
-        found.setdefault(kind, []).append((k, local, target, weight / noise[k]))
+        found.setdefault(kind, []).append((k, local, target, weight))
     dtype = scenes[0].heights.dtype
-    return tuple(
-        Group(
-            *_stacked([local for _, local, _, _ in members]),
-            jnp.asarray(np.stack([target for *_, target, _ in members]), dtype),
-            jnp.asarray(np.stack([weight for *_, weight in members]), dtype),
-            tuple(k for k, *_ in members),
+    groups = []
+    for members in found.values():
+        given = np.stack([weight for *_, weight in members])
+        indices = tuple(k for k, *_ in members)
+        groups.append(
+            Group(
+                *_stacked([local for _, local, _, _ in members]),
+                jnp.asarray(np.stack([target for *_, target, _ in members]), dtype),
+                jnp.asarray(given, dtype),
+                jnp.asarray(given / noise[list(indices)].reshape(-1, 1, 1, 1), dtype),
+                indices,
+            )
         )
-        for members in found.values()
-    )
+    return tuple(groups)
 
 
 def _noise(given: Any, targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
