@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError
 from ..core.settings import Shading
-from ..core.types import Flag, Index
+from ..core.types import Index, Scalar
 from ..core.vector import unit
 from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sky
@@ -74,21 +74,22 @@ def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
     return jnp.concatenate(weights)
 
 
-def boundaries_in_sight(world: World, camera: Camera) -> Flag:
-    """Whether a silhouette or the terrain's border may be in the frame, or ground that its own shadow may fall on.
+def boundary_length(world: World, camera: Camera) -> Scalar:
+    """How long boundaries may be in the picture, pixels: silhouettes, the terrain's border and edges of shadows.
 
-    By the edges alone, without tracing a ray: what hides them does not count.
+    By the edges alone, without tracing a ray: what hides them does not count, and a shadow's edge counts with the length of the
+    edge that throws it. Zero where nothing in the picture has a boundary.
     """
-    found = jnp.zeros((), bool)
+    total = jnp.zeros((), camera.world_from_camera.dtype)
     for surface in world.surfaces:
         if not isinstance(surface, Grid):
             continue
-        seen = silhouettes(surface, Viewpoint(*camera.viewpoint())) & (seen_lengths(surface, camera) > 0)
-        found = found | seen.any()
+        lengths = seen_lengths(surface, camera)
+        total = total + jnp.sum(jnp.where(silhouettes(surface, Viewpoint(*camera.viewpoint())), lengths, 0))
         for light in world.lights if world.settings.shadows else ():
             if not isinstance(light, Sky):
-                found = found | folds(surface, _viewpoint(light)).any()
-    return found
+                total = total + jnp.sum(jnp.where(folds(surface, _viewpoint(light)), lengths, 0))
+    return total
 
 
 def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], shading: Shading) -> EdgeFlags:

@@ -14,7 +14,7 @@ from ..scene.heightfield import Heightfield
 # The height of a terrain's longest modes, as a share of the footprint's longer side. A mode's height falls as 1 / frequency
 # from there: as modes of one slope do.
 _STEEPNESS = 0.25
-# The smallest curvature of the loss along a mode, as a share of the median, that its unit makes up for.
+# As a share of the median: along a mode of less curvature the loss counts as flat, and its unit stays as it is.
 _LEAST_CURVATURE = 1e-6
 
 
@@ -126,27 +126,28 @@ def make_basis(
 
 def balanced_units(
     slope_units: Float[np.ndarray, "my mx"], curvature: Float[np.ndarray, "my mx"], mean_only: bool = False
-) -> Float[np.ndarray, "my mx"]:
-    """Units of the modes in which the loss has curvature 1 along each of them.
+) -> tuple[Float[np.ndarray, "my mx"], float]:
+    """Units of the modes in which the loss has the same curvature along each of them, and that curvature.
 
-    Along the mean of all heights, which pictures hardly show, the curvature in units of one slope is ten thousand times less
-    than along other modes.
+    It is the median of those in units of one slope. Along the mean of all heights, which pictures hardly show, the curvature in
+    units of one slope is ten thousand times less than along other modes.
 
     Args:
       slope_units: `Basis.scale` of all modes in units of one slope.
       curvature: of the loss along each mode, for a mode of unit height; 0: unknown.
-      mean_only: leave all but the mean in units of one slope, and it in one where its curvature is the median of theirs.
+      mean_only: leave all but the mean in units of one slope.
     """
     per_slope = curvature * slope_units**2
     if not (per_slope > 0).any():
-        return slope_units
+        return slope_units, 1.0
     typical = float(np.median(per_slope[per_slope > 0]))
-    balanced = slope_units / np.sqrt(np.maximum(per_slope, _LEAST_CURVATURE * typical))
+    relative = per_slope / typical
+    balanced = slope_units / np.sqrt(np.where(relative > _LEAST_CURVATURE, relative, 1))
     if mean_only:
-        units = slope_units.copy()
-        units[0, 0] = max(balanced[0, 0] * np.sqrt(typical), slope_units[0, 0])
-        return units
-    return balanced
+        mean = max(balanced[0, 0], slope_units[0, 0])
+        balanced = slope_units.copy()
+        balanced[0, 0] = mean
+    return balanced, typical
 
 
 def pad(values: Float[np.ndarray, "ny nx"], padding: tuple[int, int]) -> Float[np.ndarray, "my mx"]:

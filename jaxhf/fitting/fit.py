@@ -18,12 +18,11 @@ from ..io.errors import FileError
 from ..io.files import require_folder
 from ..scene.scene import Scene
 from .basis import Unknowns
-from .defaults import choose_settings
 from .diagnosis import Findings, Places, Region, warnings, where_residuals_are, worst_regions
 from .history import Draws, Step, Stop
 from .loop import FitLoop
 from .options import Albedo, FitOptions, Loss, Solver
-from .problem import Problem, make_problem, require_scenes
+from .problem import Problem, make_problem
 from .residuals import pictures_and_influence
 from .solvers import BFGS_UNKNOWNS, count_unknowns
 from .uncertainty import require_small, standard_deviations, with_unexplained
@@ -159,10 +158,8 @@ def fit(
       KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
     scenes, targets = tuple(scenes), tuple(targets)
-    require_scenes(scenes, targets)
-    settings = choose_settings(scenes, settings or Settings(), albedo == "known")
     options = FitOptions(
-        settings=settings, weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
+        settings=settings or Settings(), weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
         prior_length=prior_length, prior_exponent=prior_exponent, smoothness=smoothness, albedo=albedo,
         albedo_smoothness=albedo_smoothness, exposures=exposures, offsets=offsets, loss=loss, loss_scale=loss_scale,
         solver=solver, levels=levels, max_steps=max_steps, inner_steps=inner_steps, tolerance=tolerance,
@@ -222,6 +219,7 @@ def _report(loop: FitLoop, result: Stop, targets: Sequence[Any]) -> Fit:
     # A background that is black in picture and target says nothing.
     counted = np.concatenate([values[values != 0] for values in in_noise])
     with np.errstate(over="ignore"):
+        regions, where = worst_regions(in_noise), where_residuals_are(in_noise, _places(problem))
         chi2 = float(np.mean(np.square(counted, dtype=np.float64))) if len(counted) else 0.0
     seen = np.asarray(influence) != 0
     std, scaled, draws = None, None, None
@@ -232,12 +230,11 @@ def _report(loop: FitLoop, result: Stop, targets: Sequence[Any]) -> Fit:
         if problem.prior is None:
             std = np.where(seen, std, np.inf)
     heights = problem.basis.crop(problem.basis.base)
-    regions = worst_regions(in_noise)
     findings = Findings(
         result=result,
         chi2=chi2,
         noise_given=options.noise is not None,
-        where=where_residuals_are(in_noise, _places(problem)),
+        where=where,
         regions=regions,
         help=_what_may_help(problem),
         strayed=_strayed(problem, np.asarray(heights), seen, options.prior_std),

@@ -185,7 +185,7 @@ def _in_pixels(
 
 def _resampled(
     values: Float[jax.Array, "chunks n c"], edges: LinearisedEdges, camera: Camera, settings: Settings
-) -> Float[jax.Array, "pixels n c"]:
+) -> Float[jax.Array, "pixels samples c"]:
     """The samples of the pixels that are resampled."""
     tiling, samples = Tiling(camera, settings), settings.samples
     assert samples is not None

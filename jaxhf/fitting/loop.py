@@ -23,7 +23,17 @@ from .history import Step, Stop, print_progress
 from .options import FitOptions
 from .problem import Problem, mode_curvature
 from .residuals import heights_of, linearised, pictures_and_influence
-from .solvers import DEFAULT_TOLERANCE, Outcome, advance, evaluated_at, init_state, make_solver, reset_state, with_rejections
+from .solvers import (
+    DEFAULT_TOLERANCE,
+    FIRST_DAMPING,
+    Outcome,
+    advance,
+    evaluated_at,
+    init_state,
+    make_solver,
+    reset_state,
+    with_rejections,
+)
 
 _REJECTIONS = 2  # in a row, at a coarse level: the next one may do better
 _HALVINGS = 50  # in a row, in a line search, whose first step is the whole gradient
@@ -33,7 +43,7 @@ _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
 _SETTLED = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
 _LAST_STAGES = 3  # at most, over which the scale of a robust loss comes down to its own, or the noise settles
-_PROBES = 4  # of the pictures' curvature
+_PROBES = 8  # of the pictures' curvature
 
 
 def make_stages(shape: tuple[int, ...], options: FitOptions) -> list[float]:
@@ -141,12 +151,13 @@ class FitLoop:
         self.unknowns, self.stage_start = unknowns, len(self.history)
         self.set_noise(noise, known)
         probes = [pictures_and_influence(self.best[1], self.known(self.best[1]), key)[1] for key in range(_PROBES)]
-        self.units = self._measured_units([np.asarray(influence) for influence in probes])
+        self.units, curvature = self._measured_units([np.asarray(influence) for influence in probes])
         self._set_basis(surface)
         if scale is not None:
             self.problem = dataclasses.replace(self.problem, loss_scale=jnp.asarray(scale, self.field.heights.dtype))
         self.best = (self.best[0], self.unknowns)
-        self.state = reset_state(self.initial_state, self.unknowns)
+        step_size = jnp.asarray(1 / (FIRST_DAMPING * curvature), self.field.heights.dtype)
+        self.state = reset_state(self.initial_state, self.unknowns, step_size if self._damped() else None)
         self._take_snapshot()
         return True
 
@@ -175,8 +186,8 @@ class FitLoop:
         changes = np.maximum(noise / self.noise, self.noise / noise)
         return self.noise if share == 1 and changes.max() < _SETTLED else noise
 
-    def _measured_units(self, influences: Sequence[np.ndarray]) -> np.ndarray:
-        """Units of the modes by the curvature of the loss, see `balanced_units`."""
+    def _measured_units(self, influences: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
+        """Units of the modes by the curvature of the loss, and that curvature, see `balanced_units`."""
         basis = make_basis(self.field, np.asarray(self.problem.basis.base))
         curvature = mode_curvature(self.problem, influences)
         return balanced_units(np.asarray(basis.scale, np.float64), curvature, mean_only=self.options.solver != "lm")
@@ -185,7 +196,7 @@ class FitLoop:
         """Varies all modes about the present surface, whatever the level at which the fit stopped."""
         surface = np.asarray(self.problem.basis.surface(self.unknowns.coefficients))
         known = self.known(self.unknowns)
-        self.units = self._measured_units(
+        self.units, _ = self._measured_units(
             [np.asarray(pictures_and_influence(self.unknowns, known, key)[1]) for key in range(_PROBES)]
         )
         basis = make_basis(self.field, surface, 1.0, self.units)

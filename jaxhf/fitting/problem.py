@@ -22,6 +22,7 @@ from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
 from ..trace.world import resolve_settings
 from .basis import Basis, Unknowns, dct_matrix, make_basis, pad, resample
+from .defaults import choose_settings
 from .linearise import Linearised
 from .options import FitOptions
 
@@ -128,11 +129,13 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
     Raises:
       ValueError: scenes, targets and options do not belong together.
     """
-    groups = make_groups(scenes, targets, options)
+    require_scenes(scenes, targets)
     first = scenes[0]
     field, shape, dtype = first.heightfields[0], first.heights.shape, first.heights.dtype
     start = _without_holes(np.asarray(first.heights)) if options.start is None else options.start
     heights = make_heights("start", start, shape)
+    settings = choose_settings(scenes, heights.astype(dtype), options.settings, options.albedo == "known")
+    groups = make_groups(scenes, targets, options, settings)
     prior = make_prior(field, options.prior, options.prior_std, options.prior_length, options.prior_exponent)
     basis = make_basis(field, pad(heights, prior_padding(field, options.prior_length)))
     unknowns = first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), options)
@@ -147,7 +150,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
         noise,
         _brightness(targets) * _LEAST_NOISE,
         options.loss,
-        options.settings,
+        settings,
         local_mesh() if options.mesh is None else options.mesh,
     )
     return problem, unknowns
@@ -179,8 +182,8 @@ def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any]) -> None:
         _require_alike(k, scene, scenes[0])
 
 
-def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOptions) -> tuple[Group, ...]:
-    """Checks scenes and pictures, and gathers those that one program can render."""
+def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOptions, settings: Settings) -> tuple[Group, ...]:
+    """Checks pictures, and gathers those that one program can render with these settings."""
     weights = options.weights
     if weights is not None and len(weights) != len(scenes):
         raise ArgumentError("fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(weights)}")
@@ -192,7 +195,7 @@ def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOpt
         leaves, structure = jax.tree.flatten(local)
         kind = (
             structure,
-            resolve_settings(options.settings, scene).samples,
+            resolve_settings(settings, scene).samples,
             tuple(leaf.shape for leaf in leaves),
             target.shape,
         )
@@ -305,7 +308,7 @@ def _is_grey(target: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w 
     return bool(np.all(target[counts] == target[counts][:, :1]) and np.all(weight == weight[..., :1]))
 
 
-def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, exponent: float) -> Prior | None:
+def make_prior(field: Heightfield, prior: Any, std: Any, length: float | int | None, exponent: float | int) -> Prior | None:
     """The prior of the heights of `field`; `length` and `exponent` are `fit`'s prior_length and prior_exponent."""
     shape, dtype = field.heights.shape, field.heights.dtype
     if prior is None:
@@ -321,6 +324,8 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | None, e
             "fit", "prior_std", f"must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}"
         )
     padding = prior_padding(field, length)
+    if length is not None:
+        _require_plausible(field, length)
     heights = pad(make_heights("prior", prior, shape), padding)
     weight, stiffness = pad(np.broadcast_to(1 / std, shape), padding), None
     if length is not None:
@@ -363,6 +368,19 @@ def _over_neighbours(values: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "m
     padded[1, 1] = np.mean([values[0, 1], values[1, 0]])
     ny, nx = values.shape
     return np.mean([padded[y : y + ny, x : x + nx] for y in range(3) for x in range(3)], axis=0)
+
+
+def _require_plausible(field: Heightfield, length: float) -> None:
+    """Refuses a correlation length that no terrain of this size and spacing can show, such as one in cells."""
+    cell = min(field.dx, field.dy)
+    side = max((n - 1) * d for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True))
+    if not cell * (1 - 1e-6) <= length <= side * (1 + 1e-6):
+        raise ArgumentError(
+            "fit",
+            "prior_length",
+            f"must lie from one cell to the terrain's longer side, {cell:.6g} to {side:.6g}; it is {length:.6g}, or "
+            f"{length / cell:.3g} cells. It is in the unit of dx and dy: {length:.6g} cells would be {length * cell:.6g}",
+        )
 
 
 def prior_padding(field: Heightfield, length: float | None) -> tuple[int, int]:

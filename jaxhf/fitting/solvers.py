@@ -21,7 +21,7 @@ from .residuals import half_squares, linearised, residuals
 
 # BFGS keeps a dense matrix of this many rows at most: 128 MiB in double precision.
 BFGS_UNKNOWNS = 4096
-_FIRST_DAMPING = 1e-2
+FIRST_DAMPING = 1e-2  # as a share of the loss's curvature along a mode
 _REJECTED = 0.1  # by which 1 / λ is multiplied at a rejected step, the first in a row
 # Of LSMR, as a share of the matrix's Frobenius norm. That is far above what a height changes that no picture shows: where a
 # prior is to say how high it is, such heights wandered off with 1e-3, and came back over twice as many steps as with 1e-4.
@@ -170,7 +170,7 @@ def _init_state(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
     shape, _ = eqx.filter_eval_shape(function, unknowns, problem)
     state = solver.init(function, unknowns, problem, _OPTIONS, shape, None, _TAGS)
     if isinstance(solver, LevenbergMarquardt):
-        state = _with_step_size(state, jnp.asarray(1 / _FIRST_DAMPING, unknowns.coefficients.dtype))
+        state = _with_step_size(state, jnp.asarray(1 / FIRST_DAMPING, unknowns.coefficients.dtype))
     return on_every_device(state, problem.mesh)
 
 

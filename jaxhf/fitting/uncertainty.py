@@ -22,7 +22,7 @@ from .problem import Problem
 from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import influence_function, robust_weight
 
-_INNER_TOLERANCE = 1e-6
+_INNER_TOLERANCE = 1e-7
 EXACT_ENTRIES = 2**24
 """Up to so many residuals times unknowns the matrix is formed where "exact" is asked for: 128 MiB in double precision."""
 
@@ -47,7 +47,7 @@ def standard_deviations(
       samples: "exact" forms J as a dense matrix and inverts H. A number, without any dense matrix: that many
         x = argmin |J x - z|², z normal, are drawn; their covariance is H⁻¹ (Papandreou and Yuille, Gaussian sampling by local
         perturbations, 2010), so each deviation is right to 1 / √(2 · samples), however the heights are correlated.
-      inner_steps: of LSMR, each, at most twice as many as in a step of the fit.
+      inner_steps: of LSMR, each, at most five times as many as in a step of the fit.
       report: called after each sample.
 
     Returns:
@@ -65,7 +65,7 @@ def standard_deviations(
     begin = time.perf_counter()
     try:
         while drawn < count:
-            draw = np.asarray(_draw(unknowns, problem, jax.random.key(drawn), 2 * inner_steps), np.float64)
+            draw = np.asarray(_draw(unknowns, problem, jax.random.key(drawn), 5 * inner_steps), np.float64)
             total, drawn = total + draw * draw, drawn + 1
             if report is not None:
                 seconds = time.perf_counter() - begin
