@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ..core.settings import Settings
 from ..io.checkpoint import load_arrays, load_facts, save_checkpoint
 from ..io.errors import FileError
 from ..scene.heightfield import Heightfield
@@ -136,6 +137,9 @@ class FitLoop:
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, jnp.zeros_like(unknowns.coefficients))
         share, repeats = self.stages[self.stage + 1], self.stage >= 0 and self.stages[self.stage] == 1
         known = self.known(self.best[1])
+        refined = repeats and self._take_more_edges(surface)
+        if refined:
+            known = self.known(self.best[1])
         pictures, _ = pictures_and_influence(self.best[1], known)
         spreads = _spreads(pictures, known)  # radiance
         noise = self._settled_noise(spreads, share)
@@ -145,7 +149,7 @@ class FitLoop:
             scale = max(self.final_loss_scale, 3 * spread)
             if scale <= _SETTLED * self.final_loss_scale or self.stage + 2 == len(self.stages):
                 scale = self.final_loss_scale
-        if repeats and np.array_equal(noise, self.noise) and (scale is None or scale == self._loss_scale()):
+        if repeats and not refined and np.array_equal(noise, self.noise) and (scale is None or scale == self._loss_scale()):
             return False
         self.stage += 1
         self.unknowns, self.stage_start = unknowns, len(self.history)
@@ -160,6 +164,20 @@ class FitLoop:
         self.state = reset_state(self.initial_state, self.unknowns, step_size if self._damped() else None)
         self._take_snapshot()
         return True
+
+    def _take_more_edges(self, surface: np.ndarray) -> bool:
+        """Whether the heights that were found call for many more points on edges than those of the start did."""
+        heights = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype)
+        problem = self.problem.with_edge_samples(heights, self.options)
+        if problem.settings == self.problem.settings:
+            return False
+        self._set_settings(problem.settings)
+        return True
+
+    def _set_settings(self, settings: Settings) -> None:
+        """Renders otherwise; the solver's state has another structure then."""
+        self.problem, self.views = dataclasses.replace(self.problem, settings=settings, linearised=None), []
+        self.initial_state = init_state(self.solver, self.best[1], self.known(self.best[1]))
 
     def _loss_scale(self) -> float | None:
         return None if self.problem.loss_scale is None else float(self.problem.loss_scale)
@@ -296,6 +314,7 @@ class FitLoop:
             "best": self.best[0],
             "converged": self.converged,
             "predicted": self.predicted,
+            "edge_samples": self.problem.settings.edge_samples,
             "seconds": self.elapsed(),
             "history": [list(step) for step in self.history],
         }
@@ -311,6 +330,9 @@ class FitLoop:
         facts = load_facts(self.path)
         if facts["fingerprint"] != self.fingerprint:
             raise FileError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
+        settings = dataclasses.replace(self.problem.settings, edge_samples=facts["edge_samples"])
+        if settings != self.problem.settings:
+            self._set_settings(settings)
         self.units = np.zeros(self.problem.basis.base.shape)
         self.unknowns, best, (base, loss_scale, noise, self.units), state = load_arrays(self.path, self._arrays())
         self.stage, self.stage_start, self.converged = facts["stage"], facts["stage_start"], facts["converged"]

@@ -22,7 +22,7 @@ from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
 from ..trace.world import resolve_settings
 from .basis import Basis, Unknowns, dct_matrix, make_basis, pad, resample
-from .defaults import choose_settings
+from .defaults import choose_edge_samples, choose_samples
 from .linearise import Linearised
 from .options import FitOptions
 
@@ -106,6 +106,23 @@ class Problem(eqx.Module):
         """How many pictures there are."""
         return sum(len(group.indices) for group in self.groups)
 
+    def with_edge_samples(self, heights: Float[Array, "ny nx"], options: FitOptions) -> "Problem":
+        """The problem with as many points on edges as pictures of these heights call for, if that is left open.
+
+        Where there were some, others are taken only if it calls for four times as many: all is then compiled again.
+        """
+        if options.settings.edge_samples is not None or options.albedo != "known":
+            return self
+        views = [
+            group.complete(jax.tree.map(lambda leaf, k=k: leaf[k], group.scenes), heights)
+            for group in self.groups
+            for k in range(len(group.indices))
+        ]
+        count, before = choose_edge_samples(views, self.settings), self.settings.edge_samples
+        if count == before or (before and count < 4 * before):
+            return self
+        return dataclasses.replace(self, settings=dataclasses.replace(self.settings, edge_samples=count), linearised=None)
+
     def with_noise(self, noise: Float[np.ndarray, " pictures"]) -> "Problem":
         """The same problem with another standard deviation of each picture's values at weight 1.
 
@@ -134,7 +151,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
     field, shape, dtype = first.heightfields[0], first.heights.shape, first.heights.dtype
     start = _without_holes(np.asarray(first.heights)) if options.start is None else options.start
     heights = make_heights("start", start, shape)
-    settings = choose_settings(scenes, heights.astype(dtype), options.settings, options.albedo == "known")
+    settings = choose_samples(scenes, options.settings)
     groups = make_groups(scenes, targets, options, settings)
     prior = make_prior(field, options.prior, options.prior_std, options.prior_length, options.prior_exponent)
     basis = make_basis(field, pad(heights, prior_padding(field, options.prior_length)))
@@ -153,7 +170,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
         settings,
         local_mesh() if options.mesh is None else options.mesh,
     )
-    return problem, unknowns
+    return problem.with_edge_samples(jnp.asarray(heights, dtype), options), unknowns
 
 
 def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:

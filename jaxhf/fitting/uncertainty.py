@@ -22,7 +22,7 @@ from .problem import Problem
 from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import influence_function, robust_weight
 
-_INNER_TOLERANCE = 1e-7
+_INNER_TOLERANCE = 1e-6
 EXACT_ENTRIES = 2**24
 """Up to so many residuals times unknowns the matrix is formed where "exact" is asked for: 128 MiB in double precision."""
 

@@ -264,7 +264,7 @@ def test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption(tmp_pat
     assert len(damping) > 5
     np.testing.assert_allclose(damping[1:] / damping[:-1], 10 * 2.0 ** np.arange(len(damping) - 1), rtol=1e-12)
 
-    def interrupt(step):
+    def interrupt(step: Any) -> None:
         if step.step == len(whole.history) - 2:
             raise KeyboardInterrupt
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -50,7 +51,7 @@ def agree(found: jaxhf.Fit, whole: jaxhf.Fit) -> None:
 
 @pytest.mark.parametrize("last", [1, 4, 7])
 def test_after_ctrl_c_it_goes_on_to_the_same_bits(tmp_path, whole, last):
-    def interrupt(step: jaxhf.Step) -> None:
+    def interrupt(step: Any) -> None:
         if step.step == last:
             raise KeyboardInterrupt
 
