@@ -17,6 +17,7 @@ from .basis import Unknowns
 from .problem import Problem
 from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import robust_weight
+from .view import KNOWN
 
 EXACT_ENTRIES = 2**24
 """Up to so many residuals times unknowns the matrix is formed where "exact" is asked for: 128 MiB in double precision."""
@@ -27,10 +28,11 @@ def standard_deviations(
 ) -> Float[np.ndarray, "ny nx"]:
     """The standard deviation of each height, given what the pictures and the prior say; shape (ny, nx), height units.
 
-    The Gauss-Newton matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs them;
-    its inverse is the covariance (Laplace's approximation). Albedo, exposures and offsets vary along, so their doubt counts
-    too. Besides, each DCT coefficient has the prior N(0, `Basis.prior_amplitude`²), and each other unknown N(0, 1): a direction
-    on which no picture depends, such as the mean of all heights, then gets a large deviation, not an infinite one.
+    The Gauss-Newton matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs
+    them; its inverse is the covariance (Laplace's approximation). Albedo, exposures, offsets, lights and cameras vary
+    along, so their doubt counts too. Besides, each DCT coefficient has the prior N(0, `Basis.prior_amplitude`²), and the
+    albedo, each exposure and each offset N(0, 1): a direction on which no picture depends, such as the mean of all heights,
+    then gets a large deviation, not an infinite one.
 
     Args:
       samples: "exact" forms J as a dense matrix and inverts H. A number, without any dense matrix: that many
@@ -67,6 +69,7 @@ def _operator(unknowns: Unknowns, problem: Problem) -> tuple[lx.AbstractLinearOp
     roots = [jnp.sqrt(robust_weight(part, problem.loss, problem.loss_scale)) for part in parts]
 
     def normalised(change: Unknowns) -> Unknowns:
+        change = eqx.tree_at(lambda change: change.view, change, KNOWN)  # which has a prior of its own
         return eqx.tree_at(lambda change: change.coefficients, change, change.coefficients / problem.basis.prior_amplitude)
 
     def product(change: Unknowns) -> Any:
