@@ -33,7 +33,7 @@ def table(found: dict[str, dict[int, dict[str, float]]]) -> str:
 
 
 def by_points(measured: Sequence[Configuration]) -> dict[int, dict[str, float]]:
-    return dict(sorted((row.settings.edge_samples, row.figures) for row in measured if row.task == "derivative"))
+    return dict(sorted((row.settings.edge_samples or 0, row.figures) for row in measured if row.task == "derivative"))
 
 
 def derivative_table(found: dict[str, dict[int, dict[str, float]]]) -> str:

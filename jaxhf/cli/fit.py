@@ -122,12 +122,36 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
         for name, values in (("exposures", found.exposures), ("offsets", found.offsets))
         if values is not None
     ]
+    lines += _views(case, found)
     lines.append(
         f"{outputs.heights}: {ny} x {nx} heights from {count} picture{'s' * (count > 1)}, {found.result.value}; "
         f"{found.stats['steps']} steps, {found.stats['seconds']:.3g} s, loss {found.stats['loss']:.6g}, "
         f"chi2 {found.stats['chi2']:.4g}"
     )
     return "\n".join(lines)
+
+
+def _views(case: "Case", found: "Fit") -> list[str]:
+    """The lights' directions and the cameras' positions, where they were sought, and how far they are from those given."""
+    import numpy as np
+
+    from ..fitting.view import differences, sun
+
+    lights, cameras = [], []
+    for given, scene in zip(case.scenes, found.scenes, strict=True):
+        turned, moved, rotated = differences(given, scene)
+        light = sun(scene.lights)
+        if light is not None:
+            x, y, z = np.asarray(light.towards, np.float64)
+            azimuth, altitude = np.degrees(np.arctan2(x, y)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
+            lights.append(f"azimuth {azimuth:.2f} altitude {altitude:.2f} (turned by {turned:.2f} degrees)")
+        eye = " ".join(f"{value:.9g}" for value in np.asarray(scene.camera.world_from_camera)[:3, 3])
+        cameras.append(f"eye {eye} (moved by {moved:.4g}, turned by {rotated:.2f} degrees)")
+    return [
+        f"{name}: {', '.join(values)}"
+        for name, values in (("light", lights), ("camera", cameras))
+        if f"{name}_std" in case.options
+    ]
 
 
 def _write(path: str, case: "Case", found: "Fit", outputs: Outputs) -> None:

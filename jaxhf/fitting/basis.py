@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..scene.heightfield import Heightfield
+from .view import KNOWN, View
 
 # The height of a terrain's longest modes, as a share of the footprint's longer side. A mode's height falls as 1 / frequency
 # from there: as modes of one slope do.
@@ -27,12 +28,15 @@ class Unknowns(eqx.Module):
       albedo: a factor for each texel of the albedo (or for all of them: (1, 1)) in each channel, shape (ty, tx, c).
       exposures: a factor for each picture, shape (pictures,).
       offsets: added to each picture, radiance, shape (pictures,).
+      view: how far the light and the camera of each picture are moved, in units of `Problem.view_unit`, shapes (pictures, 2)
+        and (pictures, 6).
     """
 
     coefficients: Float[Array, "my mx"]
     albedo: Float[Array, "ty tx c"] | None = None
     exposures: Float[Array, " pictures"] | None = None
     offsets: Float[Array, " pictures"] | None = None
+    view: View = KNOWN
 
 
 class Basis(eqx.Module):

@@ -23,7 +23,7 @@ from .history import Draws, Step, Stop
 from .loop import FitLoop
 from .options import Albedo, FitOptions, Loss, Solver
 from .problem import Problem, make_problem
-from .residuals import pictures_and_influence
+from .residuals import found_scenes, pictures_and_influence
 from .solvers import BFGS_UNKNOWNS, count_unknowns
 from .uncertainty import require_small, standard_deviations, with_unexplained
 
@@ -41,6 +41,7 @@ class Fit:
       albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c); None where it was known.
       exposures, offsets: of each picture; None where they were known.
       noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated.
+      scenes: as they were given, with all that was found: heights, albedo, lights and cameras.
       images: the pictures as they would be measured, (h, w) or (h, w, c) each, as their targets.
       residuals: `images` - targets; 0 where a target has no weight.
       regions: the three blocks of the pictures with the largest residuals.
@@ -58,6 +59,7 @@ class Fit:
     exposures: Float[AnyArray, " pictures"] | None
     offsets: Float[AnyArray, " pictures"] | None
     noise: Float[np.ndarray, " pictures"]
+    scenes: tuple[Scene, ...]
     images: tuple[np.ndarray, ...]
     residuals: tuple[np.ndarray, ...]
     regions: tuple[Region, ...]
@@ -83,6 +85,8 @@ def fit(
     albedo_smoothness: float | int | None = None,
     exposures: bool = False,
     offsets: bool = False,
+    light_std: float | int | None = None,
+    camera_std: Any = None,
     loss: Loss | str = "geman",
     loss_scale: float | int = 3.0,
     solver: Solver | str = "lm",
@@ -130,6 +134,11 @@ def fit(
       albedo_smoothness: as `smoothness`, of those factors.
       exposures, offsets: whether each picture has an unknown factor, an unknown addend. Where the albedo is unknown too, only
         the product of exposure and albedo is known; the fit keeps near 1.
+      light_std: how far the direction of each picture's light, of its first Directional one, may be off: the standard deviation
+        of either of two angles, degrees. None: it is known.
+      camera_std: the same of each picture's camera: of its position along each axis, world units, and of its rotation about
+        each, degrees. None: they are known. Pictures alone do not say where everything is: turning or moving the cameras, the
+        lights and the terrain together changes none of them. The priors settle that, of the heights above all.
       loss: ρ, see `loss_scale`: "squares", r²/2; "huber", "cauchy" and "geman" make less of what is far off, such as
         pixels that a moved shadow explains. They begin with a scale as wide as the residuals and come down (Black and
         Rangarajan 1996).
@@ -161,7 +170,8 @@ def fit(
     options = FitOptions(
         settings=settings or Settings(), weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
         prior_length=prior_length, prior_exponent=prior_exponent, smoothness=smoothness, albedo=albedo,
-        albedo_smoothness=albedo_smoothness, exposures=exposures, offsets=offsets, loss=loss, loss_scale=loss_scale,
+        albedo_smoothness=albedo_smoothness, exposures=exposures, offsets=offsets, light_std=light_std, camera_std=camera_std,
+        loss=loss, loss_scale=loss_scale,
         solver=solver, levels=levels, max_steps=max_steps, inner_steps=inner_steps, tolerance=tolerance,
         uncertainty=uncertainty, progress=progress, checkpoint=checkpoint, checkpoint_every=checkpoint_every,
         resume=resume, mesh=mesh,
@@ -174,7 +184,7 @@ def fit(
     loop = FitLoop(problem, unknowns, field, options)
     result = loop.run()
     loop.set_all_modes()
-    return _report(loop, result, targets)
+    return _report(loop, result, scenes, targets)
 
 
 def _require_solvable(problem: Problem, unknowns: Unknowns, options: FitOptions) -> None:
@@ -203,7 +213,7 @@ def _in_shape(image: Float[np.ndarray, "h w c"], shape: tuple[int, ...]) -> np.n
     return np.broadcast_to(image, (*image.shape[:2], *shape[2:])).copy() if len(shape) == 3 else image[..., 0]
 
 
-def _report(loop: FitLoop, result: Stop, targets: Sequence[Any]) -> Fit:
+def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Sequence[Any]) -> Fit:
     problem, unknowns, options = loop.problem, loop.unknowns, loop.options
     images: list[np.ndarray] = [np.zeros(())] * problem.count
     differences: list[np.ndarray] = [np.zeros(())] * problem.count
@@ -259,6 +269,7 @@ def _report(loop: FitLoop, result: Stop, targets: Sequence[Any]) -> Fit:
         exposures=unknowns.exposures,
         offsets=unknowns.offsets,
         noise=problem.noise,
+        scenes=found_scenes(scenes, unknowns, problem),
         images=tuple(images),
         residuals=tuple(differences),
         regions=regions,

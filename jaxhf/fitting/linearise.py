@@ -34,6 +34,7 @@ from ..trace.grid import Grid
 from ..trace.hit import Hit
 from ..trace.triangle import Corners, triangle_vertices
 from ..trace.world import World, make_world, resolve_settings
+from .view import KNOWN, View, motion, moved
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
 _TOGETHER = 1024
@@ -54,6 +55,8 @@ class Linearised(eqx.Module):
         normals.
       vertices: the numbers of those three vertices over all grids, (chunks, 3, samples).
       edges: of samples of moving boundaries; None where the settings ask for none.
+      view: derivatives of each sample in the numbers of the light and of the camera that are sought, see `moved`,
+        (chunks, c, 2 or 6, samples).
     """
 
     image: Float[jax.Array, "*n h w c"]
@@ -62,6 +65,7 @@ class Linearised(eqx.Module):
     slopes: Float[jax.Array, "*n chunks c k samples"]
     vertices: Int[jax.Array, "*n chunks 3 samples"]
     edges: "LinearisedEdges | None"
+    view: View = KNOWN
 
 
 class LinearisedEdges(eqx.Module):
@@ -73,6 +77,7 @@ class LinearisedEdges(eqx.Module):
       pixel: which pixel each boundary sample is in; they are numbered row by row.
       kind: 0 where a sample does not count, 1 where its edge is seen where it stands, 2 where its shadow is.
       resampled: the pixels that are resampled, by samples after the picture's.
+      view: as that of `Linearised`, (chunks, c, 2 or 6, size).
     """
 
     slopes: Float[jax.Array, "*n chunks c 5 size"]
@@ -80,6 +85,7 @@ class LinearisedEdges(eqx.Module):
     pixel: Int[jax.Array, "*n points"]
     kind: Int[jax.Array, "*n points"]
     resampled: Int[jax.Array, "*n pixels"]
+    view: View = KNOWN
 
 
 def can_be_linearised(scene: Scene, settings: Settings) -> bool:
@@ -88,9 +94,10 @@ def can_be_linearised(scene: Scene, settings: Settings) -> bool:
 
 
 def linearise_each(
-    scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh, channels: int
+    scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh, channels: int, still: View = KNOWN
 ) -> Linearised:
-    """Pictures of scenes that differ in numbers only, one after the other, and their derivatives in the heights alone.
+    """Pictures of scenes that differ in numbers only, one after the other, and their derivatives in the heights, and in the
+    light and the camera that `still` names.
 
     Args:
       scenes: one `localise`d scene that `can_be_linearised`; its leaves have a leading axis of n scenes.
@@ -98,24 +105,25 @@ def linearise_each(
       settings: the knobs.
       mesh: the devices that share the work.
       channels: 3, or 1 for their mean.
+      still: zeros, (2,) for a light and (6,) for a camera in which the derivative is taken.
 
     Returns:
       Leaves with a leading axis of n pictures.
     """
-    return lax.map(lambda scene: _linearise(on_every_device(change(scene), mesh), settings, mesh, channels), scenes)
+    return lax.map(lambda scene: _linearise(on_every_device(change(scene), mesh), settings, mesh, channels, still), scenes)
 
 
 def picture_each(
     known: Linearised, scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh
 ) -> Float[jax.Array, "n h w c"]:
-    """The pictures that are known, with their derivatives in the heights that `change` gives to the scenes.
+    """The pictures that are known, with their derivatives in the heights, light and camera that `change` gives to the scenes.
 
-    Those must be the heights at which `linearise_each` was called.
+    Those must be the ones at which `linearise_each` was called.
     """
     return lax.map(lambda pair: _picture(pair[0], on_every_device(change(pair[1]), mesh), settings, mesh), (known, scenes))
 
 
-def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int) -> Linearised:
+def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int, still: View) -> Linearised:
     world, camera = make_world(scene, settings), scene.camera
     key = default_key(None, world.settings, mesh)
     drawn = None
@@ -124,14 +132,14 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int) -> L
     points = _sample_points(camera, world.settings)
     if drawn is not None:
         points = _in_a_row(points, _resampled_points(camera, world.settings, drawn))
-    light, slopes, vertices = map_over(mesh, functools.partial(_samples, channels), (world, camera), points)
+    light, slopes, vertices, view = map_over(mesh, functools.partial(_samples, channels), (world, camera, still), points)
     image, edges = _in_pixels(light, camera, world.settings), None
     sampling = _in_pixels(light, camera, world.settings, _sampling_error)
     if drawn is not None:
         followed = functools.partial(_boundary_samples, channels)
-        edge_slopes, edge_vertices = map_over(mesh, followed, (world, camera), (drawn.samples, drawn.flows))
+        edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, (world, camera, still), (drawn.samples, drawn.flows))
         kind = jnp.where(drawn.samples.valid, jnp.where(drawn.samples.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
-        edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled)
+        edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled, edge_view)
         finer = _resampled(light, edges, camera, world.settings)
         image, sampling = (
             known.reshape(-1, channels).at[drawn.resampled].set(new, unique_indices=True).reshape(image.shape)
@@ -139,7 +147,7 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int) -> L
         )
     moving = (slopes != 0).any(axis=(1, 2)).astype(light.dtype)[..., None]
     depends = _in_pixels(moving, camera, world.settings)[..., 0] > 0
-    return Linearised(image, depends, jnp.sqrt(jnp.mean(sampling * sampling, axis=-1)), slopes, vertices, edges)
+    return Linearised(image, depends, jnp.sqrt(jnp.mean(sampling * sampling, axis=-1)), slopes, vertices, edges, view)
 
 
 def _sampling_error(samples: Float[jax.Array, "pixels n c"]) -> Float[jax.Array, "pixels c"]:
@@ -157,16 +165,27 @@ def _sampling_error(samples: Float[jax.Array, "pixels n c"]) -> Float[jax.Array,
 def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "h w c"]:
     settings = resolve_settings(settings, scene)
     at_vertices = _at_vertices(make_world(scene, settings))
-    moved = _product(mesh, at_vertices, known.slopes, known.vertices)
-    change = _in_pixels(moved, scene.camera, settings)
+    numbers = motion(scene.lights, scene.camera, known.view)
+    of_samples = _product(mesh, at_vertices, known.slopes, known.vertices)
+    of_samples = _with_view(of_samples, known.view, numbers)
+    change = _in_pixels(of_samples, scene.camera, settings)
     if known.edges is not None:
         edges, flat = known.edges, change.reshape(-1, change.shape[-1])
-        finer = _resampled(moved, edges, scene.camera, settings).mean(1)
+        finer = _resampled(of_samples, edges, scene.camera, settings).mean(1)
         heights = at_vertices[:, 0].at[edges.vertices].get(mode="promise_in_bounds")
         light = jnp.moveaxis(jnp.sum(edges.slopes * heights[:, None], axis=2), 1, -1)
+        light = _with_view(light, edges.view, numbers)
         flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, flat.shape[1]))
         change = flat.reshape(change.shape)
     return with_tangent(known.image, change)
+
+
+def _with_view(change: Float[jax.Array, "chunks n c"], slopes: View, numbers: View) -> Float[jax.Array, "chunks n c"]:
+    """What samples change by, with their part from the light and the camera."""
+    for slope, values in zip(jax.tree.leaves(slopes), jax.tree.leaves(numbers), strict=True):
+        for k in range(values.shape[0]):
+            change = change + jnp.moveaxis(slope[:, :, k] * values[k], 1, -1)
+    return change
 
 
 def _in_pixels(
@@ -226,28 +245,39 @@ def _resampled_points(camera: Camera, settings: Settings, boundaries: Boundaries
     )
 
 
-def _samples(channels: int, seen: tuple[World, Camera], points: tuple[jax.Array, ...]):
-    """Radiance at points of the picture, (n, c), and its slopes and vertices, see `Linearised`."""
-    world, camera = seen
+def _samples(channels: int, seen: tuple[World, Camera, View], points: tuple[jax.Array, ...]):
+    """Radiance at points of the picture, (n, c), and its slopes, vertices and view, see `Linearised`."""
+    world, camera, still = seen
     x, y = points
     smooth = world.settings.shading == "smooth"
 
-    def one(x: jax.Array, y: jax.Array, perturbation: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def one(x: jax.Array, y: jax.Array, perturbation: jax.Array, view: View) -> tuple[jax.Array, jax.Array]:
         corners = Corners(perturbation[:3], perturbation[3:].reshape(3, 3) if smooth else None)
         surfaces = tuple(
             dataclasses.replace(surface, perturbation=corners) if isinstance(surface, Grid) else surface
             for surface in world.surfaces
         )
-        light, _, hit = direct(dataclasses.replace(world, surfaces=surfaces), materialise(camera.ray(x, y)))
+        lights, eye = moved(world.lights, camera, view)
+        there = dataclasses.replace(world, surfaces=surfaces, lights=lights)
+        light, _, hit = direct(there, materialise(eye.ray(x, y)))
         return _channels(light, channels), _vertices(world, hit)
 
-    def shade(perturbations: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return jax.vmap(one, in_axes=(0, 0, 1), out_axes=(0, 1))(x, y, perturbations)
+    def shade(perturbations: jax.Array, view: View) -> tuple[jax.Array, jax.Array]:
+        return jax.vmap(one, in_axes=(0, 0, 1, 1), out_axes=(0, 1))(x, y, perturbations, view)
 
-    light, pull_back, vertices = jax.vjp(shade, jnp.zeros((12 if smooth else 3, x.shape[0]), x.dtype), has_aux=True)
+    none = jnp.zeros((12 if smooth else 3, x.shape[0]), x.dtype)
+    light, pull_back, vertices = jax.vjp(shade, none, _each(still, x.shape[0]), has_aux=True)
     each = jnp.broadcast_to(jnp.eye(channels, dtype=x.dtype)[:, None], (channels, *light.shape))
-    slopes = pull_back(each[0])[0][None] if channels == 1 else jax.vmap(pull_back)(each)[0]
-    return light, slopes, vertices
+    if channels == 1:
+        slopes, view = jax.tree.map(lambda leaf: leaf[None], pull_back(each[0]))
+    else:
+        slopes, view = jax.vmap(pull_back)(each)
+    return light, slopes, vertices, view
+
+
+def _each(still: View, count: int) -> View:
+    """The same numbers for each of so many samples, which come last."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*leaf.shape, count)), still)
 
 
 def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
@@ -259,21 +289,24 @@ def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
     return vertices
 
 
-def _boundary_samples(channels: int, seen: tuple[World, Camera], drawn: tuple[BoundarySample, Float[jax.Array, "n 3 2"]]):
-    """Slopes and vertices of boundary samples, see `LinearisedEdges`."""
-    world, camera = seen
+def _boundary_samples(channels: int, seen: tuple[World, Camera, View], drawn: tuple[BoundarySample, Float[jax.Array, "n 3 2"]]):
+    """Slopes, vertices and view of boundary samples, see `LinearisedEdges`."""
+    world, camera, still = seen
     samples, flows = drawn
     flows = jnp.moveaxis(_channels(jnp.moveaxis(flows, 1, -1), channels), -1, 0)
 
-    def position(sample: BoundarySample, perturbation: jax.Array) -> jax.Array:
-        return picture_point(world, camera, sample, sample.s, perturbation=perturbation)[0]
+    def position(sample: BoundarySample, perturbation: jax.Array, view: View) -> jax.Array:
+        lights, eye = moved(world.lights, camera, view)
+        there = dataclasses.replace(world, lights=lights)
+        return picture_point(there, eye, sample, sample.s, perturbation=perturbation)[0]
+
+    def positions(perturbations: jax.Array, view: View) -> jax.Array:
+        return jax.vmap(position, in_axes=(0, 1, 1))(samples, perturbations, view)
 
     count = flows.shape[1]
-    _, pull_back = jax.vjp(
-        lambda values: jax.vmap(position, in_axes=(0, 1))(samples, values), jnp.zeros((5, count), flows.dtype)
-    )
-    slopes = jax.vmap(pull_back)(flows)[0]
-    return slopes, jax.vmap(functools.partial(deciding_vertices, world), out_axes=1)(samples)
+    _, pull_back = jax.vjp(positions, jnp.zeros((5, count), flows.dtype), _each(still, count))
+    slopes, view = jax.vmap(pull_back)(flows)
+    return slopes, jax.vmap(functools.partial(deciding_vertices, world), out_axes=1)(samples), view
 
 
 def _at_vertices(world: World) -> Float[jax.Array, "vertices n"]:

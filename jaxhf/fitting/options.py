@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 
+import numpy as np
 from jax.sharding import Mesh
 
 from ..core.errors import ArgumentError
@@ -38,6 +39,8 @@ class FitOptions:
     albedo_smoothness: float | int | None
     exposures: bool
     offsets: bool
+    light_std: float | int | None
+    camera_std: Any
     loss: Loss | str
     loss_scale: float | int
     solver: Solver | str
@@ -61,10 +64,22 @@ class FitOptions:
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise ArgumentError("fit", name, f"must be a whole number from 1 on, it is {value!r}")
-        for name in ("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", "loss_scale", "tolerance"):
+        for name in (
+            "prior_length",
+            "prior_exponent",
+            "smoothness",
+            "albedo_smoothness",
+            "light_std",
+            "loss_scale",
+            "tolerance",
+        ):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ArgumentError("fit", name, f"must be positive and finite, it is {value!r}")
+        pair = self.camera_std
+        if pair is not None and not (np.shape(pair) == (2,) and all(math.isfinite(value) and value > 0 for value in pair)):
+            rule = f"must be two positive numbers, of the position and, in degrees, of the rotation; it is {pair!r}"
+            raise ArgumentError("fit", "camera_std", rule)
         levels, uncertainty = self.levels, self.uncertainty
         if levels is not None and not (len(levels) and all(0 < level <= 1 for level in levels) and levels[-1] == 1):
             raise ArgumentError("fit", "levels", f"must be shares above 0, the last of them 1; they are {levels!r}")

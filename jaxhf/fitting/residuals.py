@@ -1,18 +1,17 @@
 """How far a terrain is from its pictures and from what is known beforehand, in standard deviations."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
-from jax.sharding import Mesh
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ..core.devices import on_every_device
-from ..core.settings import Settings
 from ..rendering.render import render_each
 from ..scene.material import Matte
 from ..scene.scene import Scene
@@ -21,6 +20,7 @@ from .basis import Basis, Unknowns
 from .linearise import Linearised, can_be_linearised, linearise_each, picture_each
 from .problem import Group, Problem
 from .robust import soften
+from .view import moved
 
 
 def residuals(unknowns: Unknowns, problem: Problem) -> tuple[Any, None]:
@@ -70,8 +70,7 @@ def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
     if not all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
         return problem
     heights = heights_of(unknowns, problem.basis)
-    heights, unknowns, groups = on_every_device((heights, unknowns, problem.groups), problem.mesh)
-    found = _linearised(heights, unknowns, groups, problem.settings, problem.mesh)
+    found = _linearised(*on_every_device((heights, unknowns, problem), problem.mesh))
     return dataclasses.replace(problem, linearised=found)
 
 
@@ -82,14 +81,33 @@ def heights_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "ny nx"]:
 
 
 @eqx.filter_jit
-def _linearised(
-    heights: Float[Array, "ny nx"], unknowns: Unknowns, groups: tuple[Group, ...], settings: Settings, mesh: Mesh
-) -> tuple[Linearised, ...]:
+def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem) -> tuple[Linearised, ...]:
+    still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), unknowns.view)
     pictures = tuple(
-        linearise_each(group.scenes, _completion(unknowns, group, heights), settings, mesh, group.targets.shape[-1])
-        for group in groups
+        linearise_each(
+            views(unknowns, problem, group),
+            _completion(unknowns, group, heights),
+            problem.settings,
+            problem.mesh,
+            group.targets.shape[-1],
+            still,
+        )
+        for group in problem.groups
     )
-    return on_every_device(pictures, mesh)
+    return on_every_device(pictures, problem.mesh)
+
+
+def views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
+    """`group.scenes` under the lights and from the cameras that are sought."""
+    given, found = (group.scenes.lights, group.scenes.camera), []
+    if not jax.tree.leaves(unknowns.view):
+        return group.scenes
+    for n, k in enumerate(group.indices):
+        lights, camera = jax.tree.map(lambda leaf, n=n: leaf[n], given)
+        by = jax.tree.map(lambda values, unit, k=k: values[k] * unit, unknowns.view, problem.view_unit)
+        found.append(moved(lights, camera, by))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, stacked)
 
 
 def _completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
@@ -105,11 +123,11 @@ def _completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]
 def _simulate(
     unknowns: Unknowns, problem: Problem, heights: Float[Array, "ny nx"], group: Group, linear: Linearised | None
 ) -> Float[Array, "n h w c"]:
-    n, change = len(group.indices), _completion(unknowns, group, heights)
+    n, change, scenes = len(group.indices), _completion(unknowns, group, heights), views(unknowns, problem, group)
     if linear is not None:
-        image = picture_each(linear, group.scenes, change, problem.settings, problem.mesh)
+        image = picture_each(linear, scenes, change, problem.settings, problem.mesh)
     else:
-        image = render_each(group.scenes, change, problem.settings, problem.mesh)
+        image = render_each(scenes, change, problem.settings, problem.mesh)
         if group.targets.shape[-1] == 1:
             image = jnp.mean(image, axis=-1, keepdims=True)
     if unknowns.exposures is not None:
@@ -133,9 +151,10 @@ def _with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
 
 
 def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
-    """Residuals of what is known without the pictures: of the prior heights, and of the smoothness of heights and albedo."""
+    """Residuals of what is known without the pictures: of the lights and cameras that are sought, of the prior heights, and of
+    the smoothness of heights and albedo."""
     surface = problem.basis.surface(unknowns.coefficients)
-    parts: list[Array] = []
+    parts: list[Array] = jax.tree.leaves(jax.tree.map(lambda x, weight: x * weight[None], unknowns.view, problem.view_weight))
     if problem.prior is not None:
         off = problem.prior.weight * (surface - problem.prior.heights)
         stiffness = problem.prior.stiffness
@@ -183,3 +202,21 @@ def _pictures_and_influence(
     keys = jax.random.split(key, len(parts))
     draws = [jax.random.normal(key, part.shape, part.dtype) for key, part in zip(keys, parts, strict=True)]
     return images, vjp(draws)[0]
+
+
+def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:
+    """The scenes as they were given, with all that was found; positions keep double precision."""
+    heights, found = problem.basis.heights(unknowns.coefficients), list(scenes)
+    for group in problem.groups:
+        new, old = ((part.lights, part.camera) for part in (views(unknowns, problem, group), group.scenes))
+        change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)
+        for n, k in enumerate(group.indices):
+            scene = scenes[k].with_heights(heights)
+            if unknowns.albedo is not None:
+                scene = _with_albedo(scene, unknowns.albedo)
+            if jax.tree.leaves(unknowns.view):
+                given = scene.lights, scene.camera
+                lights, camera = jax.tree.map(lambda leaf, more, n=n: np.asarray(leaf) + more[n], given, change)
+                scene = scene.with_lights(lights).with_camera(camera)
+            found[k] = scene
+    return tuple(found)

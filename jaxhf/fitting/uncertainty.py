@@ -21,6 +21,7 @@ from .history import Draws
 from .problem import Problem
 from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import influence_function, robust_weight
+from .view import KNOWN
 
 _INNER_TOLERANCE = 1e-6
 EXACT_ENTRIES = 2**24
@@ -36,10 +37,11 @@ def standard_deviations(
 ) -> tuple[Float[np.ndarray, "ny nx"], int | None]:
     """The standard deviation of each height, given what the pictures and the prior say; shape (ny, nx), height units.
 
-    The Gauss-Newton matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs them;
-    its inverse is the covariance (Laplace's approximation). Albedo, exposures and offsets vary along, so their doubt counts
-    too. Besides, each DCT coefficient has the prior N(0, `Basis.prior_amplitude`²), and each other unknown N(0, 1): a direction
-    on which no picture depends, such as the mean of all heights, then gets a large deviation, not an infinite one.
+    The Gauss-Newton matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs
+    them; its inverse is the covariance (Laplace's approximation). Albedo, exposures, offsets, lights and cameras vary
+    along, so their doubt counts too. Besides, each DCT coefficient has the prior N(0, `Basis.prior_amplitude`²), and the
+    albedo, each exposure and each offset N(0, 1): a direction on which no picture depends, such as the mean of all heights,
+    then gets a large deviation, not an infinite one.
 
     Args:
       unknowns: at which the fit ended; all modes are varied.
@@ -117,6 +119,7 @@ def _operator(unknowns: Unknowns, problem: Problem) -> tuple[lx.AbstractLinearOp
     roots = [jnp.sqrt(robust_weight(part, problem.loss, problem.loss_scale)) for part in parts]
 
     def normalised(change: Unknowns) -> Unknowns:
+        change = eqx.tree_at(lambda change: change.view, change, KNOWN)  # which has a prior of its own
         return eqx.tree_at(lambda change: change.coefficients, change, change.coefficients / problem.basis.prior_amplitude)
 
     def product(change: Unknowns) -> Any:

@@ -1,6 +1,6 @@
 """Cameras: from a point of the picture to a ray in the world, and back."""
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -14,6 +14,8 @@ from ..core.ray import Ray
 from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
 from ..core.vector import unit
 from .show import known, numbers
+
+Convention = Literal["opencv", "opengl"]
 
 
 class Projection(eqx.Module):
@@ -44,7 +46,8 @@ class Perspective(eqx.Module):
     """A pinhole camera.
 
     Attributes:
-      world_from_camera: 4x4; camera space is +x right, +y up, +z forward (the handedness of pbrt).
+      world_from_camera: 4x4; camera space is +x right, +y up, +z forward (the handedness of pbrt). What is not a rotation in
+        it stretches and shears the picture: so `from_intrinsics` takes account of a principal point off the centre.
       fov: full angle of view across the shorter side of the picture, degrees.
       width, height: of the picture, pixels.
     """
@@ -66,6 +69,60 @@ class Perspective(eqx.Module):
     ) -> "Perspective":
         """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
         return cls(_look_at(eye, target, up), fov, width=width, height=height)
+
+    @classmethod
+    def from_intrinsics(
+        cls,
+        fx: Any,
+        fy: Any,
+        cx: Any,
+        cy: Any,
+        *,
+        world_from_camera: Any,
+        width: int,
+        height: int,
+        convention: Convention | str = "opencv",
+    ) -> "Perspective":
+        """The camera of a calibration: a pinhole without distortion, and its pose.
+
+        Args:
+          fx, fy: focal lengths, in widths and in heights of a pixel.
+          cx, cy: the principal point, pixels from the picture's top left corner: right and, in both conventions, down. The
+            centre of the top left pixel is (0.5, 0.5) here. OpenCV and what is calibrated with it call that point (0, 0): add
+            0.5 to both numbers.
+          world_from_camera: 4x4, a rotation and the position of the eye: [R | t] of OpenCV or COLMAP, which maps the world to
+            the camera, must be inverted.
+          width, height: of the picture for which the numbers hold, pixels.
+          convention: of the camera's axes: "opencv" (COLMAP, ROS), +x right, +y down, +z forward; "opengl" (Blender, NeRF), +x
+            right, +y up, the view along -z.
+
+        Raises:
+          ValueError: focal lengths that are not positive, a matrix that is no pose, an unknown convention.
+        """
+        if convention not in get_args(Convention):
+            raise ArgumentError(
+                "from_intrinsics", "convention", f"must be one of {', '.join(get_args(Convention))}; it is {convention!r}"
+            )
+        lens = {"fx": float_leaf(fx), "fy": float_leaf(fy), "cx": float_leaf(cx), "cy": float_leaf(cy)}
+        for name, leaf in lens.items():
+            require_number("from_intrinsics", name, leaf)
+            require_finite("from_intrinsics", name, leaf)
+            if name in ("fx", "fy") and isinstance(leaf, np.ndarray) and not leaf > 0:
+                raise ArgumentError("from_intrinsics", name, f"must be positive, it is {leaf}")
+        pose = float_leaf(world_from_camera)
+        _require_pose(pose)
+        leaves, xp = [pose, *lens.values()], np
+        if traced := [leaf.dtype for leaf in leaves if isinstance(leaf, jax.Array)]:
+            leaves, xp = [jnp.asarray(leaf, jnp.result_type(*traced)) for leaf in leaves], jnp
+        pose, fx, fy, cx, cy = leaves
+        side = 1 if convention == "opengl" else -1
+        right, up, backward = pose[:3, 0], side * pose[:3, 1], side * pose[:3, 2]
+        # Rays go along column 2 + sx tan(fov / 2) column 0 + sy tan(fov / 2) column 1, see `_screen`.
+        f = fx if width <= height else fy
+        middle = right * ((width / 2 - cx) / fx) + up * ((cy - height / 2) / fy) - backward
+        columns = xp.stack([right * (f / fx), up * (f / fy), middle, pose[:3, 3]], axis=1)
+        fov = xp.rad2deg(2 * xp.arctan(min(width, height) / 2 / f))
+        return cls(xp.concatenate([columns, pose[3:]]), fov, width=width, height=height)
 
     def ray(self, x: Scalar, y: Scalar) -> Ray:
         """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""
@@ -195,6 +252,17 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
     right = direction(right)
     columns = xp.stack([right, xp.cross(right, forward), forward, eye], axis=1)
     return xp.concatenate([columns, xp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=columns.dtype)])
+
+
+def _require_pose(matrix: Any) -> None:
+    """Raises ArgumentError on a matrix that does more than rotate and translate, as the wrong one of two would."""
+    require_invertible("from_intrinsics", "world_from_camera", matrix)
+    if isinstance(matrix, np.ndarray):
+        turn = matrix[:3, :3]
+        if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
+            raise ArgumentError(
+                "from_intrinsics", "world_from_camera", f"must rotate without scaling or mirroring, it is {turn.tolist()}"
+            )
 
 
 def _check_camera(camera: Camera) -> None:

@@ -4,6 +4,7 @@ All that surrounds the fit is tested with one that is pretended: a real one take
 """
 
 import base64
+import dataclasses
 import io
 import re
 import sys
@@ -17,6 +18,7 @@ from PIL import Image
 
 import jaxhf
 from jaxhf.cli.main import main
+from jaxhf.core.affine import rotate
 from jaxhf.io.toml.fit import load_case
 
 CASE = """
@@ -45,6 +47,8 @@ prior = 0
 prior_std = 30
 tolerance = 1e-9
 max_steps = 9
+light_std = 1
+camera_std = [5, 1]
 uncertainty = 2
 checkpoint_every = 2
 
@@ -86,6 +90,12 @@ def run(folder, name, *more) -> int:
 def pretended(options: dict, ends: bool = True):
     """What stands for `fit`: it notes its arguments, leaves a checkpoint, and finds the truth or is interrupted."""
 
+    def elsewhere(scene):
+        pose = rotate(2.0, 1.0, 2.0, 3.0) @ scene.camera.world_from_camera
+        pose[:3, 3] = scene.camera.world_from_camera[:3, 3] + [3, 4, 0]
+        camera = dataclasses.replace(scene.camera, world_from_camera=pose)
+        return scene.with_camera(camera).with_lights([jaxhf.Directional((1, 2, 10**0.5))])
+
     def fit(scenes, targets, *, checkpoint, progress, **more) -> jaxhf.Fit:
         options.update(more, scenes=scenes, targets=targets)
         steps = tuple(jaxhf.Step(k, 9, 10.0**-k, k != 2, 0.1, 0.2, 0.5 * k) for k in (1, 2, 3))
@@ -98,8 +108,9 @@ def pretended(options: dict, ends: bool = True):
         return jaxhf.Fit(
             heights=jnp.asarray(TRUTH), result=jaxhf.Stop.CONVERGED, std=np.where(TRUTH > 15, np.inf, 1.5), seen=TRUTH <= 15,
             albedo=jnp.linspace(0, 1, 6).reshape(3, 2, 1), exposures=jnp.array([1.25]), offsets=None,
-            images=(image,), residuals=(0 * image,), history=steps,
-            stats={"steps": 3, "accepted": 2, "seconds": 1.5, "loss": 0.001, "chi2": 0.99},
+            scenes=tuple(map(elsewhere, scenes)), images=(image,), residuals=(0 * image,), history=steps,
+            stats={"steps": 3, "accepted": 2, "seconds": 1.5, "loss": 0.001, "chi2": 0.99}, noise=np.array([0.0123]),
+            regions=(), warnings=("chi2 is 9",),
         )  # fmt: skip
 
     return fit
@@ -122,7 +133,7 @@ def test_what_the_file_says_reaches_fit(found):
     assert scene.heights.dtype == np.float64
     assert target.shape == (12, 12)
     assert options["settings"] == SETTINGS
-    assert (options["noise"], options["weights"], options["resume"]) == ((0.01,), (None,), False)
+    assert (options["noise"], options["weights"], options["resume"]) == (None, (None,), False)
     assert (options["prior_std"], options["max_steps"], options["uncertainty"]) == (30, 9, 2)
 
 
@@ -137,7 +148,10 @@ def test_results_lie_where_the_terrain_lies(folder, found):
     tifffile = pytest.importorskip("tifffile")
 
     assert found[0] == (
-        f"exposures: 1.25\n{folder}/out.tif: 9 x 9 heights from 1 picture, {jaxhf.Stop.CONVERGED.value}; "
+        "exposures: 1.25\n"
+        "light: azimuth 26.57 altitude 54.74 (turned by 1.43 degrees)\n"
+        "camera: eye 500123 4100124 720 (moved by 5, turned by 2.00 degrees)\n"
+        f"{folder}/out.tif: 9 x 9 heights from 1 picture, {jaxhf.Stop.CONVERGED.value}; "
         "3 steps, 1.5 s, loss 0.001, chi2 0.99\n"
     )
     heights, deviations = jaxhf.load_heights(folder / "out.tif"), jaxhf.load_heights(folder / "out_std.tif")

@@ -1,5 +1,6 @@
 """The derivative of a picture as a sparse matrix against that of `render`, which other tests hold against differences."""
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -12,11 +13,14 @@ import jaxhf
 from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
 from jaxhf.core.devices import local_mesh
 from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each
+from jaxhf.fitting.view import View, moved
 from jaxhf.scene.localise import localise
 from jaxhf.trace.grid import Grid
 from jaxhf.trace.world import make_world
 
 PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])
+
+CAMERA = jaxhf.Perspective.look_at((0.6, -0.8, 0.9), (0.5, 0.5, 0.1), fov=50.0, width=37, height=22)
 
 
 def waves(ny: int, nx: int, height: float) -> np.ndarray:
@@ -34,8 +38,7 @@ def terrains(which: str, material: jaxhf.Matte | jaxhf.Mirror = jaxhf.Matte((0.3
     if which == "all":
         tube = jaxhf.Cylinder(radius=0.15, z_min=-0.3, z_max=0.3)
         objects = [jaxhf.Object(tube, painted), jaxhf.Object(jaxhf.Heightfield(waves(12, 10, 0.08)), painted), *objects]
-    camera = jaxhf.Perspective.look_at((0.6, -0.8, 0.9), (0.5, 0.5, 0.1), fov=50.0, width=37, height=22)
-    return jaxhf.Scene(objects, camera, [jaxhf.Point((0.1, 0.3, 0.9), (0.9, 0.8, 0.7))])
+    return jaxhf.Scene(objects, CAMERA, [jaxhf.Point((0.1, 0.3, 0.9), (0.9, 0.8, 0.7))])
 
 
 def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
@@ -101,6 +104,46 @@ def test_matrix_is_the_derivative_of_render(which, settings, channels, derivativ
 
     forward, reverse = products(linear)
     backwards = sum(np.nansum(np.asarray(a) * np.asarray(b)) for a, b in zip(reverse, tangent, strict=True))
+    np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=1e-9)
+
+
+def test_matrix_is_the_derivative_in_light_and_camera():
+    """In every pixel, about a light and a camera that were turned already; and back, by the inner product."""
+    settings = jaxhf.Settings(samples=1, chunk=64, shading="flat", edge_samples=300)
+    lights = [jaxhf.Sky(0.1), jaxhf.Directional((0.3, -0.4, 0.5))]
+    scene = localise(terrains("one").with_lights(lights))
+    scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
+    start = View(jnp.array([0.02, -0.01]), jnp.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.03]))
+    tangent = jax.tree.map(lambda leaf: jax.random.normal(jax.random.key(leaf.size), leaf.shape, leaf.dtype), start)
+    cotangent = jax.random.normal(jax.random.key(1), (22, 37, 1), jnp.float64)
+
+    def change(view):
+        def changed(scene):
+            lights, camera = moved(scene.lights, scene.camera, view)
+            return dataclasses.replace(scene, lights=lights, camera=camera)
+
+        return changed
+
+    @jax.jit
+    def products():
+        still = jax.tree.map(jnp.zeros_like, start)
+        known = linearise_each(scenes, change(start), settings, local_mesh(), 1, still)
+
+        def picture(view):
+            return picture_each(known, scenes, change(view), settings, local_mesh())[0]
+
+        return *jax.jvp(picture, (start,), (tangent,)), jax.vjp(picture, start)[1](cotangent)[0]
+
+    image, forward, reverse = products()
+
+    def rendered(view):
+        return jaxhf.render(change(view)(scene), settings).mean(-1, keepdims=True)
+
+    expected = jax.jit(lambda: jax.jvp(rendered, (start,), (tangent,)))()
+    for mine, theirs in zip((image, forward), expected, strict=True):
+        assert np.abs(theirs).max() > 1e-3
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-10 * np.abs(theirs).max())
+    backwards = sum(np.vdot(a, b) for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(tangent), strict=True))
     np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=1e-9)
 
 

@@ -60,6 +60,8 @@ albedo = "map"
 albedo_smoothness = 1
 exposures = true
 offsets = false
+light_std = 1
+camera_std = [2, 0.5]
 loss = "huber"
 loss_scale = 2
 solver = "bfgs"
@@ -104,7 +106,8 @@ def test_every_key_arrives(folder):
     np.testing.assert_array_equal(found.options.pop("prior"), np.arange(9).reshape(3, 3))
     assert found.options == {
         "start": 3, "prior_std": 0.5, "prior_length": 4, "prior_exponent": 3, "smoothness": 2, "albedo": "map",
-        "albedo_smoothness": 1, "exposures": True, "offsets": False, "loss": "huber", "loss_scale": 2, "solver": "bfgs",
+        "albedo_smoothness": 1, "exposures": True, "offsets": False, "light_std": 1,
+        "camera_std": [2, 0.5], "loss": "huber", "loss_scale": 2, "solver": "bfgs",
         "levels": [0.5, 1], "max_steps": 7,
         "inner_steps": 8, "tolerance": 1e-3, "uncertainty": "exact", "checkpoint_every": 3,
     }  # fmt: skip
@@ -134,7 +137,7 @@ def test_what_is_not_given_is_left_to_fit(folder):
     found = case(folder, SCENE + PICTURE)
     assert found.options == {}
     assert found.weights == (None,)
-    assert found.noise == (0.01,)
+    assert found.noise is None
     assert found.settings == jaxhf.Settings()
     assert found.like is None
 

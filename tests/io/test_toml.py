@@ -91,6 +91,15 @@ def test_heights_are_read_in_a_precision_that_can_be_rendered(tmp_path, load):
         load(tmp_path / "scene.toml", np.float64)
 
 
+def test_a_camera_from_its_calibration(tmp_path):
+    camera = read(tmp_path, view(f"{PINHOLE}fy = 50")).camera
+    pose = np.array([[1, 0, 0, 5], [0, -1, 0, 6], [0, 0, -1, 7], [0, 0, 0, 1]])
+    expected = Perspective.from_intrinsics(40, 50, 20, 15, world_from_camera=pose, width=40, height=30)
+    np.testing.assert_array_equal(camera.world_from_camera, expected.world_from_camera)
+    assert isinstance(camera, Perspective)
+    assert (camera.fov, camera.width, camera.height) == (expected.fov, 40, 30)
+
+
 def test_every_part_of_a_scene(tmp_path):
     scene = read(
         tmp_path,
@@ -247,6 +256,15 @@ def view(line):
 
 
 LOOK = 'type = "perspective"\neye = [0, 0, 1]\ntarget = [0, 0, 0]\nup = [0, 1, 0]\n'
+PINHOLE = """type = "pinhole"
+fx = 40
+cx = 20
+cy = 15
+width = 40
+height = 30
+world_from_camera = [
+  [1, 0, 0, 5], [0, -1, 0, 6], [0, 0, -1, 7], [0, 0, 0, 1]]
+"""
 
 # The text, the line of the mistake (None: no line), and what the message says.
 MISTAKES = [
@@ -274,7 +292,7 @@ MISTAKES = [
     (CAMERA, None, "a scene must have 'objects', it is missing"),
     (f"objects = []\n{CAMERA}", 1, "objects must hold at least one Object, it is empty"),
     (view('type = "perspective"\neye = [0, 0, 0]'), 5, "camera must have 'target', it is missing"),
-    (view("eye = [0, 0, 0]"), 5, "camera must have 'type', one of perspective, orthographic; it is missing"),
+    (view("eye = [0, 0, 0]"), 5, "camera must have 'type', one of perspective, orthographic, pinhole; it is missing"),
     (view('type = "orthographic"\neye = [0, 0, 1]\ntarget = [0, 0, 0]'), 5, "camera must have 'extent'"),
     (light('type = "point"\nposition = [0, 0, 1]'), 10, "lights[0] must have 'intensity', it is missing"),
     (light('type = "sky"'), 10, "lights[0] must have 'radiance', it is missing"),
@@ -387,6 +405,9 @@ MISTAKES = [
         9,
         "camera.extent must be positive and finite, it is 0.0",
     ),
+    (view(f"{PINHOLE}fy = 0"), 14, "camera.fy must be positive, it is 0.0"),
+    (view(f"{PINHOLE}fy = 5\nconvention = 'pbrt'"), 15, "camera.convention must be one of opencv, opengl; it is 'pbrt'"),
+    (view(PINHOLE), 5, "camera must have 'fy', it is missing"),
     (light('type = "directional"\ntowards = [0, 0, 0]'), 12, "lights[0].towards must not be zero"),
     (light('type = "directional"\ntowards = [0, 0, 1]\nazimuth = 3'), 12, "towards must stand without azimuth and altitude"),
     (light('type = "sky"\nradiance = 1\n[[lights]]\ntype = "sky"\nradiance = 1'), 10, "lights may hold one Sky"),

@@ -49,6 +49,12 @@ def perspective(world=None, **arguments):
     return lambda: ANYTHING.Perspective(np.eye(4) if world is None else world, **arguments)
 
 
+def intrinsics(fx: Any = 40, fy: Any = 50, cx: Any = 20, cy: Any = 30, **arguments):
+    return lambda: ANYTHING.Perspective.from_intrinsics(
+        fx, fy, cx, cy, **{"world_from_camera": np.eye(4), "width": 32, "height": 24, **arguments}
+    )
+
+
 def orthographic(world=None, **arguments):
     return lambda: ANYTHING.Orthographic(np.eye(4) if world is None else world, **arguments)
 
@@ -121,6 +127,13 @@ BAD = [
     (perspective(np.eye(3)), "Perspective: world_from_camera must be a 4x4 matrix, its shape is (3, 3)"),
     (perspective(matrix(m00=NAN)), "Perspective: world_from_camera must be finite, it is "),
     (perspective(matrix(m11=0)), "Perspective: world_from_camera must be invertible, it flattens space: "),
+    (intrinsics(fx=0), "from_intrinsics: fx must be positive, it is 0.0"),
+    (intrinsics(cy=NAN), "from_intrinsics: cy must be finite, it is nan"),
+    (intrinsics(cx=[1, 2]), "from_intrinsics: cx must be one number, its shape is (2,)"),
+    (intrinsics(convention="blender"), "from_intrinsics: convention must be one of opencv, opengl; it is 'blender'"),
+    (intrinsics(world_from_camera=np.eye(3)), "from_intrinsics: world_from_camera must be a 4x4 matrix, its shape is (3, 3)"),
+    (intrinsics(world_from_camera=matrix(m11=2)), "from_intrinsics: world_from_camera must rotate without scaling or"),
+    (intrinsics(world_from_camera=matrix(m11=-1)), "from_intrinsics: world_from_camera must rotate without scaling or"),
     (orthographic(extent=0), "Orthographic: extent must be positive and finite, it is 0.0"),
     (orthographic(extent=NAN), "Orthographic: extent must be positive and finite, it is nan"),
     (orthographic(extent=INF), "Orthographic: extent must be positive and finite, it is inf"),
@@ -284,6 +297,48 @@ SHOWN = [
 @pytest.mark.parametrize(("part", "text"), SHOWN, ids=[text.partition("(")[0] for _, text in SHOWN])
 def test_parts_print_their_numbers(part, text):
     assert repr(part) == text
+
+
+@pytest.mark.parametrize("convention", ["opencv", "opengl"])
+@pytest.mark.parametrize("size", [(64, 48), (48, 64)])
+def test_cameras_from_intrinsics_project_as_k_r_t(convention, size):
+    """World points by K [R | t] (Hartley and Zisserman 2004, equation 6.8): a pixel's ray passes through them, and back."""
+    rng, (width, height) = np.random.default_rng(4), size
+    k = np.array([[70.0, 0, 27.3], [0, 55, 31.9], [0, 0, 1]])
+    rotation, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    rotation *= np.linalg.det(rotation)
+    t = np.array([0.3, -0.2, 4.0])
+    points = rng.uniform(-1, 1, (20, 3))
+    seen = points @ rotation.T + t  # x right, y down, z forward
+    pixels = (seen @ k.T)[:, :2] / seen[:, 2:]
+    pose = matrix()
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ t
+    if convention == "opengl":
+        pose[:3, 1:3] *= -1
+    made = jaxhf.Perspective.from_intrinsics(
+        k[0, 0], k[1, 1], k[0, 2], k[1, 2], world_from_camera=pose, width=width, height=height, convention=convention
+    )
+    ray = jax.vmap(made.ray)(*pixels.T)
+    np.testing.assert_allclose(ray.o, np.broadcast_to(pose[:3, 3], (20, 3)), atol=1e-14)
+    np.testing.assert_allclose(ray.d, units(points - pose[:3, 3]), atol=1e-14)
+    x, y, w, depth = np.asarray(jax.vmap(made.film_from_world())(jnp.asarray(points))).T
+    np.testing.assert_allclose(np.stack([x, y]) / w, pixels.T, atol=1e-12)
+    np.testing.assert_allclose(depth, seen[:, 2], atol=1e-13)
+    traced = jax.jit(lambda fx: jaxhf.Perspective.from_intrinsics(
+        fx, k[1, 1], k[0, 2], k[1, 2], world_from_camera=pose, width=width, height=height, convention=convention
+    ))(k[0, 0])  # fmt: skip
+    np.testing.assert_allclose(traced.world_from_camera, made.world_from_camera, atol=1e-14)
+    np.testing.assert_allclose(traced.fov, made.fov)
+
+
+def test_a_centred_pinhole_is_a_camera_that_looks_at_its_middle():
+    """The centre of its picture is at half its size, as pixels have their centres at halves; y of OpenCV points down."""
+    expected = jaxhf.Perspective.look_at((1, 2, 3), (4, 1, 0.5), fov=40.0, width=64, height=48)
+    f, pose = 24 / np.tan(np.radians(20)), np.array(expected.world_from_camera)
+    pose[:3, 1] *= -1
+    made = jaxhf.Perspective.from_intrinsics(f, f, 32, 24, world_from_camera=pose, width=64, height=48)
+    np.testing.assert_allclose(made.world_from_camera, expected.world_from_camera, atol=1e-15)
+    np.testing.assert_allclose(made.fov, 40)
 
 
 def test_a_scene_prints_whatever_its_leaves_are():

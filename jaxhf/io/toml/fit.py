@@ -25,7 +25,7 @@ from .checks import Part
 from .priors import Sought, known_deviations, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene
 from .tables import SCENE, Key, Keys
-from .values import flag, number, number_list, or_word, table, tables, whole, word
+from .values import flag, number, number_list, numbers, or_word, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
 _CASE: Keys = {
@@ -55,6 +55,8 @@ _FIT: Keys = {
     },
     **{name: Key(word, None) for name in ("albedo", "loss", "solver")},
     **{name: Key(flag, None) for name in ("exposures", "offsets")},
+    "light_std": Key(number, None),
+    "camera_std": Key(numbers(2), None),
     **{name: Key(whole, None) for name in ("max_steps", "inner_steps", "checkpoint_every")},
     "levels": Key(number_list, None),
     "uncertainty": Key(or_word(whole), None),

@@ -70,6 +70,15 @@ _VIEW: Keys = {
 CAMERAS: dict[str, tuple[Callable[..., Camera], Keys]] = {
     "perspective": (Perspective.look_at, {**_VIEW, "fov": Key(number, 45.0)}),
     "orthographic": (Orthographic.look_at, {**_VIEW, "extent": Key(number)}),
+    "pinhole": (
+        Perspective.from_intrinsics,
+        {
+            **{name: Key(number) for name in ("fx", "fy", "cx", "cy")},
+            "world_from_camera": Key(matrix),
+            "convention": Key(word, "opencv"),
+            **{name: Key(whole) for name in ("width", "height")},
+        },
+    ),
 }
 LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
     "directional": (

@@ -1,0 +1,103 @@
+"""A picture's light and camera as unknowns: a direction and a pose, each in a few numbers about what was given."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float
+
+from ..core.affine import Affine, affine
+from ..core.types import Vector
+from ..core.vector import dot, unit
+from ..scene.camera import Camera
+from ..scene.light import Directional, Light
+from ..scene.scene import Scene
+
+
+class View(eqx.Module):
+    """What stands for each number of a light's direction and of a camera's pose; None for what is known.
+
+    Attributes:
+      light: two angles by which the first directional light is turned, about axes across it, radians (their tangents).
+      camera: by how much the eye is moved, world units, and a rotation vector about it, radians, both along the world's axes.
+    """
+
+    light: Float[jax.Array, "..."] | None = None
+    camera: Float[jax.Array, "..."] | None = None
+
+
+KNOWN = View()
+
+
+def sun(lights: Sequence[Light]) -> Directional | None:
+    """The first directional light; None where there is none."""
+    return next((light for light in lights if isinstance(light, Directional)), None)
+
+
+def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[Light, ...], Camera]:
+    """The light turned and the camera moved by `view`, leaves (2,) and (6,); where these are zero, the same to the bit."""
+    if view.light is not None:
+        light = sun(lights)
+        assert light is not None
+        first, second = _across(light.towards)
+        towards = light.towards + view.light[0] * first + view.light[1] * second
+        lights = tuple(dataclasses.replace(light, towards=towards) if other is light else other for other in lights)
+    if view.camera is not None:
+        world = affine(jnp.asarray(camera.world_from_camera))
+        # Cayley's transform, of half the angle's tangent: for the angle itself that has no singular derivative at zero, and
+        # a rotation of a degree is a degree to 3e-5 of it.
+        q = view.camera[3:] / 2
+        factor = 2 / (1 + dot(q, q))
+        columns = []
+        for k in range(3):
+            column = jnp.cross(q, world.linear[:, k])
+            columns.append(world.linear[:, k] + factor * (column + jnp.cross(q, column)))
+        columns.append(world.offset + view.camera[:3])
+        matrix = jnp.asarray(camera.world_from_camera).at[:3].set(jnp.stack(columns, axis=1))
+        camera = eqx.tree_at(lambda camera: camera.world_from_camera, camera, matrix)
+    return lights, camera
+
+
+def motion(lights: tuple[Light, ...], camera: Camera, like: View) -> View:
+    """Numbers that mean nothing, but whose tangents are those of a view by which `moved` would bring lights and camera from
+    where they are to where their own tangents do; `like` says of which."""
+    light = pose = None
+    if like.light is not None:
+        given = sun(lights)
+        assert given is not None
+        light = jnp.stack([dot(axis, given.towards) / dot(axis, axis) for axis in _across(given.towards)])
+    if like.camera is not None:
+        world = affine(jnp.asarray(camera.world_from_camera))
+        back = Affine(lax.stop_gradient(world.linear), jnp.zeros_like(world.offset)).inverse()
+        turn = [world.vector(back.linear[:, k]) for k in range(3)]  # columns; their tangents are the cross products
+        rotation = [turn[1][2] - turn[2][1], turn[2][0] - turn[0][2], turn[0][1] - turn[1][0]]
+        pose = jnp.concatenate([world.offset, jnp.stack(rotation) / 2])
+    return View(light, pose)
+
+
+def differences(scene: Scene, other: Scene) -> tuple[float, float, float]:
+    """Between two scenes: the angle of their first directional lights, degrees (nan where there is none); the distance of
+    their cameras, world units, and the angle by which these are turned, degrees."""
+    first, second, angle = sun(scene.lights), sun(other.lights), np.nan
+    if first is not None and second is not None:
+        a, b = (np.asarray(light.towards, np.float64) for light in (first, second))
+        angle = np.arctan2(np.linalg.norm(np.cross(a, b)), np.dot(a, b))
+    a, b = (np.asarray(each.camera.world_from_camera, np.float64) for each in (scene, other))
+    turn = b[:3, :3] @ np.linalg.inv(a[:3, :3])
+    sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    rotation = np.arctan2(sine, np.trace(turn) - 1)
+    return float(np.degrees(angle)), float(np.linalg.norm(b[:3, 3] - a[:3, 3])), float(np.degrees(rotation))
+
+
+def _across(towards: Any) -> tuple[Vector, Vector]:
+    """Two vectors across `towards` and each other, of its length; constants."""
+    towards = lax.stop_gradient(jnp.asarray(towards))
+    axis = jnp.where(jnp.abs(towards[0]) < jnp.abs(towards[1]), jnp.array([1, 0, 0]), jnp.array([0, 1, 0]))
+    first = unit(jnp.cross(towards, axis.astype(towards.dtype)))
+    size = jnp.sqrt(dot(towards, towards))
+    return size * first, jnp.cross(towards, first)
