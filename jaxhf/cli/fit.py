@@ -114,7 +114,7 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
     outputs.checkpoint.unlink(missing_ok=True)
     ny, nx = found.heights.shape
     count = len(case.targets)
-    lines = [f"warning: {warning}" for warning in found.warnings]
+    lines = []
     if case.noise is None:
         lines.append(f"noise, estimated: {', '.join(f'{value:.3g}' for value in found.noise)}")
     lines += [
@@ -128,6 +128,7 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
         f"{found.stats['steps']} steps, {found.stats['seconds']:.3g} s, loss {found.stats['loss']:.6g}, "
         f"chi2 {found.stats['chi2']:.4g}"
     )
+    lines += [f"warning: {warning}" for warning in found.warnings]
     return "\n".join(lines)
 
 

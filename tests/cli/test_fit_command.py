@@ -131,7 +131,7 @@ def test_what_the_file_says_reaches_fit(found):
     _, options = found
     (scene,), (target,) = options["scenes"], options["targets"]
     assert scene.heights.dtype == np.float64
-    assert target.shape == (12, 12)
+    assert target.shape == (12, 12, 3)
     assert options["settings"] == SETTINGS
     assert (options["noise"], options["weights"], options["resume"]) == (None, (None,), False)
     assert (options["prior_std"], options["max_steps"], options["uncertainty"]) == (30, 9, 2)
@@ -139,7 +139,7 @@ def test_what_the_file_says_reaches_fit(found):
 
 def test_the_case_that_comes_along_can_be_read():
     case = load_case(Path(__file__).parents[2] / "scenes" / "recover" / "case.toml", np.dtype("float32"))
-    assert [np.shape(target) for target in case.targets] == 3 * [(128, 128)]  # grey
+    assert [np.shape(target) for target in case.targets] == 3 * [(128, 128, 3)]
     assert all(0.1 < np.mean(target) < 0.4 for target in case.targets)
     assert case.scenes[0].heights.shape == (41, 41)
 
@@ -148,11 +148,13 @@ def test_results_lie_where_the_terrain_lies(folder, found):
     tifffile = pytest.importorskip("tifffile")
 
     assert found[0] == (
+        "noise, estimated: 0.0123\n"
         "exposures: 1.25\n"
         "light: azimuth 26.57 altitude 54.74 (turned by 1.43 degrees)\n"
         "camera: eye 500123 4100124 720 (moved by 5, turned by 2.00 degrees)\n"
         f"{folder}/out.tif: 9 x 9 heights from 1 picture, {jaxhf.Stop.CONVERGED.value}; "
         "3 steps, 1.5 s, loss 0.001, chi2 0.99\n"
+        "warning: chi2 is 9\n"
     )
     heights, deviations = jaxhf.load_heights(folder / "out.tif"), jaxhf.load_heights(folder / "out_std.tif")
     for terrain in (heights, deviations):

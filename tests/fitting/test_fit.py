@@ -31,7 +31,7 @@ from jaxhf.fitting.view import differences
 from jaxhf.io.procedural import fractal
 from jaxhf.scene.localise import localise
 
-SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024)
+SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024, edge_samples=0)
 LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6))
 SIZE = 24
 # Its frame ends inside the terrain: a border that moves in the picture is what the derivative does not know.
@@ -201,7 +201,7 @@ def test_sampled_deviations_are_the_exact_ones():
     assert sampled is not None
     assert exact[4:8, 1:5].max() < 0.5 * exact[:, 9:].min()
     for half in np.s_[:, :7], np.s_[:, 9:]:
-        assert rms((sampled / exact - 1)[half]) < 2 / np.sqrt(2 * 200)  # each has a spread of 1 / sqrt(400)
+        assert rms((sampled / exact - 1)[half]) < 3 / np.sqrt(2 * 200)  # each has a spread of 1 / sqrt(400); they hang together
 
 
 def test_what_no_picture_shows_is_marked():
@@ -517,7 +517,8 @@ def test_a_robust_loss_at_its_final_scale_needs_no_other_stage(monkeypatch, spre
     problem = Problem(
         (), make_basis(field, np.zeros((5, 6))), None, None, None, jnp.asarray(3.0), one, one, "geman", SETTINGS, local_mesh()
     )
-    loop = FitLoop(problem, Unknowns(jnp.zeros((5, 6))), field, fit_options(noise=1.0, levels=[0.5, 1.0]))
+    options = fit_options(noise=1.0, levels=[0.5, 1.0], settings=SETTINGS)
+    loop = FitLoop(problem, Unknowns(jnp.zeros((5, 6))), field, options)
     loop.initial_state = None
     loop._next_stage()
     assert loop.stage == 0

@@ -12,6 +12,7 @@ import pytest
 import jaxhf
 from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
 from jaxhf.core.devices import local_mesh
+from jaxhf.fitting import linearise as _linearise
 from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each
 from jaxhf.fitting.view import View, moved
 from jaxhf.scene.localise import localise
@@ -74,11 +75,12 @@ def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
     ],
     ids=["smooth with edges", "flat, several objects"],
 )
-def test_matrix_is_the_derivative_of_render(which, settings, channels, derivative):
+def test_matrix_is_the_derivative_of_render(which, settings, channels, derivative, monkeypatch):
     """In every pixel, or in every height, to rounding; in the other mode by the inner product.
 
-    (The forward derivative of `render` compiles sooner.)
+    (The forward derivative of `render` compiles sooner.) The picture itself is `render`'s but where pixels are resampled.
     """
+    monkeypatch.setattr(_linearise, "_POINTS_PER_PIXEL", 64)  # then as many are resampled as by `render`
     scene = terrains(which)
     heights = tuple(jnp.asarray(field.heights) for field in scene.heightfields)
     cotangent = jax.random.normal(jax.random.key(1), (22, 37, channels), heights[0].dtype)
@@ -93,7 +95,14 @@ def test_matrix_is_the_derivative_of_render(which, settings, channels, derivativ
     known, by_matrix, by_render = pictures(scene, settings, channels)
     linear = jax.jit(known)(heights)
     found = jax.jit(lambda linear: both(functools.partial(by_matrix, linear)))(linear)
-    for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(jax.jit(lambda: both(by_render))()), strict=True):
+    expected = jax.jit(lambda: both(by_render))()
+    if linear.edges is not None:
+        resampled = np.asarray(linear.edges.resampled[0])
+        picture = np.array(expected[0]).reshape(-1, channels)
+        assert np.abs(np.asarray(found[0]).reshape(-1, channels) - picture)[resampled].max() > 1e-3
+        picture[resampled] = np.asarray(found[0]).reshape(-1, channels)[resampled]
+        expected = (picture.reshape(22, 37, channels), *expected[1:])
+    for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert np.nanmax(np.abs(theirs)) > 1e-3
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-11 * np.nanmax(np.abs(theirs)))
 
@@ -107,8 +116,9 @@ def test_matrix_is_the_derivative_of_render(which, settings, channels, derivativ
     np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=1e-9)
 
 
-def test_matrix_is_the_derivative_in_light_and_camera():
+def test_matrix_is_the_derivative_in_light_and_camera(monkeypatch):
     """In every pixel, about a light and a camera that were turned already; and back, by the inner product."""
+    monkeypatch.setattr(_linearise, "_POINTS_PER_PIXEL", 64)  # as many pixels are resampled as by `render`
     settings = jaxhf.Settings(samples=1, chunk=64, shading="flat", edge_samples=300)
     lights = [jaxhf.Sky(0.1), jaxhf.Directional((0.3, -0.4, 0.5))]
     scene = localise(terrains("one").with_lights(lights))
@@ -132,14 +142,17 @@ def test_matrix_is_the_derivative_in_light_and_camera():
         def picture(view):
             return picture_each(known, scenes, change(view), settings, local_mesh())[0]
 
-        return *jax.jvp(picture, (start,), (tangent,)), jax.vjp(picture, start)[1](cotangent)[0]
+        products = *jax.jvp(picture, (start,), (tangent,)), jax.vjp(picture, start)[1](cotangent)[0]
+        assert known.edges is not None
+        return *products, known.edges.resampled[0]
 
-    image, forward, reverse = products()
+    image, forward, reverse, resampled = products()
 
     def rendered(view):
         return jaxhf.render(change(view)(scene), settings).mean(-1, keepdims=True)
 
     expected = jax.jit(lambda: jax.jvp(rendered, (start,), (tangent,)))()
+    expected = (expected[0].reshape(-1, 1).at[resampled].set(image.reshape(-1, 1)[resampled]).reshape(image.shape), expected[1])
     for mine, theirs in zip((image, forward), expected, strict=True):
         assert np.abs(theirs).max() > 1e-3
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-10 * np.abs(theirs).max())

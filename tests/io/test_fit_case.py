@@ -98,7 +98,7 @@ def case(folder, text):
 def test_every_key_arrives(folder):
     found = case(folder, ALL)
     assert found.names == ("grey.npy", "colour.npy")
-    assert [target.shape for target in found.targets] == [(3, 4), (3, 4, 3)]
+    assert [target.shape for target in found.targets] == [(3, 4, 3), (3, 4, 3)]
     assert found.noise == (0.5, 0.02)
     np.testing.assert_array_equal(found.weights[0], np.arange(12).reshape(3, 4) > 5)
     np.testing.assert_array_equal(found.weights[1], np.arange(12).reshape(3, 4) / 4)
