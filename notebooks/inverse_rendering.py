@@ -11,7 +11,7 @@
 #
 # Three pictures of a real terrain, under three suns, and a blurred idea of its heights: `jaxhf.fit` finds the heights
 # that make the renderer's pictures agree with the measured ones. Every picture is rendered, compared and
-# differentiated; no step here is specific to this terrain. It runs in less than three minutes on two cores, most of
+# differentiated; no step here is specific to this terrain. It takes a few minutes on two cores, most of
 # which JAX spends on compiling.
 
 # %%
@@ -93,14 +93,14 @@ print(f"relief {np.ptp(truth):.0f} m; the coarse map is off by {prior_std:.1f} m
 # %% [markdown]
 # ## The fit: before, during and after
 #
-# `loss="geman"` makes little of pixels that are far off. Why that is needed comes below. A fit that may take only a
-# few steps shows what it looks like on the way.
+# Scenes, pictures, and the map with how far it is off: the rest is chosen by what the pictures show. The noise is
+# estimated, too. A fit that may take only a few steps shows what it looks like on the way.
 
 # %%
-FIT = dict(noise=noise, prior=coarse, prior_std=prior_std, tolerance=1e-3)
+FIT = dict(prior=coarse, prior_std=prior_std)
 
 
-def run(settings=jaxhf.Settings(samples=4), **options):
+def run(settings=None, **options):
     begin = time.perf_counter()
     found = jaxhf.fit(scenes(coarse), targets, settings=settings, **{**FIT, "max_steps": 40, **options})
     return found, time.perf_counter() - begin
@@ -111,11 +111,13 @@ def rmse(found):
     return float(np.sqrt(np.mean((np.asarray(found.heights) - truth)[found.seen] ** 2)))
 
 
-after, seconds = run(loss="geman", uncertainty=12)
-during, _ = run(loss="geman", max_steps=4)
+after, seconds = run(uncertainty=12)
+during, _ = run(max_steps=4)
 before = float(np.sqrt(np.mean((coarse - truth)[after.seen] ** 2)))
 print(f"{after.result.value}, after {after.stats['steps']} steps and {seconds:.0f} s, chi2 {after.stats['chi2']:.2f}")
 print(f"RMSE before {before:.1f} m, during {rmse(during):.1f} m, after {rmse(after):.2f} m")
+print(f"noise {noise:.4f}, estimated {after.noise.round(4)}")
+print("\n".join(after.warnings))
 
 # %%
 show(
@@ -143,23 +145,22 @@ plt.show()
 #
 # A shadow is dark because something else stands in the light: darkness there says nothing about the slope of the
 # ground on which it lies. A renderer without shadows takes it for a steep slope. A renderer with shadows knows
-# better, but the derivative of a pixel does not tell that the shadow's edge would move with the ridge; with plain
-# squares the fit may then stop where every step seems to make things worse. The robust loss lets those few pixels go.
-# Here, with three suns, most ground is lit by at least one, so that much is at stake only in the valley's dark side.
-# `Settings(edge_samples=...)` adds what moving edges contribute to the derivative; where a shadow alone tells of a
-# ridge that no picture shows, nothing else does (`docs/gradients.md`).
+# better, and its derivative tells how the shadow's edge moves with the ridge (`docs/gradients.md`). A fit includes that
+# by itself where shadows or silhouettes are in sight; `edge_samples=0` leaves it out. The loss is robust: it lets the few
+# pixels go that the scene cannot explain. `loss="squares"` does not.
 
 # %%
 trials = {
-    "no shadows, geman": run(jaxhf.Settings(samples=4, shadows=False), loss="geman"),
-    "shadows, squares": run(),
-    "shadows, geman": (after, seconds),
+    "no shadows": run(jaxhf.Settings(shadows=False)),
+    "shadows, still edges": run(jaxhf.Settings(edge_samples=0)),
+    "shadows, squares": run(loss="squares"),
+    "shadows": (after, seconds),
 }
 for name, (found, elapsed) in trials.items():
     print(f"{name:34} RMSE {rmse(found):5.2f} m, {found.stats['steps']:3} steps, {elapsed:3.0f} s with compiling")
 
 # %%
-figure, axes = plt.subplots(1, len(trials), figsize=(9, 3.2))
+figure, axes = plt.subplots(1, len(trials), figsize=(10, 3))
 for axis, (name, (found, _)) in zip(axes, trials.items(), strict=True):
     error = np.where(found.seen, np.asarray(found.heights) - truth, np.nan)
     shown = axis.imshow(error, origin="lower", cmap="RdBu_r", vmin=-prior_std, vmax=prior_std)
@@ -179,7 +180,7 @@ figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3.2))
 for name, levels in (("coarse to fine", None), ("all at once", [1.0])):
     line = []
     for steps in (2, 4, 8, 16):
-        found, elapsed = run(loss="geman", levels=levels, max_steps=steps)
+        found, elapsed = run(levels=levels, max_steps=steps)
         line.append((elapsed, rmse(found)))
         print(f"{name:15} {steps:3} steps: RMSE {line[-1][1]:5.2f} m in {elapsed:5.1f} s")
     left.loglog(*zip(*line, strict=True), "o-", label=name)
@@ -188,7 +189,7 @@ left.set_ylabel("RMSE, m")
 left.legend()
 errors = [before]
 for count in (1, 2):
-    found, _ = run(loss="geman", noise=[noise if k < count else 1e6 * noise for k in range(3)])
+    found, _ = run(noise=[noise if k < count else 1e6 * noise for k in range(3)])
     errors.append(float(np.sqrt(np.mean((np.asarray(found.heights) - truth)[after.seen] ** 2))))
 errors.append(rmse(after))
 right.semilogy(range(4), errors, "o-")
@@ -202,8 +203,7 @@ print("RMSE with 0, 1, 2 and 3 pictures:", ", ".join(f"{error:.2f} m" for error 
 #
 # `uncertainty=12` drew twelve terrains that the pictures and the map allow; their spread is `std`. Here the truth is
 # known, so the deviations can be checked: were they right and the errors normal, 68 % of the heights would lie within
-# one of them and 95 % within two. More do: `prior_std` says of each height how far the map is off, as if its errors
-# were independent; those of a blurred map are smooth, and the pictures, which show slopes, correct them the better.
+# one of them and 95 % within two.
 
 # %%
 ratio = ((np.asarray(after.heights) - truth) / after.std)[after.seen]

@@ -58,6 +58,8 @@ def _facts(found: Fit) -> list[tuple[str, str]]:
         ("loss", f"{found.stats['loss']:.6g}"),
         ("χ² of a pixel", f"{found.stats['chi2']:.4g} (about 1 where the noise is right and all is explained)"),
     ]
+    facts.append(("noise", ", ".join(f"{value:.3g}" for value in found.noise)))
+    facts += [("warning", warning) for warning in found.warnings]
     if found.std is not None:
         facts.append(("standard deviation", f"{np.median(found.std):.3g} (median)"))
     for name, values in (("exposures", found.exposures), ("offsets", found.offsets)):
@@ -119,10 +121,12 @@ def _symmetric(values: np.ndarray) -> dict[str, float]:
 
 
 def _pictures(found: Fit, targets: Sequence[np.ndarray], noise: np.ndarray, names: Sequence[str]) -> Any:
+    from matplotlib.patches import Rectangle
+
     height, width = targets[0].shape[:2]
     figure, axes = _figure(len(targets), 3, 10 / 3 * len(targets) * min(1.5, max(0.5, height / width)) + 0.5)
-    for row, target, image, residual, deviation, name in zip(
-        axes, targets, found.images, found.residuals, noise, names, strict=True
+    for number, (row, target, image, residual, deviation, name) in enumerate(
+        zip(axes, targets, found.images, found.residuals, noise, names, strict=True)
     ):
         top = float(np.nanmax(target)) or 1.0
         for axis, values, title in ((row[0], target, f"{name}, measured"), (row[1], image, "simulated")):
@@ -130,8 +134,13 @@ def _pictures(found: Fit, targets: Sequence[np.ndarray], noise: np.ndarray, name
             axis.set_title(title)
         far = residual if residual.ndim == 2 else residual.mean(axis=-1)
         shown = row[2].imshow(far / deviation, cmap="RdBu_r", vmin=-_FAR, vmax=_FAR)
-        row[2].set_title("their difference / noise")
+        row[2].set_title("their difference / noise, and the worst regions")
         figure.colorbar(shown, ax=row[2])
+        for rank, region in enumerate(found.regions, 1):
+            if region.picture == number:
+                corner = region.column - 0.5, region.row - 0.5
+                row[2].add_patch(Rectangle(corner, region.width, region.height, fill=False, edgecolor="k"))
+                row[2].annotate(str(rank), corner, ha="right", va="bottom")
         for axis in row:
             axis.set_xticks([])
             axis.set_yticks([])

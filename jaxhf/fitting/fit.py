@@ -107,24 +107,29 @@ def fit(
     + Σ (Laplacian / smoothness)² / 2 over the heights and what else is unknown, from coarse to fine, by Levenberg-Marquardt
     steps that form no dense matrix. Every term is in standard deviations, so the deviations of the result follow from it.
 
-    The derivative is `render`'s: it includes moving shadows, silhouettes and the terrain's border only where the settings have
-    `edge_samples`. What changes no picture (the height of a plain under a vertical view) stays as it was at the start.
+    Scenes and pictures are enough: noise, samples, and whether moving silhouettes and shadows take part are chosen by what is
+    in sight, the loss is robust, and `Fit.warnings` says what speaks against the result. What changes no picture (the height
+    of a plain under a vertical view) stays as it was at the start.
 
     Args:
       scenes: one a picture. Their first heightfields share shape, precision, spacing and origin, and are what is sought.
       targets: linear radiance, shape (h, w), (h, w, 1) or (h, w, 3) as the scene's camera says, top row first. One without or
         with one channel is compared with the mean over a picture's channels.
-      settings: how to render; None: `Settings()`.
+      settings: how to render. Samples that it leaves open are 4 a pixel, or the scene's if that is more. Where it leaves
+        `edge_samples` open, points on edges are taken where silhouettes, the terrain's border or shadows may be in sight, 2048
+        to 32768 by their length in the pictures; not where the albedo is unknown or a mirror in the scene.
       weights: for each picture None or a map (h, w) or (h, w, c), from 0 (masked: the target may be nan there)
         on; it divides the noise.
-      noise: standard deviation of a target's values at weight 1, radiance; one number or one for each picture.
+      noise: standard deviation of a target's values at weight 1, radiance; one number or one for each picture. None: each
+        picture's is estimated from what the fit leaves of it, see `Fit.noise`.
       start: heights to begin with: a number (flat), a grid over the same footprint, of any size, or None: those of the
         first scene. They may have no holes: fill in what is not known; where a picture shows no ground there, give its
         pixels no weight.
       prior: heights known beforehand, as `start`; None: nothing.
       prior_std: standard deviation of their errors, a number or shape (ny, nx), height units.
-      prior_length: correlation length L of those errors, in units of dx and dy; None: they are independent. For a terrain
-        that was smoothed by a Gaussian of standard deviation s, L is about s / √2, see docs/fitting.md.
+      prior_length: correlation length L of those errors, in world units as dx and dy are, not in cells; from one cell to the
+        terrain's longer side. None: they are independent. For a terrain that was smoothed by a Gaussian of standard deviation
+        s, L is about s / √2: cells of 30 m smoothed over 8 of them have s = 240 m and L = 170 m, see docs/fitting.md.
       prior_exponent: the amplitudes of these errors' DCT modes, over prior_std, go as (1 + (L · frequency)²)^(-exponent / 2)
         (Matérn's family). 2 is Whittle's of 1954, with the correlation (r/L) K₁(r/L) at the distance r; 3 is smoother.
       smoothness: standard deviation of the sum of a height's differences to its four neighbours, height units; None: no
@@ -142,16 +147,20 @@ def fit(
       loss: ρ, see `loss_scale`: "squares", r²/2; "huber", "cauchy" and "geman" make less of what is far off, such as
         pixels that a moved shadow explains. They begin with a scale as wide as the residuals and come down (Black and
         Rangarajan 1996).
-      loss_scale: where that begins, in standard deviations.
+      loss_scale: where that begins at last, in standard deviations.
       solver: "lm"; "bfgs" (4096 unknowns at most) and "lbfgs"; "adam", optax's, for its robustness against a noisy derivative.
       levels: shares of the highest frequency up to which heights are varied, one after the other, the last being 1; None:
         from 8 modes a side, doubled each time, for "lm", all at once for the others.
       max_steps: over all levels.
       inner_steps: LSMR iterations in one step of Levenberg-Marquardt, at most.
-      tolerance: of the relative change of unknowns and residuals in one step at which the fit has converged.
+      tolerance: of the relative change of unknowns and residuals in one step at which the fit has converged. None: with "lm",
+        when a step would lower the loss by less than 0.001 for each height, which moves heights by 0.05 of the deviation that
+        the noise leaves them with; else 1e-4.
       uncertainty: None; the number of samples from which standard deviations are estimated, each to 1 / √(2 · samples); or
-        "exact", where pictures times unknowns are few. See `standard_deviations`.
-      progress: called after each step; True prints a line to standard error.
+        "exact", where pictures times unknowns are few. Ctrl-C while samples are drawn ends with those that there are, from
+        two on. Where pictures are not explained to their noise, deviations are those of the noise that is borne out.
+      progress: called after each step with a `Step`, and after each sample of the deviations with a `Draws`, which says what
+        is left to do; True prints lines to standard error.
       checkpoint: a file in which the state is kept every `checkpoint_every` steps, after the last one and on Ctrl-C;
         `fit` never removes it.
       resume: goes on from that file if it is there; the result is bitwise that of a fit that was not interrupted. Without
