@@ -7,6 +7,10 @@ Medians over the directions: cosine and relative error, and the noise of the edg
 
 Cost: `--cost` heights a side and as many pixels, value and gradient of a loss against the plain frame, interleaved.
 
+With `--precision` the derivative in single precision against that in double, direction by direction, with the same key: the
+difference relative to the norm, the cosine, the pixel that differs most relative to the largest, and how many pixels hold 99 %
+of the squared difference.
+
 With `--mitsuba` (pip install mitsuba; see DRJIT_LIBLLVM_PATH) its `direct_projective` integrator is held against the same
 reference, and timed.
 """
@@ -108,6 +112,39 @@ def accuracy(work: Any, options: argparse.Namespace, camera: str, light: str) ->
         print(f"{f'Mitsuba, {options.mitsuba}':>24} {'':8} {cosine:8.4f} {error:8.4f} {'':8} {ms:24.0f}", flush=True)
 
 
+def precision(work: Any, options: argparse.Namespace, camera: str, light: str) -> None:
+    """Single against double precision, for every direction."""
+    heights, directions = work.bumps(VERTICES)
+    names = [name for name in directions if name in np.load(options.peers / "gradient_B_low.npz")]
+    stacked = np.stack([directions[name] for name in names])
+    settings = jaxhf.Settings(normals="six-angle", samples=options.samples[-1], edge_samples=options.edge_samples[-1])
+
+    def derivatives(dtype: Any, key: int) -> np.ndarray:
+        scene = make_scene(work, heights, camera, light, PIXELS)
+        scene = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), scene)
+
+        @jax.jit
+        def along(direction: jax.Array, key: jax.Array) -> jax.Array:
+            def picture(heights: jax.Array) -> jax.Array:
+                return jaxhf.render(scene.with_heights(heights), settings, key=key)[..., 0]
+
+            return jax.jvp(picture, (scene.heights,), (direction,))[1]
+
+        rows = [along(jnp.asarray(direction, dtype), jax.random.key(key)) for direction in stacked]
+        assert all(row.dtype == dtype for row in rows)
+        return np.stack(rows).astype(float)
+
+    for key in range(options.keys):
+        print(f"\ncamera {camera}, {light} light: float32 against float64, {settings.edge_samples} points, key {key}")
+        print(f"{'':12} {'difference':>12} {'cosine':>10} {'worst pixel':>12} {'99 % in':>8}")
+        for name, a, b in zip(names, derivatives(np.float64, key), derivatives(np.float32, key), strict=True):
+            squares = np.sort(((b - a) ** 2).ravel())[::-1]
+            pixels = int(np.searchsorted(np.cumsum(squares), 0.99 * squares.sum())) + 1
+            cosine, difference = compare([b], [a])
+            worst = np.abs(b - a).max() / np.abs(a).max()
+            print(f"{name:12} {difference:12.6f} {cosine:10.6f} {worst:12.6f} {pixels:8}", flush=True)
+
+
 def interior(work: Any, options: argparse.Namespace, camera: str, light: str) -> None:
     """The error of the interior derivative alone, against that of `--fine` samples: of n x n samples everywhere, and with 8 x 8
     where a boundary was seen."""
@@ -200,6 +237,8 @@ def main() -> None:
     parser.add_argument("--fine", type=int, default=48 * 48, help="samples a pixel of the differences made here")
     parser.add_argument("--cost", type=int, default=256, help="heights a side; 0: leave it out")
     parser.add_argument("--interior", action="store_true", help="the interior derivative's error, in place of the whole's")
+    parser.add_argument("--precision", action="store_true", help="float32 against float64, in place of either's accuracy")
+    parser.add_argument("--keys", type=int, default=1, help="of random numbers, for --precision")
     parser.add_argument("--untimed", action="store_true", help="accuracy alone, where the machine is not quiet")
     parser.add_argument("--mitsuba", type=int, default=0, metavar="SAMPLES")
     parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="of the CPU")
@@ -209,8 +248,9 @@ def main() -> None:
     if options.cost:
         cost(work, options.cost, options.edge_samples)
     jax.config.update("jax_enable_x64", True)
+    measured = precision if options.precision else interior if options.interior else accuracy
     for view in options.views:
-        (interior if options.interior else accuracy)(work, options, *view.split("-"))
+        measured(work, options, *view.split("-"))
 
 
 if __name__ == "__main__":

@@ -58,8 +58,8 @@ MUTATIONS = {
     ),
     "silhouette correction of the shading normal": Mutation(
         "shade/lighting.py",
-        "cosine = rounded_abs(dot(wi, hit.ns))",
-        "cosine = jnp.maximum(dot(wi, hit.ns), 0)",
+        "return rounded_abs(dot(wi, hit.ns))",
+        "return jnp.maximum(dot(wi, hit.ns), 0)",
         "shade/test_shade.py::test_no_black_holes",
     ),
     "derivative of the shading normal": Mutation(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError
+from ..core.powers import floor_to_power_of_two
 from ..core.settings import Shading
 from ..core.types import Index, Scalar
 from ..core.vector import unit
@@ -128,6 +129,7 @@ def make_distribution(weights: Float[jax.Array, " edges"], draws: Index) -> Guid
         raise ArgumentError(
             "Settings", "edge_samples", f"works for fewer than {_TOTAL_WEIGHT // 2} edges, the scene has {count}"
         )
+    weights = jnp.where(weights > 0, floor_to_power_of_two(weights), 0)
     total = jnp.sum(weights)
     integers = jnp.ceil(weights / jnp.where(total > 0, total, 1) * (_TOTAL_WEIGHT - count)).astype(jnp.int32)
     cumulative = jnp.cumsum(integers, dtype=jnp.int32)
@@ -161,7 +163,7 @@ def refined_weights(
         mean = (total_block + mean) / (n_block + 1)
         refined.append(((total + mean[None].repeat(3, axis=0)) / (n + 1)).ravel())
     factors = jnp.concatenate(refined)
-    return weights * jnp.where((factors > 0).any(), factors, 1)
+    return weights * jnp.sqrt(jnp.where((factors > 0).any(), factors, 1))
 
 
 def _over_blocks(values: Float[jax.Array, "3 ny nx"]) -> Float[jax.Array, "ny nx"]:

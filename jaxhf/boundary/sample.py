@@ -26,11 +26,9 @@ from ..core.vector import largest_component, unit
 from ..scene.camera import Camera
 from ..scene.light import Point, Sky
 from ..trace.cylinder import tube_distance
-from ..trace.grid import Grid, triangle_plane
-from ..trace.hit import Hit
-from ..trace.status import Status
+from ..trace.grid import Grid
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
-from ..trace.world import World, first_hit, no_hit
+from ..trace.world import World
 from .guiding import GuidingDistribution, edge_sets
 from .silhouette import STEPS, framed_part
 
@@ -96,7 +94,7 @@ def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u
     )  # fmt: skip
     # Of an edge that is seen where it stands, only the part in the frame is drawn from.
     film = camera.film_from_world()
-    a, b = (film(_on_edge(world, point, jnp.full((), end, dtype))) for end in (0, 1))
+    a, b = (film(on_edge(world, point, jnp.full((), end, dtype))) for end in (0, 1))
     first, last = framed_part(camera, a, b)
     stands = light < 0
     first, last = jnp.where(stands, first, 0), jnp.where(stands, last, 1)
@@ -107,96 +105,30 @@ def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u
     )
 
 
-def cast_shadow(world: World, point: BoundarySample) -> BoundarySample:
-    """The sample with the triangle on which its shadow falls, found by a ray along the light. No derivative."""
-    p = _on_edge(world, point, point.s)
-    away = _away_from_light(world, point, p)
-    leaving = _lit_side(world, point, away)
-    casts = point.valid & (point.light >= 0)
-    hit = first_hit(world, Ray(p, away), leaving, casts)
-    met = hit.status == int(Status.HIT)
-    return eqx.tree_at(
-        lambda point: (point.valid, point.receiver, point.cell, point.upper, point.t),
-        point,
-        (
-            point.valid & (met | (point.light < 0)),
-            jnp.maximum(hit.object, 0),
-            hit.cell,
-            hit.triangle == 1,
-            jnp.where(met, hit.t, 0),
-        ),
-    )
-
-
-def _lit_side(world: World, point: BoundarySample, away: Vector) -> Hit:
-    """A hit on the edge's triangle over which the light goes on, for a ray that leaves it and so cannot meet it again.
-
-    On an edge with exactly one triangle facing the light, the light passes both on the same side.
-    """
-    leaving = no_hit(away.dtype)
-    ix, iy = point.start[0], point.start[1]
-    along_x, along_y = point.end[1] == iy, point.end[0] == ix
-    for k, grid in enumerate(world.surfaces):
-        if not isinstance(grid, Grid):
-            continue
-        local = grid.grid_from_world.vector(away)
-        # The triangles to the left of the edge (above it, where it runs along x) and to its right.
-        left_x, left_y, left_upper = jnp.where(along_y, ix - 1, ix), iy, ~along_x & ~along_y
-        right_x, right_y, right_upper = ix, jnp.where(along_x, iy - 1, iy), along_x | along_y
-        leftwards = jnp.where(along_x, local[1] > 0, jnp.where(along_y, local[0] < 0, local[1] > local[0]))
-        left = (_has_cell(grid, left_x, left_y) & leftwards) | ~_has_cell(grid, right_x, right_y)
-        cell_x, cell_y = jnp.where(left, left_x, right_x), jnp.where(left, left_y, right_y)
-        cell_x, cell_y = jnp.clip(cell_x, 0, grid.cells[0] - 1), jnp.clip(cell_y, 0, grid.cells[1] - 1)
-        upper = jnp.where(left, left_upper, right_upper)
-        a, b, _ = triangle_plane(grid, cell_x, cell_y, upper)
-        side = jnp.where(local[2] - a * local[0] - b * local[1] >= 0, 1, -1).astype(jnp.int32)
-        x, y = _between_ends(point, point.s)
-        cells_x, cells_y = grid.cells
-        here = eqx.tree_at(
-            lambda hit: (hit.cell, hit.triangle, hit.side, hit.uv, hit.object),
-            leaving,
-            (
-                jnp.stack([cell_x, cell_y]),
-                upper.astype(jnp.int32),
-                side,
-                jnp.stack([x / cells_x, y / cells_y]),
-                jnp.full((), k, jnp.int32),
-            ),
-        )
-        leaving = jax.tree.map(lambda new, old, k=k: jnp.where(point.surface == k, new, old), here, leaving)
-    return leaving
-
-
-def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
-    """Whether there is such a cell, with all its vertices."""
-    x, y = jnp.clip(ix, 0, grid.cells[0] - 1), jnp.clip(iy, 0, grid.cells[1] - 1)
-    z = grid.z
-    return (x == ix) & (y == iy) & jnp.isfinite(z[y, x] + z[y, x + 1] + z[y + 1, x] + z[y + 1, x + 1])
-
-
-def _between_ends(point: BoundarySample, s: Scalar) -> tuple[Scalar, Scalar]:
+def between_ends(point: BoundarySample, s: Scalar) -> tuple[Scalar, Scalar]:
     a, b = point.start.astype(s.dtype), point.end.astype(s.dtype)
     return a[0] + s * (b[0] - a[0]), a[1] + s * (b[1] - a[1])
 
 
-def _on_edge(
+def on_edge(
     world: World,
     point: BoundarySample,
     s: Scalar,
-    lift: Scalar | None = None,
+    offset: Vector | None = None,
     perturbation: Float[jax.Array, "5"] | None = None,
 ) -> Vector:
-    """World frame, `lift` above the edge (in the grid's frame); differentiable in the heights and in the transform."""
+    """World frame, moved by `offset` (in the grid's frame); differentiable in the heights and in the transform."""
     chosen = None
     for k, grid in enumerate(world.surfaces):
         if isinstance(grid, Grid):
-            x, y = _between_ends(point, s)
+            x, y = between_ends(point, s)
             z0, z1 = (grid.rows.at[end].get(mode="clip") for end in _ends(grid, point))
             if perturbation is not None:
                 z0, z1 = z0 + perturbation[0], z1 + perturbation[1]
             z0, z1 = (jnp.where(jnp.isfinite(z), z, 0) for z in (z0, z1))
             z = z0 + s * (z1 - z0)
-            p = grid.world_from_grid.point(jnp.stack([x, y, z if lift is None else z + lift]))
+            p = jnp.stack([x, y, z])
+            p = grid.world_from_grid.point(p if offset is None else p + offset)
             chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
     assert chosen is not None
     return chosen
@@ -272,7 +204,7 @@ def picture_point(
     camera: Camera,
     point: BoundarySample,
     s: Scalar,
-    lift: Scalar | None = None,
+    offset: Vector | None = None,
     perturbation: Float[jax.Array, "5"] | None = None,
 ) -> tuple[Point2, Flag]:
     """The position of the sample, or of its shadow, in the picture (pixels), and whether it is in the frame; differentiable.
@@ -280,7 +212,7 @@ def picture_point(
     In every leaf of the scene, and in s while the shadow stays in its triangle; in `perturbation`, which is added to the
     heights at its `deciding_vertices`.
     """
-    p = _on_edge(world, point, s, lift, perturbation)
+    p = on_edge(world, point, s, offset, perturbation)
     if any(edges.light is not None for edges in edge_sets(world)):
         p = jnp.where(point.light >= 0, _fallen(world, point, p, perturbation), p)
     # Of a point that does not count, the position may be larger than any number, and its derivative, times zero, none.
@@ -290,59 +222,3 @@ def picture_point(
     x = at[:2] / jnp.where(before, at[2], 1)
     size = jnp.array([camera.width, camera.height], x.dtype)
     return x, point.valid & before & (x >= 0).all() & (x < size).all()
-
-
-class BoundarySegment(eqx.Module):
-    """The boundary in the picture round a sample of it.
-
-    Attributes:
-      valid: whether the sample is in the picture.
-      x: its position, pixels from the top left corner.
-      across: normal to the boundary, of length |dx/ds|.
-      sides: the positions x - eps n and x + eps n, n being the unit normal.
-      speed: at which the boundary moves in the picture as the edge is lifted, pixels by the grid's unit of height.
-    """
-
-    valid: Flag
-    x: Point2
-    across: Point2
-    sides: Float[jax.Array, "2 2"]
-    speed: Scalar
-
-
-def boundary_segment(world: World, camera: Camera, point: BoundarySample) -> BoundarySegment:
-    """The boundary round a sample: its position in the picture, its normal and its speed, by forward differentiation."""
-
-    def position(s: Scalar) -> tuple[Point2, Flag]:
-        return picture_point(world, camera, point, s)
-
-    x, along, valid = jax.jvp(position, (point.s,), (jnp.ones_like(point.s),), has_aux=True)
-    length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
-    # Of what would cross the whole picture within less than the rounding of s, no position is known.
-    valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)
-    x = jnp.where(valid, x, 0)
-    across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
-    n = across / jnp.where(valid, length, 1)
-    step = n * side_step(camera, x.dtype)
-
-    def lifted(lift: Scalar) -> Point2:
-        return picture_point(world, camera, point, point.s, lift)[0]
-
-    _, motion = jax.jvp(lifted, (jnp.zeros_like(point.s),), (jnp.ones_like(point.s),))
-    speed = jnp.abs(n[0] * motion[0] + n[1] * motion[1])
-    return BoundarySegment(valid, x, across, jnp.stack([x - step, x + step]), jnp.where(valid & jnp.isfinite(speed), speed, 0))
-
-
-def side_ray(camera: Camera, segment: BoundarySegment, side: Point2) -> Ray:
-    """The camera's ray beside a boundary; without a direction, so that it costs nothing, where the segment is not valid."""
-    ray = camera.ray(side[0], side[1])
-    return Ray(ray.o, jnp.where(segment.valid, ray.d, 0))
-
-
-def side_step(camera: Camera, dtype) -> float:
-    """How far to either side of a boundary the radiance is taken, in pixels.
-
-    Larger than the rounding of x, that is of some hundred ulps at the picture's size, and else as small as can be: a second
-    boundary between the two rays would be taken for a part of the first.
-    """
-    return max(camera.width, camera.height) * float(jnp.finfo(dtype).eps) ** 0.5 / 4

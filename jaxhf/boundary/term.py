@@ -22,7 +22,8 @@ from ..scene.camera import Camera
 from ..shade.radiance import radiance
 from ..trace.world import World
 from .guiding import GuidingDistribution, initial_weights, make_distribution, refined_weights
-from .sample import BoundarySample, BoundarySegment, boundary_segment, cast_shadow, draw, picture_point, side_ray
+from .jump import boundary_segment, pass_edge, radiance_jump
+from .sample import BoundarySample, draw, picture_point
 
 # The first of this many rounds of samples only refines the guiding distribution.
 _ROUNDS = 4
@@ -140,22 +141,23 @@ def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks
 
     def one(world: World, camera: Camera, guiding: GuidingDistribution, k: jax.Array, u: jax.Array):
         sample = materialise(draw(world, camera, guiding, k, u))
-        sample = materialise(cast_shadow(world, sample))
-        return materialise((sample, boundary_segment(world, camera, sample)))
-
-    def beside(world: World, camera: Camera, segment: BoundarySegment, side: jax.Array) -> jax.Array:
-        return radiance(world, materialise(side_ray(camera, segment, side)))[0]
+        sample, passage = materialise(pass_edge(world, camera, sample))
+        return materialise((sample, passage, boundary_segment(world, camera, sample, passage.fold)))
 
     def chunk(known: tuple[World, Camera, GuidingDistribution], drawn: tuple[jax.Array, jax.Array]):
         (world, camera, guiding), (key, first) = known, drawn
-        u = jax.random.uniform(key, (size, 2), camera.world_from_camera.dtype)
-        samples, segments = jax.vmap(functools.partial(one, world, camera, guiding))(
+        # In single precision always, so that both precisions take the same points.
+        u = jax.random.uniform(key, (size, 2), jnp.float32).astype(camera.world_from_camera.dtype)
+        samples, passages, segments = jax.vmap(functools.partial(one, world, camera, guiding))(
             first + jnp.arange(size, dtype=jnp.int32), u
         )
         # One batch: a `vmap` of a `vmap` would have to do all that `only_where` leaves out.
-        sides, both = segments.sides.reshape(-1, 2), jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), segments)
-        light = jax.vmap(functools.partial(beside, world, camera))(both, sides).reshape(size, 2, 3)
-        jump = (light[:, 0] - light[:, 1]) * jnp.where(segments.valid, samples.measure, 0)[:, None]
+        both = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), (samples, passages, segments.valid))
+        sides = jnp.tile(jnp.arange(2, dtype=jnp.int32), size)
+        light = jax.vmap(lambda both, side: radiance_jump(world, both[0], both[1], both[2], side))(both, sides).reshape(
+            size, 2, 3
+        )
+        jump = light.sum(1) * jnp.where(segments.valid, samples.measure, 0)[:, None]
         return samples, segments, jump[:, :, None] * segments.across[:, None, :]
 
     def in_round(weights: jax.Array, number: jax.Array):

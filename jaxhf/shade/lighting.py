@@ -11,8 +11,7 @@ from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, largest_component, unit
 from ..scene.light import Directional, Light, Point, Sky
 from ..trace.hit import Hit
-from ..trace.intersect import blocked
-from ..trace.world import World
+from ..trace.world import World, unblocked
 
 # A cosine below this is rounded off; 0.6 degrees from the horizon of the shading normal.
 GRAZING = 0.01
@@ -25,8 +24,17 @@ def irradiance(world: World, light: Light, hit: Hit, active: Flag) -> tuple[Vect
         return light.radiance * (jnp.pi * (1 + cosine) / 2), jnp.zeros((), jnp.int32)
     wi, arriving, distance = materialise(_towards(light, hit.p))
     lit, exhausted = _visible(world, wi, distance, hit, active)
-    cosine = rounded_abs(dot(wi, hit.ns)) if world.settings.shading == "smooth" else jnp.abs(dot(wi, hit.ns))
-    return jnp.where(lit, arriving * cosine, 0), exhausted
+    return jnp.where(lit, arriving * _cosine(world, wi, hit), 0), exhausted
+
+
+def unshadowed_irradiance(world: World, light: Directional | Point, hit: Hit) -> Vector:
+    """What would arrive if nothing stood between the light and the hit, and the light on that side of it."""
+    wi, arriving, _ = _towards(light, hit.p)
+    return arriving * _cosine(world, wi, hit)
+
+
+def _cosine(world: World, wi: Vector, hit: Hit) -> Scalar:
+    return rounded_abs(dot(wi, hit.ns)) if world.settings.shading == "smooth" else jnp.abs(dot(wi, hit.ns))
 
 
 def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:
@@ -60,14 +68,9 @@ def _visible(world: World, wi: Vector, distance: Scalar | None, hit: Hit, active
     The triangle's own normal decides on which side the light stands (Veach 1997, section 5.3; pbrt-v2's BSDF::f).
     """
     lit = active & (dot(wi, hit.n) * hit.side.astype(wi.dtype) > 0)
-    exhausted = jnp.zeros((), jnp.int32)
     if world.settings.shadows:
-        for number, surface in enumerate(world.surfaces):
-            hidden, ran_out = blocked(
-                surface, number, Ray(hit.p, wi), hit, max_steps=world.settings.max_steps, active=lit, t_max=distance
-            )
-            lit, exhausted = lit & ~hidden, exhausted + ran_out.astype(jnp.int32)
-    return lit, exhausted
+        return unblocked(world, Ray(hit.p, wi), hit, lit, distance)
+    return lit, jnp.zeros((), jnp.int32)
 
 
 def rounded_abs(cosine: Scalar) -> Scalar:

@@ -16,13 +16,39 @@ from ..scene.texture import ImageTexture
 from ..trace.hit import Hit
 from ..trace.status import Status
 from ..trace.world import World, first_hit, no_hit
-from .lighting import GRAZING, irradiance
+from .lighting import GRAZING, irradiance, unshadowed_irradiance
 
 
 def radiance(world: World, ray: Ray) -> tuple[Vector, Index]:
     """What comes along a camera ray against its direction, shape (3,), and how many walks ran out of steps on the way."""
     if not has_mirrors(world.materials, world.settings):
         return direct(world, ray)[:2]
+    return _path(world, ray, no_hit(ray.d.dtype), jnp.ones((), bool), world.settings.max_depth + 1)
+
+
+def radiance_from(world: World, ray: Ray, hit: Hit, active: Flag) -> Vector:
+    """`radiance` along a ray whose first hit is known; zero unless active."""
+    light, _ = _outgoing(world, ray, hit, active)
+    if not has_mirrors(world.materials, world.settings):
+        return light
+    onwards, reflectance, mirrored = _mirrored(world, ray, hit)
+    return light + reflectance * _path(world, onwards, hit, active & mirrored, world.settings.max_depth)[0]
+
+
+def shadowed_radiance(world: World, number: Index, hit: Hit) -> Vector:
+    """By how much the shadow of the light of this number darkens the hit, if nothing else keeps that light from it."""
+    total = jnp.zeros_like(hit.n)
+    albedo = _albedo(world, hit)
+    if albedo is not None:
+        for k, light in enumerate(world.lights):
+            if not isinstance(light, Sky):
+                total = jnp.where(number == k, unshadowed_irradiance(world, light, hit), total)
+        total = jnp.where(_has_material(world, hit, Matte), albedo / jnp.pi * total, 0)
+    return total
+
+
+def _path(world: World, ray: Ray, leaving: Hit, active: Flag, length: int) -> tuple[Vector, Index]:
+    """The light of at most `length` hits along a ray and its mirrored rays, and how many walks ran out of steps."""
 
     def bounce(carry, _):
         ray, leaving, throughput, total, active, exhausted = carry
@@ -33,8 +59,8 @@ def radiance(world: World, ray: Ray) -> tuple[Vector, Index]:
 
     dtype = ray.d.dtype
     none = jnp.zeros((), jnp.int32)
-    init = (ray, no_hit(dtype), jnp.ones(3, dtype), jnp.zeros(3, dtype), jnp.ones((), bool), none)
-    (_, _, _, total, _, exhausted), _ = lax.scan(bounce, init, length=world.settings.max_depth + 1)
+    init = (ray, leaving, jnp.ones(3, dtype), jnp.zeros(3, dtype), active, none)
+    (_, _, _, total, _, exhausted), _ = lax.scan(bounce, init, length=length)
     return total, exhausted
 
 
@@ -60,9 +86,14 @@ def _bounce(world: World, ray: Ray, leaving: Hit, active: Flag) -> tuple[Ray, Hi
     hit = first_hit(world, ray, leaving, active)
     out_of_steps = active & (hit.status == int(Status.EXHAUSTED))
     light, exhausted = _outgoing(world, ray, hit, active & ~out_of_steps)
-    mirrored, reflectance = _reflectance(world, hit)
-    onwards = Ray(hit.p, _reflect(ray.d, hit))
+    onwards, reflectance, mirrored = _mirrored(world, ray, hit)
     return onwards, hit, reflectance, light, active & mirrored, exhausted + _count(out_of_steps)
+
+
+def _mirrored(world: World, ray: Ray, hit: Hit) -> tuple[Ray, Vector, Flag]:
+    """The mirrored ray from a hit, the mirror's reflectance, and whether there is a mirror."""
+    mirrored, reflectance = _reflectance(world, hit)
+    return Ray(hit.p, _reflect(ray.d, hit)), reflectance, mirrored
 
 
 def _count(flag: Flag) -> Index:

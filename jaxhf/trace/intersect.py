@@ -62,6 +62,14 @@ def intersect(
     return surface_hit(surface, number, local, scale, materialise(found))
 
 
+def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
+    """The hit of a world-frame ray that starts on the triangle of `at`, where it starts; also where it grazes the triangle."""
+    local, scale = _in_grid(grid, ray)
+    ix, iy, _, _ = place_on_grid(grid, at)
+    met, zero = jnp.full((), int(Status.HIT), jnp.int32), jnp.zeros_like(scale)
+    return surface_hit(grid, number, local, scale, WalkResult(met, ix, iy, at.triangle == 1, at.side, zero, zero, None))
+
+
 def blocked(
     surface: Surface,
     number: int,

@@ -11,7 +11,7 @@ from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.sampling import grid_side
 from ..core.settings import Settings
-from ..core.types import Flag, MatrixLeaf
+from ..core.types import Flag, Index, MatrixLeaf, Scalar
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light
 from ..scene.material import Material
@@ -19,7 +19,7 @@ from ..scene.scene import Scene, Shape
 from .cylinder import make_tube
 from .grid import Grid, make_grid
 from .hit import Hit
-from .intersect import Surface, intersect
+from .intersect import Surface, blocked, intersect
 from .status import Status
 
 
@@ -80,27 +80,37 @@ def first_hit(world: World, ray: Ray, leaving: Hit | None = None, active: Flag |
 
     The arguments are those of `intersect`.
     """
-    nearest, steps = None, jnp.zeros((), jnp.int32)
-    for number, surface in enumerate(world.surfaces):
-        hit = intersect(
+    hits = [
+        intersect(
             surface, number, ray, max_steps=world.settings.max_steps, leaving=leaving, active=active, count_steps=count_steps
         )
-        if hit.steps is not None:
-            steps = steps + hit.steps
-        if nearest is None:
-            nearest = hit
-            continue
+        for number, surface in enumerate(world.surfaces)
+    ]
+    return nearest_hit(hits)
+
+
+def nearest_hit(hits: list[Hit]) -> Hit:
+    """The nearest of one ray's hits on all objects, in their order; its steps are those of all, if they were counted."""
+    nearest = hits[0]
+    for hit in hits[1:]:
         closer = hit.t < nearest.t
         status = jnp.maximum(hit.status, nearest.status)  # ordered: MISS, HIT, EXHAUSTED, INVALID
+        steps = None if nearest.steps is None or hit.steps is None else nearest.steps + hit.steps
         nearest = jax.tree.map(lambda new, old, closer=closer: jnp.where(closer, new, old), hit, nearest)
-        nearest = eqx.tree_at(lambda hit: hit.status, nearest, status)
-    assert nearest is not None
-    if count_steps:
-        nearest = eqx.tree_at(lambda hit: hit.steps, nearest, steps)
-    if len(world.surfaces) == 1:
+        nearest = dataclasses.replace(nearest, status=status, steps=steps)
+    if len(hits) == 1:
         return nearest
     number = jnp.where(nearest.status == int(Status.HIT), nearest.object, -1)
     return materialise(dataclasses.replace(nearest, object=number))
+
+
+def unblocked(world: World, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None) -> tuple[Flag, Index]:
+    """Whether an active ray from the hit `leaving` meets nothing before `t_max`, and how many walks ran out of steps."""
+    free, exhausted = active, jnp.zeros((), jnp.int32)
+    for number, surface in enumerate(world.surfaces):
+        met, ran_out = blocked(surface, number, ray, leaving, max_steps=world.settings.max_steps, active=free, t_max=t_max)
+        free, exhausted = free & ~met, exhausted + ran_out.astype(jnp.int32)
+    return free, exhausted
 
 
 def no_hit(dtype) -> Hit:

@@ -17,9 +17,14 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.boundary.guiding import make_distribution
+from jaxhf.boundary.guiding import initial_weights, make_distribution
+from jaxhf.boundary.jump import boundary_segment, pass_edge, radiance_jump
+from jaxhf.boundary.sample import BoundarySample
+from jaxhf.boundary.silhouette import STEPS
+from jaxhf.scene.localise import localise
+from jaxhf.trace.world import make_world, resolve_settings
 
-EDGES = jaxhf.Settings(samples=16, edge_samples=2000)
+EDGES = jaxhf.Settings(samples=16, edge_samples=4000)
 INTERIOR = jaxhf.Settings(samples=16)
 KEY = jax.random.key(0)  # that of a render without one
 SIZE = 16  # pixels
@@ -332,6 +337,78 @@ def test_whole_picture_against_central_differences(kind):
         errors[name] = np.linalg.norm(whole - numeric) / size
         assert np.linalg.norm(without - numeric) > 0.1 * size, name
     assert max(errors.values()) < 0.12, errors  # 0.088 for the heights of the sheet, 0.067 for the sun, else 0.033
+
+
+# Steep bumps seen from the side: many silhouettes that are not alone in their pixel, and long shadows.
+RIDGES = 0.3 * np.random.default_rng(5).uniform(size=(9, 9))
+ASIDE = jaxhf.Orthographic.look_at((1.6, -1.2, 0.9), (0.5, 0.5, 0.1), (0, 0, 1), 1.2, width=SIZE, height=SIZE)
+
+
+def in_precision(scene: jaxhf.Scene, dtype: Any) -> jaxhf.Scene:
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), scene)
+
+
+def test_precisions_agree():
+    """Pixel by pixel, as both take the same points; and no point takes another boundary's jump for its own."""
+    scene = small_scene(RIDGES, ASIDE, (-0.8, 0.2, 0.45))
+    direction = moved(heights_of, RIDGES)(scene)
+    double, single = (
+        np.asarray(sum(changes(in_precision(scene, dtype), in_precision(direction, dtype))))
+        for dtype in (np.float64, np.float32)
+    )
+    assert single.dtype == np.float32
+    assert np.linalg.norm(single - double) < 0.02 * np.linalg.norm(double)
+    assert np.abs(single - double).max() < 0.1 * np.abs(double).max()
+
+
+@jax.jit
+def flows_at(scene: jaxhf.Scene, s: float) -> tuple[jax.Array, jax.Array]:
+    """The flow of light across the boundary at the same place of every edge, and whether the edge is drawn from."""
+    scene = localise(scene)
+    world, camera = make_world(scene, resolve_settings(EDGES, scene)), scene.camera
+    weights = initial_weights(world, camera)
+    vertices = jnp.stack(jnp.meshgrid(jnp.arange(9, dtype=jnp.int32), jnp.arange(9, dtype=jnp.int32)), -1).reshape(-1, 2)
+
+    def flow(edge: jax.Array, start: jax.Array, end: jax.Array, light: jax.Array, valid: jax.Array) -> jax.Array:
+        none, at = jnp.zeros((), jnp.int32), jnp.asarray(s, weights.dtype)
+        sample = BoundarySample(
+            valid, edge, none, light, start, end, at, jnp.ones_like(at), none, jnp.zeros(2, jnp.int32), valid, at
+        )
+        sample, passage = pass_edge(world, camera, sample)
+        segment = boundary_segment(world, camera, sample, passage.fold)
+        near, beyond = (radiance_jump(world, sample, passage, segment.valid, jnp.asarray(k, jnp.int32)) for k in (0, 1))
+        return (near + beyond)[0] * segment.across
+
+    starts = jnp.tile(vertices, (6, 1))
+    ends = starts + jnp.tile(jnp.repeat(jnp.array(STEPS, jnp.int32), len(vertices), axis=0), (2, 1))
+    lights = jnp.repeat(jnp.array([-1, 0], jnp.int32), 3 * len(vertices))
+    edges = jnp.arange(len(starts), dtype=jnp.int32)
+    return jax.vmap(flow)(edges, starts, ends, lights, weights > 0), weights > 0
+
+
+@pytest.mark.parametrize("s", [1e-4, 1 - 1e-4])
+def test_jump_at_the_end_of_an_edge_is_its_own(s):
+    """There the next edge of a silhouette is 2e-4 pixels away; rays as far beside it would see that one's jump."""
+    scene = small_scene(RIDGES, ASIDE, (-0.8, 0.2, 0.45))
+    (double, drawn), (single, _) = (flows_at(in_precision(scene, dtype), s) for dtype in (np.float64, np.float32))
+    assert 100 < drawn.sum() < 300
+    np.testing.assert_allclose(single, double, atol=1e-3 * np.abs(double).max())
+
+
+@pytest.mark.slow  # two objects: another program
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_border_shared_by_two_sheets_is_no_boundary(dtype):
+    """Two sheets that go on in one plane, lit and seen from either side: where they meet, nothing jumps."""
+    slope = 0.3 * X
+    beside = np.eye(4)
+    beside[:3, 3] = 1, 0, 0.3
+    sheets = [jaxhf.Object(jaxhf.Heightfield(slope), jaxhf.Matte(0.7), place) for place in (np.eye(4), beside)]
+    for eye in ((0.3, -0.6, 1.5), (1.9, -0.6, 1.5)):
+        camera = jaxhf.Orthographic.look_at(eye, (1.0, 0.5, 0.3), (0, 0, 1), 0.4, width=SIZE, height=SIZE)
+        for light in ((-0.8, 0.2, 0.6), (0.8, 0.2, 1.6)):
+            scene = jax.tree.map(jnp.asarray, jaxhf.Scene(sheets, camera, [jaxhf.Directional(light)]))
+            direction = in_precision(moved(camera_of, shift(0.3, 0.2, 0.1))(scene), dtype)
+            assert np.abs(changes(in_precision(scene, dtype), direction)[1]).max() < 1e-4
 
 
 def test_distribution_is_exact_in_single_precision():

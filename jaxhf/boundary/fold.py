@@ -1,0 +1,151 @@
+"""The two triangles of an edge, as sight or light that passes a point of the edge meets them. Discrete: no derivative."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..core.ray import Ray
+from ..core.types import Flag, Index, Scalar, Vector
+from ..core.vector import dot, unit
+from ..scene.camera import Camera
+from ..scene.light import Point, Sky
+from ..trace.grid import Grid, triangle_plane
+from ..trace.hit import Hit
+from ..trace.intersect import intersect
+from ..trace.world import World, first_hit, nearest_hit, no_hit, unblocked
+from .sample import BoundarySample, between_ends, on_edge
+
+# Other surfaces are looked for beside the edge and from a little before it, so that those that share a border with the edge's
+# are met: this many times the square root of an ulp of the grid's larger side beside it, and as many times that before it.
+_ASIDE, _BACK = 1 / 16, 16
+
+
+class Fold(eqx.Module):
+    """An edge's two triangles at a sample, met by the ray that passes it from the eye, or from the light whose shadow it is.
+
+    Attributes:
+      past: the ray, from the sample on, away from its source; `d` has length 1.
+      distance: of the source; infinite for a directional light.
+      near: on the triangle over which the ray comes; says what a ray needs that leaves it towards the source.
+      ahead: on that over which the ray goes on; says what the ray needs to leave it. At a border both are the only triangle.
+      source_side: of the triangle ahead, 1 where the source stands on its +z side, else -1.
+      bends: whether the source sees only one of the triangles, or there is only one: then the edge bounds what it sees.
+      beside: the ray that other surfaces than the edge's are met by, on the side away from `near`; it begins `back` earlier.
+      back: in the units of the ray.
+      across: unit normal of the plane through the edge and the source, towards `near`; in the grid's frame.
+    """
+
+    past: Ray
+    distance: Scalar
+    near: Hit
+    ahead: Hit
+    source_side: Index
+    bends: Flag
+    beside: Ray
+    back: Scalar
+    across: Vector
+
+
+def towards(world: World, camera: Camera, light: Index, p: Vector) -> tuple[Vector, Scalar]:
+    """Unit direction from p to a light, or to the eye where that is -1, and the distance."""
+    eye, at_place = camera.viewpoint()
+    sight = eye - p if at_place else eye * camera.film_from_world()(p)[3]
+    chosen = unit(sight)
+    distance = dot(sight, chosen)
+    for number, source in enumerate(world.lights):
+        if isinstance(source, Sky):
+            continue
+        there = source.p - p if isinstance(source, Point) else source.towards
+        to = unit(there)
+        far = dot(there, to) if isinstance(source, Point) else jnp.full_like(distance, jnp.inf)
+        chosen, distance = jnp.where(light == number, to, chosen), jnp.where(light == number, far, distance)
+    return chosen, distance
+
+
+def fold_at(world: World, camera: Camera, sample: BoundarySample) -> Fold:
+    """The fold at a sample."""
+    p = on_edge(world, sample, sample.s)
+    to, distance = towards(world, camera, sample.light, p)
+    chosen = None
+    for k, grid, _ in world.grids:
+        here = _fold_on(grid, k, sample, Ray(p, -to), distance)
+        chosen = here if chosen is None else jax.tree.map(lambda a, b, k=k: jnp.where(sample.surface == k, a, b), here, chosen)
+    assert chosen is not None
+    return chosen
+
+
+def _fold_on(grid: Grid, number: int, sample: BoundarySample, past: Ray, distance: Scalar) -> Fold:
+    local = grid.grid_from_world.vector(past.d)
+    d = unit(local)
+    ix, iy = sample.start[0], sample.start[1]
+    along_x, along_y = sample.end[1] == iy, sample.end[0] == ix
+    # The triangles to the left of the edge (above it, where it runs along x) and to its right.
+    left_x, left_y, left_upper = jnp.where(along_y, ix - 1, ix), iy, ~along_x & ~along_y
+    right_x, right_y, right_upper = ix, jnp.where(along_x, iy - 1, iy), along_x | along_y
+    has_left, has_right = _has_cell(grid, left_x, left_y), _has_cell(grid, right_x, right_y)
+    leftwards = jnp.where(along_x, d[1] > 0, jnp.where(along_y, d[0] < 0, d[1] > d[0]))
+    ahead_left = (has_left & leftwards) | ~has_right
+    near_left = ahead_left ^ (has_left & has_right)
+    x, y = between_ends(sample, sample.s)
+
+    def on_triangle(left: Flag) -> tuple[Hit, Index]:
+        """A hit from the side of the source on one of the two, and the side."""
+        cell_x = jnp.clip(jnp.where(left, left_x, right_x), 0, grid.cells[0] - 1)
+        cell_y = jnp.clip(jnp.where(left, left_y, right_y), 0, grid.cells[1] - 1)
+        upper = jnp.where(left, left_upper, right_upper)
+        a, b, _ = triangle_plane(grid, cell_x, cell_y, upper)
+        side = jnp.where(d[2] - a * d[0] - b * d[1] <= 0, 1, -1).astype(jnp.int32)
+        hit = eqx.tree_at(
+            lambda hit: (hit.cell, hit.triangle, hit.side, hit.uv, hit.object),
+            no_hit(d.dtype),
+            (
+                jnp.stack([cell_x, cell_y]),
+                upper.astype(jnp.int32),
+                side,
+                jnp.stack([x / grid.cells[0], y / grid.cells[1]]),
+                jnp.full((), number, jnp.int32),
+            ),
+        )
+        return hit, side
+
+    near, near_side = on_triangle(near_left)
+    ahead, source_side = on_triangle(ahead_left)
+    z0, z1 = (grid.rows.at[v[1] * grid.shape[1] + v[0]].get(mode="clip") for v in (sample.start, sample.end))
+    e = jnp.stack([*(sample.end - sample.start).astype(d.dtype), jnp.where(jnp.isfinite(z1 - z0), z1 - z0, 0)])
+    normal = jnp.stack([e[i] * d[j] - e[j] * d[i] for i, j in ((1, 2), (2, 0), (0, 1))])
+    # The triangle on the left lies on the side of e x d if the source sees its +z side.
+    across = unit(normal) * jnp.where(near_left, near_side, -near_side).astype(d.dtype)
+    bends = (near_side != source_side) | ~(has_left & has_right)
+    step = _ASIDE * float(jnp.finfo(d.dtype).eps) ** 0.5 * max(grid.cells)
+    back = _BACK * step / dot(local, d)
+    beside = Ray(past.o - grid.world_from_grid.vector(across * step) - back * past.d, past.d)
+    return Fold(past, distance, near, ahead, source_side, bends, beside, back, across)
+
+
+def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
+    """Whether there is such a cell, with all its vertices."""
+    x, y = jnp.clip(ix, 0, grid.cells[0] - 1), jnp.clip(iy, 0, grid.cells[1] - 1)
+    z = grid.z
+    return (x == ix) & (y == iy) & jnp.isfinite(z[y, x] + z[y, x + 1] + z[y + 1, x] + z[y + 1, x + 1])
+
+
+def unblocked_source(world: World, fold: Fold, active: Flag) -> Flag:
+    """Whether nothing stands between the edge and the source."""
+    return unblocked(world, Ray(fold.past.o, -fold.past.d), fold.near, active, fold.distance)[0]
+
+
+def hit_beyond(world: World, sample: BoundarySample, fold: Fold, active: Flag) -> Hit:
+    """What the ray past the edge meets next, seen from the edge.
+
+    t counts from the edge. Of another surface that touches the edge there it is between -`back` and `back`.
+    """
+    leaving = eqx.tree_at(lambda hit: hit.side, fold.ahead, -fold.source_side)
+    if len(world.surfaces) == 1:
+        return first_hit(world, fold.past, leaving, active)
+    hits = []
+    for number, surface in enumerate(world.surfaces):
+        own = sample.surface == number
+        ray = jax.tree.map(lambda a, b, own=own: jnp.where(own, a, b), fold.past, fold.beside)
+        hit = intersect(surface, number, ray, max_steps=world.settings.max_steps, leaving=leaving, active=active)
+        hits.append(eqx.tree_at(lambda hit: hit.t, hit, hit.t - jnp.where(own, 0, fold.back)))
+    return nearest_hit(hits)

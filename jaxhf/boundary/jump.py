@@ -1,0 +1,135 @@
+"""By how much the radiance jumps across a boundary in the picture, where its sample is seen.
+
+The two sides are not looked for by rays beside the boundary: those would be a distance apart that rounding forbids to be small,
+and could stand on both sides of another boundary. Everything is followed from the sample itself, over the triangles that share
+its edge: a jump belongs to the edge, or there is none.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ..core.masked import only_where
+from ..core.ray import Ray
+from ..core.types import Flag, Index, Point2, Scalar, Vector
+from ..core.vector import dot
+from ..scene.camera import Camera
+from ..shade.radiance import radiance_from, shadowed_radiance
+from ..trace.hit import Hit
+from ..trace.intersect import hit_on_triangle
+from ..trace.status import Status
+from ..trace.world import World, unblocked
+from .fold import Fold, fold_at, hit_beyond, towards, unblocked_source
+from .sample import BoundarySample, picture_point
+
+
+class BoundarySegment(eqx.Module):
+    """The boundary in the picture round a sample of it.
+
+    Attributes:
+      valid: whether the sample is in the picture.
+      x: its position, pixels from the top left corner.
+      across: normal to the boundary, of length |dx/ds|; towards the triangle that is nearer to the eye or, for a shadow,
+        towards the shadow.
+      speed: at which the boundary moves in the picture as the edge is lifted, pixels by the grid's unit of height.
+    """
+
+    valid: Flag
+    x: Point2
+    across: Point2
+    speed: Scalar
+
+
+class Passage(eqx.Module):
+    """What a ray past an edge meets.
+
+    Attributes:
+      fold: the edge's triangles.
+      beyond: the hit behind the edge; for a shadow, where it falls.
+      open: whether nothing hides the boundary: not the edge from its source and, for a shadow, not its place from the eye.
+    """
+
+    fold: Fold
+    beyond: Hit
+
+
+def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[BoundarySample, Passage]:
+    """Follows the ray past a sample's edge.
+
+    Returns:
+      The sample with the triangle on which its shadow falls; valid where nothing hides the boundary: not the edge from its
+      source nor, for a shadow, its place from the eye. And the passage.
+    """
+    fold = fold_at(world, camera, sample)
+    casts = sample.light >= 0
+    free = unblocked_source(world, fold, sample.valid & (fold.bends | ~casts))
+    beyond = hit_beyond(world, sample, fold, free & fold.bends)
+    # On a surface that touches the edge, or shares it as a border, no shadow begins there.
+    contact = jnp.where(beyond.object == sample.surface, 0, fold.back)
+    falls = casts & free & (beyond.status == int(Status.HIT)) & (beyond.t > contact)
+    valid = jnp.where(casts, only_where(falls, _seen, world, camera, beyond, falls), free)
+    sample = eqx.tree_at(
+        lambda sample: (sample.valid, sample.receiver, sample.cell, sample.upper, sample.t),
+        sample,
+        (valid, jnp.maximum(beyond.object, 0), beyond.cell, beyond.triangle == 1, jnp.where(falls, beyond.t, 0)),
+    )
+    return sample, Passage(fold, beyond)
+
+
+def _seen(world: World, camera: Camera, hit: Hit, active: Flag) -> Flag:
+    """Whether the eye sees the hit on the side from which it was met."""
+    to, distance = towards(world, camera, jnp.full((), -1, jnp.int32), hit.p)
+    faces = dot(to, hit.n) * hit.side.astype(to.dtype) > 0
+    return unblocked(world, Ray(hit.p, to), hit, active & faces, distance)[0]
+
+
+def boundary_segment(world: World, camera: Camera, sample: BoundarySample, fold: Fold) -> BoundarySegment:
+    """The boundary round a sample: its position in the picture, its normal and its speed, by forward differentiation."""
+
+    def position(s: Scalar) -> tuple[Point2, Flag]:
+        return picture_point(world, camera, sample, s)
+
+    x, along, valid = jax.jvp(position, (sample.s,), (jnp.ones_like(sample.s),), has_aux=True)
+    length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
+    # Of what would cross the whole picture within less than the rounding of s, no position is known.
+    valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)
+    across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
+
+    def moved(offset: Vector) -> Point2:
+        return picture_point(world, camera, sample, sample.s, offset)[0]
+
+    _, motion = jax.jvp(moved, (jnp.zeros_like(fold.across),), (fold.across,))
+    rate = (across[0] * motion[0] + across[1] * motion[1]) / jnp.where(valid, length, 1)
+    speed = jnp.abs(rate * fold.across[2])  # along the edge and along the ray the boundary stands still
+    speed = jnp.where(valid & jnp.isfinite(speed), speed, 0)
+    return BoundarySegment(valid, jnp.where(valid, x, 0), across * jnp.sign(rate), speed)
+
+
+def radiance_jump(world: World, sample: BoundarySample, passage: Passage, active: Flag, side: Index) -> Vector:
+    """One of two parts whose sum is the radiance beyond the boundary minus that on the side of `across`.
+
+    Args:
+      world: the scene.
+      sample, passage: from `pass_edge`.
+      active: whether the sample counts.
+      side: 1: what stands beyond; 0: what stands on the near side, with its sign.
+    """
+    stands, fold = active & (sample.light < 0), passage.fold
+    light = only_where(stands, _side_radiance, world, fold, passage.beyond, side, stands)
+    light = jnp.where(side == 0, -light, light)
+    if world.settings.shadows:
+        shadow = only_where(active & ~stands, shadowed_radiance, world, sample.light, passage.beyond)
+        light = jnp.where(stands, light, jnp.where(active & (side == 1), shadow, 0))
+    return light
+
+
+def _side_radiance(world: World, fold: Fold, beyond: Hit, side: Index, active: Flag) -> Vector:
+    """What comes to the eye from the triangle that is near, or from what stands beyond: the other triangle, if that is seen."""
+    ahead = eqx.tree_at(lambda hit: hit.side, fold.ahead, fold.source_side)
+    at = jax.tree.map(lambda a, b: jnp.where(side == 0, a, b), fold.near, ahead)
+    hit = beyond
+    for number, grid, _ in world.grids:
+        own = ((side == 0) | ~fold.bends) & (at.object == number)
+        here = hit_on_triangle(grid, number, fold.past, at)
+        hit = jax.tree.map(lambda new, old, own=own: jnp.where(own, new, old), here, hit)
+    return radiance_from(world, fold.past, hit, active)
