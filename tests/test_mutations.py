@@ -136,8 +136,8 @@ MUTATIONS = {
     ),
     "robust weight": Mutation(
         "fitting/robust.py",
-        "1 / (1 + square) ** 2",
-        "1 / (1 + square)",
+        '"cauchy" else 1 / (1 + square) ** 2',
+        '"cauchy" else 1 / (1 + square)',
         "fitting/test_fit.py::test_softened_residuals_square_to_the_robust_loss[geman]",
     ),
     "exposures": Mutation(
@@ -184,7 +184,7 @@ MUTATIONS = {
     ),
     "stalling": Mutation(
         "fitting/loop.py",
-        "if self.predicted < tolerance or",
+        "if not self.predicted >= self._enough(steps[-1].loss, fine) or",
         "if self.predicted < 0 or",
         "fitting/test_fit.py::test_a_fit_that_stalls_says_so_and_keeps_the_best",
     ),
@@ -214,9 +214,39 @@ MUTATIONS = {
     ),
     "draws of their own": Mutation(
         "fitting/uncertainty.py",
-        "jax.random.key(k)",
-        "jax.random.key(0 * k)",
+        "jax.random.key(drawn)",
+        "jax.random.key(0 * drawn)",
         "fitting/test_fit.py::test_sampled_deviations_are_the_exact_ones",
+    ),
+    "three equal channels": Mutation(
+        "fitting/problem.py",
+        "target.shape[-1] == 3 and _is_grey",
+        "target.shape[-1] == 4 and _is_grey",
+        "fitting/test_fit_defaults.py::test_a_grey_picture_with_three_channels_is_one_measurement",
+    ),
+    "noise that is not given": Mutation(
+        "fitting/loop.py",
+        "np.maximum(spreads, self.problem.least_noise)",
+        "self.noise + 0 * spreads",
+        "fitting/test_fit_defaults.py::test_noise_that_is_not_given_is_estimated",
+    ),
+    "noise that is borne out": Mutation(
+        "fitting/uncertainty.py",
+        "problem.with_noise(factor * problem.noise)",
+        "problem.with_noise(problem.noise)",
+        "fitting/test_fit_defaults.py::test_what_is_left_unexplained_counts_as_noise",
+    ),
+    "shadows to come": Mutation(
+        "boundary/guiding.py",
+        "jnp.where(folds(",
+        "0 * jnp.where(folds(",
+        "fitting/test_fit_defaults.py::test_edges_take_part_where_boundaries_are_in_sight",
+    ),
+    "interrupted samples": Mutation(
+        "fitting/uncertainty.py",
+        "if drawn < 2:",
+        "if drawn < 20:",
+        "fitting/test_fit_defaults.py::test_samples_can_be_stopped_with_what_is_there",
     ),
     "what is not seen": Mutation(
         "fitting/fit.py",

@@ -26,7 +26,7 @@ def choose_samples(scenes: Sequence[Scene], settings: Settings) -> Settings:
     return dataclasses.replace(settings, samples=max(_SAMPLES, asked))
 
 
-def choose_edge_samples(views: Sequence[Scene], settings: Settings) -> int:
+def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: bool = False) -> int:
     """As many points on edges as the boundaries in the longest of these pictures are long; 0 where there are none.
 
     A power of two, so that pictures that differ little share a program.
@@ -34,13 +34,14 @@ def choose_edge_samples(views: Sequence[Scene], settings: Settings) -> int:
     Args:
       views: `localise`d scenes, one a picture.
       settings: the knobs.
+      shadows: whether the measured pictures show shadows, whatever these scenes do.
     """
     if not all(can_be_linearised(view, settings) for view in views):
         return 0
     length = max(float(_boundary_length(view, settings)) for view in views)
-    if length == 0:
-        return 0
     least, most = _EDGE_SAMPLES
+    if length == 0:
+        return least if shadows else 0
     return min(max(2 ** round(math.log2(_EDGE_SAMPLES_PER_PIXEL * length)), least), most)
 
 

@@ -260,8 +260,9 @@ class FitLoop:
         if len(steps) > 1 and self._flat(steps, fine):  # the first only evaluates where the stage begins
             return Stop.CONVERGED
         if rejections and self._damped():
-            # Damping that grows with each rejection leaves less and less to be gained, until that would not count.
-            if self.predicted < self._enough(steps[-1].loss, fine) or (rejections >= _REJECTIONS and not fine):
+            # Damping that grows with each rejection leaves less and less to be gained, until that would not count. (LSMR may
+            # break down before: where damping is all that counts it ends in one iteration, and single precision in nan.)
+            if not self.predicted >= self._enough(steps[-1].loss, fine) or (rejections >= _REJECTIONS and not fine):
                 return Stop.CONVERGED if rejections == 1 else Stop.STALLED
         elif rejections >= _HALVINGS:
             return Stop.STALLED
@@ -277,7 +278,7 @@ class FitLoop:
         """Whether accepted steps hardly lower the loss any more."""
         enough, rejections = self._enough(steps[-1].loss, fine), self._rejections()
         if self.options.tolerance is None and self._damped():
-            count, ended = 1, rejections == 0 and self.predicted < enough
+            count, ended = 1, rejections == 0 and not self.predicted >= enough
         else:
             count, ended = _FLAT_STEPS if fine else 1, self.converged
         gains = [a.loss - b.loss for a, b in itertools.pairwise(steps) if b.accepted]

@@ -16,6 +16,7 @@ from ..core.devices import local_mesh
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..scene.heightfield import Heightfield
+from ..scene.light import Sky
 from ..scene.localise import localise
 from ..scene.material import Matte
 from ..scene.scene import Scene
@@ -28,6 +29,8 @@ from .options import FitOptions
 from .view import KNOWN, View, sun
 
 _FIRST_NOISE = 0.01  # of a picture's brightness, where none is given
+_DARK = 0.03  # of a picture's brightness: what lies in shadow
+_DARK_SHARE = 0.003  # of its pixels
 _LEAST_NOISE = 5e-4  # of it: about the rounding of a picture with 8 bits
 
 
@@ -123,7 +126,8 @@ class Problem(eqx.Module):
             for group in self.groups
             for k in range(len(group.indices))
         ]
-        count, before = choose_edge_samples(views, self.settings), self.settings.edge_samples
+        dark = self.settings.shadows and any(_shadows_in(group) for group in self.groups)
+        count, before = choose_edge_samples(views, self.settings, dark), self.settings.edge_samples
         if count == before or (before and count < 4 * before):
             return self
         return dataclasses.replace(self, settings=dataclasses.replace(self.settings, edge_samples=count), linearised=None)
@@ -266,6 +270,15 @@ def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOpt
             )
         )
     return tuple(groups)
+
+
+def _shadows_in(group: Group) -> bool:
+    """Whether pictures without a sky have dark places."""
+    if any(isinstance(light, Sky) for light in group.scenes.lights):
+        return False
+    targets, counts = np.asarray(group.targets), np.asarray(group.given) > 0
+    shares = [np.mean(t[c] < _DARK * np.percentile(t[c], 99)) for t, c in zip(targets, counts, strict=True)]
+    return bool(max(shares) > _DARK_SHARE)
 
 
 def _noise(given: Any, targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:

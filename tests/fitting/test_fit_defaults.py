@@ -58,6 +58,20 @@ def test_edges_take_part_where_boundaries_are_in_sight():
     assert choose_samples([flat], jaxhf.Settings(samples=1)).samples == 1
 
 
+def test_edges_take_part_where_the_measured_pictures_show_shadows():
+    """Though the start throws none; a black background with a sky says nothing."""
+    dark = [picture.copy() for picture in pictures()]
+    dark[1][:3, :3] = 0.0
+    lit, shown, sky = (
+        make_problem(given, measured, fit_options())[0].settings.edge_samples
+        for given, measured in (
+            (scenes(), pictures()), (scenes(), dark),
+            ([scene.with_lights([*scene.lights, jaxhf.Sky(0.1)]) for scene in scenes()], dark),
+        )
+    )  # fmt: skip
+    assert (lit, shown, sky) == (0, 2048, 0)
+
+
 def test_the_users_choice_is_kept():
     problem, _ = make_problem(scenes(), pictures(), fit_options(settings=jaxhf.Settings(samples=9, edge_samples=77)))
     assert (problem.settings.samples, problem.settings.edge_samples) == (9, 77)
