@@ -147,7 +147,8 @@ plt.show()
 # ground on which it lies. A renderer without shadows takes it for a steep slope. A renderer with shadows knows
 # better, and its derivative tells how the shadow's edge moves with the ridge (`docs/gradients.md`). A fit includes that
 # by itself where shadows or silhouettes are in sight; `edge_samples=0` leaves it out. The loss is robust: it lets the few
-# pixels go that the scene cannot explain. `loss="squares"` does not.
+# pixels go that the scene cannot explain. `loss="squares"` does not. Here the scene explains them all, so squares, which
+# forget nothing, come a little nearer.
 
 # %%
 trials = {
