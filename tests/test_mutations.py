@@ -245,7 +245,7 @@ MUTATIONS = {
     "interrupted samples": Mutation(
         "fitting/uncertainty.py",
         "if drawn < 2:",
-        "if drawn < 20:",
+        "if drawn < 0:",
         "fitting/test_fit_defaults.py::test_samples_can_be_stopped_with_what_is_there",
     ),
     "what is not seen": Mutation(

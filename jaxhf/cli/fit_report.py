@@ -134,7 +134,7 @@ def _pictures(found: Fit, targets: Sequence[np.ndarray], noise: np.ndarray, name
             axis.set_title(title)
         far = residual if residual.ndim == 2 else residual.mean(axis=-1)
         shown = row[2].imshow(far / deviation, cmap="RdBu_r", vmin=-_FAR, vmax=_FAR)
-        row[2].set_title("their difference / noise, and the worst regions")
+        row[2].set_title("difference / noise, worst regions")
         figure.colorbar(shown, ax=row[2])
         for rank, region in enumerate(found.regions, 1):
             if region.picture == number:
