@@ -242,10 +242,10 @@ MUTATIONS = {
         "0 * jnp.where(folds(",
         "fitting/test_fit_defaults.py::test_edges_take_part_where_boundaries_are_in_sight",
     ),
-    "interrupted samples": Mutation(
+    "squares of samples": Mutation(
         "fitting/uncertainty.py",
-        "if drawn < 2:",
-        "if drawn < 0:",
+        "total + draw * draw,",
+        "total + draw,",
         "fitting/test_fit_defaults.py::test_samples_can_be_stopped_with_what_is_there",
     ),
     "what is not seen": Mutation(
