@@ -75,6 +75,13 @@ class Definition(NamedTuple):
     make: Callable[[Sources], Case]
 
 
+def viewed(
+    ground: jaxhf.Object, cameras: Sequence[jaxhf.Perspective | jaxhf.Orthographic], lights: Sequence[jaxhf.Directional]
+) -> list[jaxhf.Scene]:
+    """A scene a picture, over the same ground."""
+    return [jaxhf.Scene([ground], camera, [light]) for camera, light in zip(cameras, lights, strict=True)]
+
+
 def flat(_: Sources, dtype: str = "float64") -> Case:
     """Smooth terrain seen from straight above, by our own noise-free pictures; four lights."""
     n = 64
@@ -84,8 +91,8 @@ def flat(_: Sources, dtype: str = "float64") -> Case:
     camera = jaxhf.Perspective.look_at((0.5, 0.5, 5.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=fov, width=128, height=128)
 
     def scenes(heights: np.ndarray) -> list[jaxhf.Scene]:
-        field = jaxhf.Object(jaxhf.Heightfield(heights))
-        return [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]
+        ground = jaxhf.Object(jaxhf.Heightfield(heights))
+        return viewed(ground, [camera] * len(LIGHTS), [jaxhf.Directional(towards) for towards in LIGHTS])
 
     targets = [np.asarray(jaxhf.render(scene))[..., 0] for scene in scenes(truth)]
     start = np.full_like(truth, 0.05)
@@ -103,7 +110,8 @@ def common(sources: Sources, count: int) -> Case:
     start = np.full(truth.shape, 0.1, np.float32)
     field = jaxhf.Object(jaxhf.Heightfield(start), jaxhf.Matte(work.ALBEDO))
     camera = jaxhf.Perspective.look_at(eye, target, fov=fov, width=128, height=128)
-    scenes = [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in stored["lights"][:count]]
+    lights = [jaxhf.Directional(towards) for towards in stored["lights"][:count]]
+    scenes = viewed(field, [camera] * count, lights)
     return Case(truth, scenes, list(stored["images"][:count]), {}, start)
 
 
@@ -150,7 +158,7 @@ def surveyed(
     )
     cameras = [jaxhf.Perspective.look_at(eye, at, fov=fov, width=256, height=256) for eye, at, fov in views]
     ground = jaxhf.Object(jaxhf.Heightfield(prior.astype(np.float32), *spacing), jaxhf.Matte(0.7))
-    scenes = [jaxhf.Scene([ground], camera, [light]) for camera, light in zip(cameras, lights, strict=True)]
+    scenes = viewed(ground, cameras, lights)
     targets, noise = noisy(exact)
     given = {"prior": prior, "prior_std": spread} | ({"noise": noise} if noise_known else {})
     return Case(truth, scenes, list(targets), given, prior)

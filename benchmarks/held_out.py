@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from cases import SAMPLES, Case, Definition, Sources, noisy, smoothed
+from cases import SAMPLES, Case, Definition, Sources, noisy, smoothed, viewed
 from peers import mesh_of
 
 import jaxhf
@@ -65,6 +65,29 @@ def by_mitsuba(scene: jaxhf.Scene, eye: Sequence[float], at: Sequence[float], te
     return np.array(mi.render(made))[..., :3]
 
 
+def from_all(
+    sources: Sources,
+    name: str,
+    scenes: Sequence[jaxhf.Scene],
+    eyes: Sequence[np.ndarray],
+    at: np.ndarray,
+    texels: np.ndarray | None = None,
+) -> np.ndarray:
+    """`by_mitsuba` of each scene: (pictures, h, w), or with a texture (pictures, h, w, 3)."""
+
+    def make() -> np.ndarray:
+        views = zip(scenes, eyes, strict=True)
+        pictures = np.stack([by_mitsuba(scene, eye.tolist(), at.tolist(), texels) for scene, eye in views])
+        return pictures[..., 0] if texels is None else pictures
+
+    return sources.pictures(name, make)
+
+
+def suns(*angles: tuple[float, float]) -> list[jaxhf.Directional]:
+    """Lights by azimuth and altitude, degrees."""
+    return [jaxhf.Directional.from_angles(azimuth=azimuth, altitude=altitude) for azimuth, altitude in angles]
+
+
 def evening(sources: Sources) -> Case:
     """One picture of a valley under a sun 18 degrees high, with long shadows, and a map; off-nadir, the noise is given."""
     terrain = jaxhf.jacksboro()
@@ -77,17 +100,14 @@ def evening(sources: Sources) -> Case:
     eye = at + np.array([-5000.0, -9000.0, 19000.0])
     camera = jaxhf.Perspective.look_at(eye, at, fov=29.0, width=224, height=224)
 
-    def scene(heights: np.ndarray) -> jaxhf.Scene:
-        ground = jaxhf.Object(jaxhf.Heightfield(heights, terrain.dx, terrain.dy), jaxhf.Matte(0.5))
-        return jaxhf.Scene([ground], camera, [jaxhf.Directional.from_angles(azimuth=250, altitude=18)])
+    def scenes(heights: np.ndarray) -> list[jaxhf.Scene]:
+        ground = jaxhf.Object(jaxhf.Heightfield(heights.astype(np.float32), terrain.dx, terrain.dy), jaxhf.Matte(0.5))
+        return viewed(ground, [camera], suns((250, 18)))
 
-    exact = sources.pictures(
-        "evening", lambda: by_mitsuba(scene(truth.astype(np.float32)), eye.tolist(), at.tolist())[None, ..., 0]
-    )
-    targets, noise = noisy(exact)
+    targets, noise = noisy(from_all(sources, "evening", scenes(truth), [eye], at))
     spread = float(f"{np.sqrt(np.mean((coarse - whole) ** 2)):.1e}")
     given = {"prior": prior, "prior_std": spread, "noise": noise}
-    return Case(truth, [scene(prior.astype(np.float32))], list(targets), given, prior)
+    return Case(truth, scenes(prior), list(targets), given, prior)
 
 
 def photographs(sources: Sources) -> Case:
@@ -101,24 +121,14 @@ def photographs(sources: Sources) -> Case:
     spacing = 1.2 / 47
     at = np.array([0.6, 39 / 2 * spacing, 0.0])
     eyes = [at + offset for offset in ((0.3, -1.0, 2.0), (-0.9, 0.5, 2.0), (0.9, 0.6, 2.0), (0.1, 0.2, 2.0))]
-    suns = [(azimuth, 40) for azimuth in (100, 190, 280, 10)]
+    cameras = [jaxhf.Orthographic.look_at(eye, at, extent=1.6, width=160, height=160) for eye in eyes]
+    lights = suns((100, 40), (190, 40), (280, 40), (10, 40))
 
     def scenes(heights: np.ndarray) -> list[jaxhf.Scene]:
         ground = jaxhf.Object(jaxhf.Heightfield(heights, spacing), jaxhf.Matte(0.35))
-        return [
-            jaxhf.Scene(
-                [ground],
-                jaxhf.Orthographic.look_at(eye, at, extent=1.6, width=160, height=160),
-                [jaxhf.Directional.from_angles(azimuth=azimuth, altitude=altitude)],
-            )
-            for eye, (azimuth, altitude) in zip(eyes, suns, strict=True)
-        ]
+        return viewed(ground, cameras, lights)
 
-    def make() -> np.ndarray:
-        views = zip(scenes(truth), eyes, strict=True)
-        return np.stack([by_mitsuba(scene, eye.tolist(), at.tolist())[..., 0] for scene, eye in views])
-
-    grey, noise = noisy(sources.pictures("photographs", make), 0.02)
+    grey, noise = noisy(from_all(sources, "photographs", scenes(truth), eyes, at), 0.02)
     targets = [np.repeat(picture[..., None], 3, axis=-1) for picture in grey]
     start = np.zeros_like(truth)
     given = {"prior": start, "prior_std": spread, "noise": noise}
@@ -134,26 +144,17 @@ def orthophoto(sources: Sources) -> Case:
     prior = truth + error - error.mean()
     at = np.array([71 / 2 * spacing, 71 / 2 * spacing, float(prior.mean())])
     eyes = [at + offset for offset in ((350.0, -500.0, 800.0), (-450.0, 350.0, 800.0))]
-    suns = ((120, 38), (230, 30))
+    cameras = [jaxhf.Perspective.look_at(eye, at, fov=31.0, width=240, height=160) for eye in eyes]
+    lights = suns((120, 38), (230, 30))
+    material = jaxhf.Matte(jaxhf.ImageTexture(texels.astype(np.float32)))
 
     def scenes(heights: np.ndarray) -> list[jaxhf.Scene]:
-        ground = jaxhf.Object(jaxhf.Heightfield(heights, spacing), jaxhf.Matte(jaxhf.ImageTexture(texels.astype(np.float32))))
-        return [
-            jaxhf.Scene(
-                [ground],
-                jaxhf.Perspective.look_at(eye, at, fov=31.0, width=240, height=160),
-                [jaxhf.Directional.from_angles(azimuth=azimuth, altitude=altitude)],
-            )
-            for eye, (azimuth, altitude) in zip(eyes, suns, strict=True)
-        ]
+        ground = jaxhf.Object(jaxhf.Heightfield(heights.astype(np.float32), spacing), material)
+        return viewed(ground, cameras, lights)
 
-    def make() -> np.ndarray:
-        views = zip(scenes(truth.astype(np.float32)), eyes, strict=True)
-        return np.stack([by_mitsuba(scene, eye.tolist(), at.tolist(), texels) for scene, eye in views])
-
-    targets, _ = noisy(sources.pictures("orthophoto", make))
+    targets, _ = noisy(from_all(sources, "orthophoto", scenes(truth), eyes, at, texels))
     given = {"prior": prior, "prior_std": float(f"{error.std():.1e}")}
-    return Case(truth, scenes(prior.astype(np.float32)), list(targets), given, prior)
+    return Case(truth, scenes(prior), list(targets), given, prior)
 
 
 def aslant(sources: Sources) -> Case:
@@ -164,24 +165,15 @@ def aslant(sources: Sources) -> Case:
     at = np.array([0.5, 0.5, 0.06])
     turns = np.radians((20, 115, 200, 290))
     eyes = [at + 2.0 * np.array([np.sin(t) * 0.82, np.cos(t) * 0.82, 0.57]) for t in turns]
+    cameras = [jaxhf.Perspective.look_at(eye, at, fov=42.0, width=160, height=160) for eye in eyes]
+    lights = suns((60, 48), (60, 48), (150, 48), (330, 48))
 
     def scenes(heights: np.ndarray) -> list[jaxhf.Scene]:
-        ground = jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(0.6))
-        return [
-            jaxhf.Scene(
-                [ground],
-                jaxhf.Perspective.look_at(eye, at, fov=42.0, width=160, height=160),
-                [jaxhf.Directional.from_angles(azimuth=azimuth, altitude=48)],
-            )
-            for eye, azimuth in zip(eyes, (60, 60, 150, 330), strict=True)
-        ]
+        ground = jaxhf.Object(jaxhf.Heightfield(heights.astype(np.float32)), jaxhf.Matte(0.6))
+        return viewed(ground, cameras, lights)
 
-    def make() -> np.ndarray:
-        views = zip(scenes(truth.astype(np.float32)), eyes, strict=True)
-        return np.stack([by_mitsuba(scene, eye.tolist(), at.tolist())[..., 0] for scene, eye in views])
-
-    targets, noise = noisy(sources.pictures("aslant", make), 0.005)
-    start = np.full(truth.shape, 0.05, np.float32)
+    targets, noise = noisy(from_all(sources, "aslant", scenes(truth), eyes, at), 0.005)
+    start = np.full(truth.shape, 0.05)
     return Case(truth, scenes(start), list(targets), {"noise": noise}, start)
 
 

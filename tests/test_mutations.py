@@ -123,13 +123,13 @@ MUTATIONS = {
         "fitting/test_fit.py::test_errors_of_a_prior_are_correlated_as_whittle_said",
     ),
     "their spread at the border": Mutation(
-        "fitting/problem.py",
+        "fitting/prior.py",
         "rows.T @ stiffness**-2 @ columns",
         "np.mean(stiffness**-2)",
         "fitting/test_fit.py::test_errors_of_a_prior_are_correlated_as_whittle_said",
     ),
     "their slope at the border": Mutation(
-        "fitting/problem.py",
+        "fitting/prior.py",
         "math.ceil(length / d)",
         "0 * math.ceil(length / d)",
         "fitting/test_fit.py::test_errors_of_a_prior_are_correlated_as_whittle_said",

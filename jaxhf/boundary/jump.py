@@ -46,7 +46,6 @@ class Passage(eqx.Module):
     Attributes:
       fold: the edge's triangles.
       beyond: the hit behind the edge; for a shadow, where it falls.
-      open: whether nothing hides the boundary: not the edge from its source and, for a shadow, not its place from the eye.
     """
 
     fold: Fold

@@ -173,5 +173,5 @@ def _write(path: str, case: "Case", found: "Fit", outputs: Outputs) -> None:
         factors = np.asarray(found.albedo)[::-1]  # a texture begins at v = 0, an image at its top
         save_image(outputs.albedo, factors if factors.shape[-1] == 3 else factors[..., 0])
     if outputs.report is not None:
-        page = report(f"Heights from {path}", found, field, case.targets, found.noise, case.names)
+        page = report(f"Heights from {path}", found, field, case.targets, case.names)
         save_text(outputs.report, page)

@@ -23,16 +23,14 @@ img {{ max-width: 100% }} th {{ text-align: left; padding-right: 2em; font-weigh
 """
 
 
-def report(
-    title: str, found: Fit, field: Heightfield, targets: Sequence[np.ndarray], noise: np.ndarray, names: Sequence[str]
-) -> str:
+def report(title: str, found: Fit, field: Heightfield, targets: Sequence[np.ndarray], names: Sequence[str]) -> str:
     """An HTML page that needs no other file.
 
     Args:
       title: of the page.
       found: what is reported.
       field: where the fit began, with its spacing.
-      targets, noise, names: of each picture, as given to `fit`.
+      targets, names: of each picture, as given to `fit`.
 
     Raises:
       ValueError: matplotlib is not installed.
@@ -40,7 +38,7 @@ def report(
     facts = "".join(f"<tr><th>{name}</th><td>{html.escape(value)}</td></tr>" for name, value in _facts(found))
     figures = (
         ("Heights", _heights(found, field)),
-        ("Pictures", _pictures(found, targets, noise, names)),
+        ("Pictures", _pictures(found, targets, names)),
         ("Convergence", _convergence(found)),
     )
     shown = "".join(f'<h2>{name}</h2><img alt="{name}" src="{_embedded(figure)}">\n' for name, figure in figures)
@@ -120,13 +118,13 @@ def _symmetric(values: np.ndarray) -> dict[str, float]:
     return {"vmin": -top, "vmax": top}
 
 
-def _pictures(found: Fit, targets: Sequence[np.ndarray], noise: np.ndarray, names: Sequence[str]) -> Any:
+def _pictures(found: Fit, targets: Sequence[np.ndarray], names: Sequence[str]) -> Any:
     from matplotlib.patches import Rectangle
 
     height, width = targets[0].shape[:2]
     figure, axes = _figure(len(targets), 3, 10 / 3 * len(targets) * min(1.5, max(0.5, height / width)) + 0.5)
     for number, (row, target, image, residual, deviation, name) in enumerate(
-        zip(axes, targets, found.images, found.residuals, noise, names, strict=True)
+        zip(axes, targets, found.images, found.residuals, found.noise, names, strict=True)
     ):
         top = float(np.nanmax(target)) or 1.0
         for axis, values, title in ((row[0], target, f"{name}, measured"), (row[1], image, "simulated")):

@@ -9,6 +9,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..core.errors import ArgumentError
 from ..scene.heightfield import Heightfield
 from .view import KNOWN, View
 
@@ -165,6 +166,19 @@ def dct_matrix(n: int) -> Float[np.ndarray, "n n"]:
     matrix = np.sqrt(2 / n) * np.cos(np.pi / n * k[:, None] * (k[None, :] + 0.5))
     matrix[0] /= np.sqrt(2)
     return matrix
+
+
+def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:
+    """Heights from a number (flat), from a coarser or finer grid over the same footprint, or as they are."""
+    heights = np.asarray(value, np.float64)
+    if heights.shape == ():
+        heights = np.full(shape, heights)
+    if heights.ndim != 2 or min(heights.shape) < 2:
+        raise ArgumentError("fit", name, f"must be a number or heights of at least 2x2, its shape is {heights.shape}")
+    if not np.isfinite(heights).all():
+        iy, ix = np.argwhere(~np.isfinite(heights))[0]
+        raise ArgumentError("fit", name, f"must be finite, row {iy} column {ix} is {heights[iy, ix]}")
+    return heights if heights.shape == shape else resample(heights, shape)
 
 
 def resample(heights: Float[np.ndarray, "my mx"], shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:

@@ -236,14 +236,14 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
             images[k], differences[k] = _in_shape(image, shape), _in_shape(values, shape)
             in_noise[k] = values * weight
     # A background that is black in picture and target says nothing.
-    counted = np.concatenate([values[values != 0] for values in in_noise])
+    counted = np.concatenate([values[values != 0] for values in in_noise]).astype(np.float64)
     with np.errstate(over="ignore"):
         regions, where = worst_regions(in_noise), where_residuals_are(in_noise, _places(problem))
-        chi2 = float(np.mean(np.square(counted, dtype=np.float64))) if len(counted) else 0.0
+        chi2 = float(np.mean(np.square(counted))) if len(counted) else 0.0
     seen = np.asarray(influence) != 0
     std, scaled, draws = None, None, None
     if options.uncertainty is not None and result is not Stop.NON_FINITE:
-        borne_out, scaled = with_unexplained(unknowns, problem)
+        borne_out, scaled = with_unexplained(problem, counted)
         std, drawn = standard_deviations(unknowns, borne_out, options.uncertainty, options.inner_steps, loop.progress)
         draws = None if drawn is None else (int(options.uncertainty), drawn)
         if problem.prior is None:

@@ -42,13 +42,16 @@ _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
 _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviation that their noise leaves them with
 _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
-_SETTLED = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
-_LAST_STAGES = 3  # at most, over which the scale of a robust loss comes down to its own, or the noise settles
+_LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
+_LAST_STAGES = 3  # at most, over which the scale of a robust loss comes down to its own, and the noise is estimated
 _PROBES = 8  # of the pictures' curvature
 
 
 def make_stages(shape: tuple[int, ...], options: FitOptions) -> list[float]:
-    """The share of the highest frequency that each stage varies: the levels, then 1 while loss and noise settle."""
+    """The share of the highest frequency that each stage varies.
+
+    The levels, then 1 while the loss is sharpened and the noise estimated.
+    """
     levels = options.levels
     if levels is None:
         doublings = max(0, math.floor(math.log2(max(shape) / 8))) if options.solver == "lm" else 0
@@ -76,7 +79,6 @@ class FitLoop:
         self.predicted = 0.0  # see `Outcome`
         self.snapshot: tuple[dict[str, Any], Any] | None = None  # for the next checkpoint
         self.final_loss_scale = None if problem.loss_scale is None else float(problem.loss_scale)
-        self.noise = problem.noise
         self.units: np.ndarray | None = None  # see `make_basis`
         self.views: list[tuple[list[np.ndarray], Any]] = []  # linearised pictures, with the unknowns that they belong to
         self.seconds = 0.0  # spent before a resumption
@@ -108,25 +110,25 @@ class FitLoop:
 
     def known(self, unknowns: Unknowns) -> Problem:
         """The problem, `linearised` at these unknowns; the pictures of the best unknowns and of the last ones are kept."""
-        heights = np.asarray(heights_of(unknowns, self.problem.basis))
-        others = eqx.tree_at(lambda u: u.coefficients, unknowns, None, is_leaf=lambda leaf: leaf is None)
-        at = [heights, *map(np.asarray, jax.tree.leaves(others))]
-        found = next((found for place, found in self.views if all(map(np.array_equal, place, at))), None)
+        at, best = self._place(unknowns), self._place(self.best[1])
+        found = next((found for place, found in self.views if _same_place(place, at)), None)
         if found is None:
             found = linearised(unknowns, self.problem).linearised
-        best = [view for view in self.views if view[1] is not found and np.array_equal(view[0][0], self._best_heights())]
-        self.views = [(at, found), *best[:1]]
+        kept = [view for view in self.views if view[1] is not found and _same_place(view[0], best)]
+        self.views = [(at, found), *kept]
         return dataclasses.replace(self.problem, linearised=found)
 
-    def _best_heights(self) -> np.ndarray:
-        return np.asarray(heights_of(self.best[1], self.problem.basis))
+    def _place(self, unknowns: Unknowns) -> list[np.ndarray]:
+        """The heights and the other unknowns, on which pictures depend; not how the heights are made of modes."""
+        others = eqx.tree_at(lambda u: u.coefficients, unknowns, None, is_leaf=lambda leaf: leaf is None)
+        return [np.asarray(heights_of(unknowns, self.problem.basis)), *map(np.asarray, jax.tree.leaves(others))]
 
     def elapsed(self) -> float:
         """Seconds since the fit began, with those before a resumption."""
         return self.seconds + time.perf_counter() - self.started
 
     def _next_stage(self) -> bool:
-        """Makes the best surface the base, and varies more modes about it, or lets the loss and the noise settle.
+        """Makes the best surface the base, and varies more modes about it, or sharpens the loss and estimates the noise again.
 
         Returns whether there is such a stage: not after the last, nor where it would repeat the one before.
         """
@@ -142,20 +144,24 @@ class FitLoop:
             known = self.known(self.best[1])
         pictures, _ = pictures_and_influence(self.best[1], known)
         spreads = _spreads(pictures, known)  # radiance
-        noise = self._settled_noise(spreads, share)
+        noise = self._estimated_noise(spreads, share)
         spread = float(np.sqrt(np.mean(np.square(spreads / noise))))
         scale = None
         if self.final_loss_scale is not None:
             scale = max(self.final_loss_scale, 3 * spread)
-            if scale <= _SETTLED * self.final_loss_scale or self.stage + 2 == len(self.stages):
+            if scale <= _LEAST_CHANGE * self.final_loss_scale or self.stage + 2 == len(self.stages):
                 scale = self.final_loss_scale
-        if repeats and not refined and np.array_equal(noise, self.noise) and (scale is None or scale == self._loss_scale()):
+        if (
+            repeats
+            and not refined
+            and np.array_equal(noise, self.problem.noise)
+            and (scale is None or scale == self._loss_scale())
+        ):
             return False
         self.stage += 1
         self.unknowns, self.stage_start = unknowns, len(self.history)
-        self.set_noise(noise, known)
-        probes = [pictures_and_influence(self.best[1], self.known(self.best[1]), key)[1] for key in range(_PROBES)]
-        self.units, curvature = self._measured_units([np.asarray(influence) for influence in probes])
+        self._set_noise(noise, known)
+        self.units, curvature = self._measured_units(self.best[1])
         self._set_basis(surface)
         if scale is not None:
             self.problem = dataclasses.replace(self.problem, loss_scale=jnp.asarray(scale, self.field.heights.dtype))
@@ -186,26 +192,28 @@ class FitLoop:
         basis = make_basis(self.field, base, self.stages[self.stage], self.units)
         self.problem = eqx.tree_at(lambda problem: problem.basis, self.problem, basis)
 
-    def set_noise(self, noise: np.ndarray, known: Problem) -> None:
+    def _set_noise(self, noise: np.ndarray, known: Problem) -> None:
         """Weighs residuals by this noise and by the error of the samples of the pictures that are known."""
         self.problem = dataclasses.replace(known.with_noise(noise), linearised=None)
-        self.noise = noise
 
-    def _settled_noise(self, spreads: np.ndarray, share: float) -> np.ndarray:
+    def _estimated_noise(self, spreads: np.ndarray, share: float) -> np.ndarray:
         """The noise of each picture by its residuals, where none is given; unchanged where it would hardly change.
 
         Args:
           spreads: of each picture's residuals, radiance.
           share: of the modes that the stage to come varies.
         """
+        before = self.problem.noise
         if self.options.noise is not None:
-            return self.noise
+            return before
         noise = np.maximum(spreads, self.problem.least_noise)
-        changes = np.maximum(noise / self.noise, self.noise / noise)
-        return self.noise if share == 1 and changes.max() < _SETTLED else noise
+        changes = np.maximum(noise / before, before / noise)
+        return before if share == 1 and changes.max() < _LEAST_CHANGE else noise
 
-    def _measured_units(self, influences: Sequence[np.ndarray]) -> tuple[np.ndarray, float]:
-        """Units of the modes by the curvature of the loss, and that curvature, see `balanced_units`."""
+    def _measured_units(self, unknowns: Unknowns) -> tuple[np.ndarray, float]:
+        """Units of the modes by the curvature of the loss at these unknowns, and that curvature, see `balanced_units`."""
+        known = self.known(unknowns)
+        influences = [np.asarray(pictures_and_influence(unknowns, known, key)[1]) for key in range(_PROBES)]
         basis = make_basis(self.field, np.asarray(self.problem.basis.base))
         curvature = mode_curvature(self.problem, influences)
         return balanced_units(np.asarray(basis.scale, np.float64), curvature, mean_only=self.options.solver != "lm")
@@ -214,9 +222,8 @@ class FitLoop:
         """Varies all modes about the present surface, whatever the level at which the fit stopped."""
         surface = np.asarray(self.problem.basis.surface(self.unknowns.coefficients))
         known = self.known(self.unknowns)
-        self.units, _ = self._measured_units(
-            [np.asarray(pictures_and_influence(self.unknowns, known, key)[1]) for key in range(_PROBES)]
-        )
+        if self.options.uncertainty is not None:  # nothing else is solved for any more
+            self.units, _ = self._measured_units(self.unknowns)
         basis = make_basis(self.field, surface, 1.0, self.units)
         self.problem = dataclasses.replace(known, basis=basis)
         self.unknowns = eqx.tree_at(lambda u: u.coefficients, self.unknowns, jnp.zeros_like(self.unknowns.coefficients))
@@ -254,8 +261,8 @@ class FitLoop:
             return None if len(self.history) < self.options.max_steps else Stop.MAX_STEPS
         if not math.isfinite(steps[-1].loss):
             return Stop.NON_FINITE
-        settled = self._loss_scale() == self.final_loss_scale
-        fine = self.stage + 1 == len(self.stages) or (self.stages[self.stage] == 1 and settled)
+        sharp = self._loss_scale() == self.final_loss_scale
+        fine = self.stage + 1 == len(self.stages) or (self.stages[self.stage] == 1 and sharp)
         rejections = self._rejections()
         if len(steps) > 1 and self._flat(steps, fine):  # the first only evaluates where the stage begins
             return Stop.CONVERGED
@@ -295,9 +302,8 @@ class FitLoop:
 
     def _arrays(self) -> Any:
         """The arrays of a checkpoint; of the state of Levenberg-Marquardt only 1 / λ, as one step makes the rest anew."""
-        lm = hasattr(self.state, "num_steps_since_acceptance")
-        state = self.state.search_state.step_size if lm else eqx.filter(self.state, eqx.is_array)
-        place = (self.problem.basis.base, self.problem.loss_scale, self.noise, self.units)
+        state = self.state.search_state.step_size if self._damped() else eqx.filter(self.state, eqx.is_array)
+        place = (self.problem.basis.base, self.problem.loss_scale, self.problem.noise, self.units)
         return self.unknowns, self.best[1], place, state
 
     def _take_snapshot(self) -> None:
@@ -341,9 +347,9 @@ class FitLoop:
         self.history = [Step(*line) for line in facts["history"]]
         self._set_basis(np.asarray(base))
         base_unknowns = eqx.tree_at(lambda u: u.coefficients, best, jnp.zeros_like(best.coefficients))
-        self.set_noise(np.asarray(noise), self.known(base_unknowns))
+        self._set_noise(np.asarray(noise), self.known(base_unknowns))
         self.problem = dataclasses.replace(self.problem, loss_scale=loss_scale)
-        if hasattr(self.initial_state, "num_steps_since_acceptance"):
+        if self._damped():
             self.state = reset_state(self.initial_state, self.unknowns, state)
             if len(self.history) > self.stage_start:
                 solver = with_rejections(self.solver, 0)
@@ -351,6 +357,10 @@ class FitLoop:
                 self.unknowns, self.state, _ = advance(solver, self.unknowns, self.state, known)
         else:
             self.state = eqx.combine(state, self.initial_state)
+
+
+def _same_place(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> bool:
+    return all(map(np.array_equal, one, other))
 
 
 def _spreads(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarray, " pictures"]:

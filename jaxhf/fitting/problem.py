@@ -15,17 +15,17 @@ from jaxtyping import Array, Float
 from ..core.devices import local_mesh
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
-from ..scene.heightfield import Heightfield
 from ..scene.light import Sky
 from ..scene.localise import localise
 from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
 from ..trace.world import resolve_settings
-from .basis import Basis, Unknowns, dct_matrix, make_basis, pad, resample
+from .basis import Basis, Unknowns, make_basis, make_heights, pad
 from .defaults import choose_edge_samples, choose_samples
 from .linearise import Linearised
 from .options import FitOptions
+from .prior import Prior, make_prior, prior_padding
 from .view import KNOWN, View, sun
 
 _FIRST_NOISE = 0.01  # of a picture's brightness, where none is given
@@ -56,21 +56,6 @@ class Group(eqx.Module):
     def complete(self, scene: Scene, heights: Float[Array, "ny nx"]) -> Scene:
         """One picture's leaves of `scenes`, with those that are shared and these heights."""
         return _with_heights(eqx.combine(scene, self.shared), heights)
-
-
-class Prior(eqx.Module):
-    """Heights that are known beforehand, and how well.
-
-    Attributes:
-      heights: shape (my, mx), padded as `Basis.base` is.
-      weight: 1 / their standard deviation, shape (my, mx). Where errors are correlated: 1 / the standard deviation that is left
-        when each DCT coefficient of the errors is divided by its amplitude.
-      stiffness: 1 / the amplitude of each DCT coefficient of the errors over their deviation; None: errors are independent.
-    """
-
-    heights: Float[Array, "my mx"]
-    weight: Float[Array, "my mx"]
-    stiffness: Float[Array, "my mx"] | None = None
 
 
 class Problem(eqx.Module):
@@ -161,11 +146,11 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
     start = _without_holes(np.asarray(first.heights)) if options.start is None else options.start
     heights = make_heights("start", start, shape)
     settings = choose_samples(scenes, options.settings)
-    groups = make_groups(scenes, targets, options, settings)
+    noise = _noise(options.noise, targets)
+    groups = make_groups(scenes, targets, noise, options, settings)
     prior = make_prior(field, options.prior, options.prior_std, options.prior_length, options.prior_exponent)
     basis = make_basis(field, pad(heights, prior_padding(field, options.prior_length)))
     unknowns = first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), options)
-    noise = _noise(options.noise, targets)
     problem = Problem(
         groups,
         basis,
@@ -237,12 +222,17 @@ def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any]) -> None:
         _require_alike(k, scene, scenes[0])
 
 
-def make_groups(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOptions, settings: Settings) -> tuple[Group, ...]:
+def make_groups(
+    scenes: Sequence[Scene],
+    targets: Sequence[Any],
+    noise: Float[np.ndarray, " pictures"],
+    options: FitOptions,
+    settings: Settings,
+) -> tuple[Group, ...]:
     """Checks pictures, and gathers those that one program can render with these settings."""
     weights = options.weights
     if weights is not None and len(weights) != len(scenes):
         raise ArgumentError("fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(weights)}")
-    noise = _noise(options.noise, targets)
     found: dict[Any, list[tuple[int, Scene, Any, Any]]] = {}
     for k, scene in enumerate(scenes):
         target, weight = _picture(k, scene, targets[k], None if weights is None else weights[k])
@@ -372,34 +362,6 @@ def _is_grey(target: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w 
     return bool(np.all(target[counts] == target[counts][:, :1]) and np.all(weight == weight[..., :1]))
 
 
-def make_prior(field: Heightfield, prior: Any, std: Any, length: float | int | None, exponent: float | int) -> Prior | None:
-    """The prior of the heights of `field`; `length` and `exponent` are `fit`'s prior_length and prior_exponent."""
-    shape, dtype = field.heights.shape, field.heights.dtype
-    if prior is None:
-        for name, value in (("prior_std", std), ("prior_length", length)):
-            if value is not None:
-                raise ArgumentError("fit", name, "must stand with a prior, there is none")
-        return None
-    if std is None:
-        raise ArgumentError("fit", "prior", "must stand with prior_std, how far it may be off")
-    std = np.asarray(std, np.float64)
-    if std.shape not in ((), shape) or not (std > 0).all():
-        raise ArgumentError(
-            "fit", "prior_std", f"must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}"
-        )
-    padding = prior_padding(field, length)
-    if length is not None:
-        _require_plausible(field, length)
-    heights = pad(make_heights("prior", prior, shape), padding)
-    weight, stiffness = pad(np.broadcast_to(1 / std, shape), padding), None
-    if length is not None:
-        stiffness = _stiffness(field, heights.shape, length, exponent)
-        rows, columns = (dct_matrix(n) ** 2 for n in heights.shape)
-        weight = weight * np.sqrt(rows.T @ stiffness**-2 @ columns)
-        stiffness = jnp.asarray(stiffness, dtype)
-    return Prior(jnp.asarray(heights, dtype), jnp.asarray(weight, dtype), stiffness)
-
-
 def mode_curvature(problem: Problem, influences: Sequence[np.ndarray]) -> Float[np.ndarray, "my mx"]:
     """The curvature of the loss along each DCT mode of unit height.
 
@@ -432,53 +394,6 @@ def _over_neighbours(values: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "m
     padded[1, 1] = np.mean([values[0, 1], values[1, 0]])
     ny, nx = values.shape
     return np.mean([padded[y : y + ny, x : x + nx] for y in range(3) for x in range(3)], axis=0)
-
-
-def _require_plausible(field: Heightfield, length: float) -> None:
-    """Refuses a correlation length that no terrain of this size and spacing can show, such as one in cells."""
-    cell = min(field.dx, field.dy)
-    side = max((n - 1) * d for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True))
-    if not cell * (1 - 1e-6) <= length <= side * (1 + 1e-6):
-        raise ArgumentError(
-            "fit",
-            "prior_length",
-            f"must lie from one cell to the terrain's longer side, {cell:.6g} to {side:.6g}; it is {length:.6g}, or "
-            f"{length / cell:.3g} cells. It is in the unit of dx and dy: {length:.6g} cells would be {length * cell:.6g}",
-        )
-
-
-def prior_padding(field: Heightfield, length: float | None) -> tuple[int, int]:
-    """How many vertices to add beyond each border, in y and in x: one correlation length, at most half of the terrain's size.
-
-    DCT modes have no slope across the edge of their grid, and errors across it are mirrored: at distance zero if the grid
-    ended at the border, at two lengths with this padding. Whatever its exponent, Matérn's correlation has its inflection at 0
-    to 2 lengths, beyond which slopes are no longer correlated; so the slopes at the border are free. The errors themselves are
-    correlated over longer distances (Lindgren, Rue and Lindström, 2011, A.4), but more padding costs more steps.
-    """
-    if length is None:
-        return 0, 0
-    steps = (field.dy, field.dx)
-    y, x = (min(math.ceil(length / d), n // 2) for n, d in zip(field.heights.shape, steps, strict=True))
-    return y, x
-
-
-def _stiffness(field: Heightfield, shape: tuple[int, ...], length: float, exponent: float) -> Float[np.ndarray, "my mx"]:
-    """(1 - length² · Laplacian)^(exponent / 2) of each DCT mode, the Laplacian being that of second differences."""
-    steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, (field.dy, field.dx), strict=True)]
-    return (1 + length**2 * (steps[0][:, None] + steps[1][None, :])) ** (exponent / 2)
-
-
-def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:
-    """Heights from a number (flat), from a coarser or finer grid over the same footprint, or as they are."""
-    heights = np.asarray(value, np.float64)
-    if heights.shape == ():
-        heights = np.full(shape, heights)
-    if heights.ndim != 2 or min(heights.shape) < 2:
-        raise ArgumentError("fit", name, f"must be a number or heights of at least 2x2, its shape is {heights.shape}")
-    if not np.isfinite(heights).all():
-        iy, ix = np.argwhere(~np.isfinite(heights))[0]
-        raise ArgumentError("fit", name, f"must be finite, row {iy} column {ix} is {heights[iy, ix]}")
-    return heights if heights.shape == shape else resample(heights, shape)
 
 
 def first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, options: FitOptions) -> Unknowns:

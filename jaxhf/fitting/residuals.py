@@ -63,9 +63,9 @@ def simulate(
 def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
     """The problem with its pictures at these unknowns and their derivatives, so that its residuals there render nothing.
 
-    With mirrors, or an unknown albedo, there is no such derivative: then the problem as it is.
+    With mirrors, or an unknown albedo, there is no such derivative: then the problem as it is; also where it has them already.
     """
-    if unknowns.albedo is not None:
+    if problem.linearised is not None or unknowns.albedo is not None:
         return problem
     if not all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
         return problem
@@ -185,8 +185,7 @@ def pictures_and_influence(
       problem: `linearised` at these unknowns, or it is here.
       key: of the random factors.
     """
-    if problem.linearised is None:
-        problem = linearised(unknowns, problem)
+    problem = linearised(unknowns, problem)
     return _pictures_and_influence(*on_every_device((unknowns, problem, jax.random.key(key)), problem.mesh))
 
 

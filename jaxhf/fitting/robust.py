@@ -1,7 +1,6 @@
 """Robust losses."""
 
-from typing import Any
-
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -39,17 +38,13 @@ def robust_weight(residual: Array, loss: str, scale: Float[Array, ""] | None) ->
 
 
 def influence_function(
-    residual: Float[np.ndarray, " n"], loss: str, scale: Any
+    residual: Float[np.ndarray, " n"], loss: str, scale: Float[Array, ""] | None
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """ψ = ρ', its derivative, and the weight ψ / r of residuals."""
-    if loss == "squares" or scale is None:
-        return residual, np.ones_like(residual), np.ones_like(residual)
-    square = (residual / float(scale)) ** 2
-    if loss == "huber":
-        weight = 1 / np.sqrt(np.maximum(square, 1))
-        return residual * weight, (square <= 1).astype(float), weight
-    if loss == "cauchy":
-        weight = 1 / (1 + square)
-        return residual * weight, (1 - square) * weight**2, weight
-    weight = 1 / (1 + square) ** 2
-    return residual * weight, (1 - 3 * square) / (1 + square) ** 3, weight
+
+    def psi(residual: Array) -> Array:
+        return robust_weight(residual, loss, scale) * residual
+
+    r = jnp.asarray(residual)
+    values, slope = jax.jvp(psi, (r,), (jnp.ones_like(r),))
+    return np.asarray(values), np.asarray(slope), np.asarray(robust_weight(r, loss, scale))

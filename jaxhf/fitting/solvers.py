@@ -159,8 +159,7 @@ def init_state(solver: Any, unknowns: Unknowns, problem: Problem) -> Any:
     """
     # What enters a compiled step and what leaves it must lie in the same places, or the next step is compiled again for the
     # other ones: 16 x 16 heights on two devices took 89 s of processor time up to the last level, not 30.
-    if problem.linearised is None:
-        problem = linearised(unknowns, problem)
+    problem = linearised(unknowns, problem)
     return _init_state(solver, *on_every_device((unknowns, problem), problem.mesh))
 
 
@@ -200,8 +199,7 @@ def advance(solver: Any, unknowns: Unknowns, state: Any, problem: Problem) -> tu
 
     The problem is `linearised` at `evaluated_at`, or it is here.
     """
-    if problem.linearised is None:
-        problem = linearised(evaluated_at(unknowns, state), problem)
+    problem = linearised(evaluated_at(unknowns, state), problem)
     return _advance(*on_every_device((solver, unknowns, state, problem), problem.mesh))
 
 

@@ -58,9 +58,7 @@ def standard_deviations(
     Raises:
       KeyboardInterrupt: Ctrl-C before there were two samples.
     """
-    if problem.linearised is None:
-        problem = linearised(unknowns, problem)
-    unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
+    unknowns, problem = on_every_device((unknowns, linearised(unknowns, problem)), problem.mesh)
     if samples == "exact":
         return np.sqrt(np.asarray(_exact_variance(unknowns, problem))), None
     total, drawn, count = np.zeros(problem.basis.crop(problem.basis.base).shape), 0, int(samples)
@@ -78,21 +76,22 @@ def standard_deviations(
     return np.sqrt(total / drawn), drawn
 
 
-def with_unexplained(unknowns: Unknowns, problem: Problem) -> tuple[Problem, float]:
+def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tuple[Problem, float]:
     """The problem with the noise that its residuals bear out, and the factor on the noise, at least 1.
 
     An M-estimate's covariance is f² (JᵀWJ)⁻¹, with f² = N / (N - p) · mean(ψ²) · mean(w) / mean(ψ')² over the N residuals r in
     units of the noise, ψ = ρ', w = ψ / r, p unknowns (Huber, Robust statistics, 1981, section 7.6; for least squares it is
     chi2 by degree of freedom, Birge's ratio squared, Physical Review 40, 207, 1932). The noise is multiplied by f, the scale of
     the loss divided, so that W stays; the prior keeps its own deviations.
+
+    Args:
+      problem: of the fit.
+      residuals: of the pictures, in units of the noise, without those of a background that is black in picture and target.
     """
-    parts = [np.asarray(part, np.float64) for part in picture_residuals(unknowns, problem)]
-    counted = np.concatenate([part[np.asarray(group.weights) > 0] for part, group in zip(parts, problem.groups, strict=True)])
-    counted = counted[counted != 0]  # a background that is black in both says nothing
-    if len(counted) == 0:
+    if len(residuals) == 0:
         return problem, 1.0
-    psi, slope, weight = influence_function(counted, problem.loss, problem.loss_scale)
-    free = max(1 - problem.basis.crop(problem.basis.base).size / len(counted), 0.5)
+    psi, slope, weight = influence_function(residuals, problem.loss, problem.loss_scale)
+    free = max(1 - problem.basis.crop(problem.basis.base).size / len(residuals), 0.5)
     factor = float(np.sqrt(np.mean(psi**2) * np.mean(weight) / np.mean(slope) ** 2 / free))
     if not factor > 1:
         return problem, 1.0

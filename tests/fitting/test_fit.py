@@ -23,7 +23,8 @@ from jaxhf.fitting import loop as _loop
 from jaxhf.fitting.basis import Unknowns, balanced_units, make_basis, resample
 from jaxhf.fitting.loop import FitLoop, make_stages
 from jaxhf.fitting.options import FitOptions
-from jaxhf.fitting.problem import Prior, Problem, make_prior, make_problem
+from jaxhf.fitting.prior import Prior, make_prior
+from jaxhf.fitting.problem import Problem, make_problem
 from jaxhf.fitting.residuals import prior_residuals
 from jaxhf.fitting.robust import robust_weight, soften
 from jaxhf.fitting.solvers import Outcome

@@ -14,6 +14,7 @@ from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.problem import make_problem
+from jaxhf.fitting.residuals import picture_residuals
 from jaxhf.fitting.robust import influence_function, soften
 from jaxhf.fitting.uncertainty import with_unexplained
 from jaxhf.scene.localise import localise
@@ -97,10 +98,11 @@ def test_what_is_left_unexplained_counts_as_noise():
     rng = np.random.default_rng(0)
     measured = [picture + 0.03 * rng.standard_normal(picture.shape) for picture in pictures()]
     problem, unknowns = make_problem(scenes(TRUTH), measured, fit_options(**OPTIONS))
-    scaled, factor = with_unexplained(unknowns, problem)
+    residuals = np.ravel(picture_residuals(unknowns, problem)[0])
+    scaled, factor = with_unexplained(problem, residuals)
     assert factor == pytest.approx(3 / np.sqrt(1 - 144 / (3 * 24 * 24)), rel=0.05)
     np.testing.assert_allclose(scaled.groups[0].weights, problem.groups[0].weights / factor)
-    assert with_unexplained(unknowns, problem.with_noise(10 * problem.noise))[1] == 1
+    assert with_unexplained(problem.with_noise(10 * problem.noise), residuals / 10)[1] == 1
 
 
 def test_samples_can_be_stopped_with_what_is_there(monkeypatch):
