@@ -33,9 +33,11 @@ def compiled(base: jaxhf.Scene, settings: jaxhf.Settings, form: Callable) -> tup
         vars(module)["materialise"] = form
     jax.clear_caches()
     local = localise(base)
-    program = rendering._trace_all.lower(local, resolve_settings(settings, base), (), local_mesh(), None).compile()
+    settings = resolve_settings(settings, base)
+    frame = jax.jit(lambda local: rendering._trace_all(local, settings, (), local_mesh(), None))
+    program = frame.lower(local).compile(compiler_options=jaxhf.compiler_options())
     bodies = re.findall(r"^%?fused_computation\S* .*?\{\n(.*?)^\}", program.as_text() or "", re.M | re.S)
-    return lambda: jax.block_until_ready(program(local, None)), sum(body.count("\n") for body in bodies)
+    return lambda: jax.block_until_ready(program(local)), sum(body.count("\n") for body in bodies)
 
 
 def main() -> None:

@@ -1,12 +1,14 @@
 """What a fit chooses by itself, from what its scenes show."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
 import equinox as eqx
 
 from ..boundary.guiding import boundary_length
+from ..core.compilation import compiled
 from ..core.settings import Settings
 from ..core.types import Scalar
 from ..scene.scene import Scene
@@ -45,6 +47,6 @@ def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: boo
     return min(max(2 ** round(math.log2(_EDGE_SAMPLES_PER_PIXEL * length)), least), most)
 
 
-@eqx.filter_jit
+@functools.partial(compiled, jit=eqx.filter_jit)
 def _boundary_length(scene: Scene, settings: Settings) -> Scalar:
     return boundary_length(make_world(scene, settings), scene.camera)

@@ -1,6 +1,7 @@
 """How far a terrain is from its pictures and from what is known beforehand, in standard deviations."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from ..core.compilation import compiled
 from ..core.devices import on_every_device
 from ..rendering.render import render_each
 from ..scene.material import Matte
@@ -80,7 +82,7 @@ def heights_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "ny nx"]:
     return basis.heights(unknowns.coefficients)
 
 
-@eqx.filter_jit
+@functools.partial(compiled, jit=eqx.filter_jit)
 def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem) -> tuple[Linearised, ...]:
     still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), unknowns.view)
     pictures = tuple(

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
+from ..core.compilation import compiled
 from ..core.errors import ArgumentError, UserError
 from ..core.ray import Ray
 from ..core.settings import Settings
@@ -36,7 +37,7 @@ def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, "
     return _moved(hit, anchor(scene))
 
 
-@functools.partial(jax.jit, static_argnames=("settings",))
+@functools.partial(compiled, static_argnames=("settings",))
 def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -> Hit:
     world = make_world(scene, settings)
 
@@ -96,7 +97,7 @@ def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
     return eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(jnp.asarray(offset, hit.p.dtype), hit.p.shape))
 
 
-@functools.partial(jax.jit, static_argnames=("settings",))
+@functools.partial(compiled, static_argnames=("settings",))
 def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
     """Rays from points (n, 3), or from hits with a leading axis n; chunk after chunk of one fixed size."""
     surface = make_surface(heightfield, None, settings)

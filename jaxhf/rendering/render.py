@@ -17,6 +17,7 @@ from jaxtyping import Float
 from ..boundary.guiding import edge_sets
 from ..boundary.term import boundary_term, default_key
 from ..core.autodiff import with_tangent
+from ..core.compilation import compiled
 from ..core.devices import local_mesh, on_every_device
 from ..core.errors import ArgumentError, UserError
 from ..core.settings import Settings
@@ -134,7 +135,7 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     return lax.map(one, scenes)
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "aovs", "mesh"))
+@functools.partial(compiled, static_argnames=("settings", "aovs", "mesh"))
 def _trace_all(
     scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
 ) -> dict[str, jax.Array]:
@@ -153,9 +154,9 @@ def _trace_world(
     return outputs
 
 
-_trace_prepared = jax.jit(_trace_world, static_argnames=("aovs", "mesh"))
-_trace_tiles = jax.jit(trace_tiles, static_argnames=("mesh", "aovs"))
-_make_world = jax.jit(make_world, static_argnames=("settings",))
+_trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh"))
+_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
+_make_world = compiled(make_world, static_argnames=("settings",))
 
 
 def _trace_in_parts(

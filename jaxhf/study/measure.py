@@ -5,12 +5,12 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..core.compilation import compiled
 from ..core.machine import peak_mb
 from ..core.settings import Settings
 from ..fitting.fit import fit
@@ -82,7 +82,7 @@ class Derivative:
         def loss(heights: jax.Array, key: jax.Array) -> jax.Array:
             return jnp.sum(weights * render(scene.with_heights(heights), one.settings, key=key))
 
-        self.step = eqx.filter_jit(jax.value_and_grad(loss))
+        self.step = compiled(jax.value_and_grad(loss))
 
     def run(self, draw: int = 0) -> jax.Array:
         return jax.block_until_ready(self.step(self.heights, jax.random.key(draw)))[1]

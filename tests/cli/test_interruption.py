@@ -1,6 +1,7 @@
 """Ctrl-C ends a command whenever it comes: each time in a process of its own."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -16,10 +17,15 @@ START = "import gc, signal, sys; from jaxhf.cli.main import main\n"
 
 
 def started(script: str, *arguments: object) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-c", script, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        cwd=ROOT,
-    )  # fmt: skip
+    """A process that hears Ctrl-C, also where this one was started so that it does not (by `nohup`, or behind a shell's &)."""
+    here = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-c", script, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            cwd=ROOT,
+        )  # fmt: skip
+    finally:
+        signal.signal(signal.SIGINT, here)
 
 
 @pytest.mark.parametrize("delay", [0.02, 0.1, 0.2, 0.35, 0.6, 1.0])

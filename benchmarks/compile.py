@@ -1,0 +1,153 @@
+"""What it costs to make the programs that jaxhf runs: equations traced, lines of StableHLO, and CPU seconds by stage.
+
+Each program is made in a process of its own, without a cache. The scene is one terrain of `--heights` a side under one
+directional light, with shadows and smooth normals, 512 x 512 pixels (for the fit 128 x 128).
+"""
+
+import argparse
+import inspect
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+PROGRAMS = {
+    "frame": "a picture, 1 sample a pixel",
+    "gradient": "a picture, 4 samples, and the gradient of a loss in the heights",
+    "edges": "the same with 1e4 points on edges",
+    "linearise": "a fit's picture with its derivative, with points on edges",
+    "step": "a step of a fit, from that",
+}
+STAGES = ("trace", "lower", "compile")
+
+
+def equations(jaxpr: Any) -> Iterator[Any]:
+    """All equations of a jaxpr and of those inside."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for value in equation.params.values():
+            for inner in value if isinstance(value, (tuple, list)) else (value,):
+                inner = getattr(inner, "jaxpr", inner)
+                if hasattr(inner, "eqns"):
+                    yield from equations(inner)
+
+
+def make_scene(heights: np.ndarray, pixels: int) -> Any:
+    import jaxhf
+
+    return jaxhf.Scene(
+        [jaxhf.Object(jaxhf.Heightfield(heights))],
+        jaxhf.Perspective.look_at((0.5, -1.2, 1.1), (0.5, 0.5, 0.05), fov=45.0, width=pixels, height=pixels),
+        [jaxhf.Directional((-0.5, 0.3, 0.5))],
+    )
+
+
+def arrays_only(function: Any, *arguments: Any) -> tuple[Any, tuple[Any, ...]]:
+    """The function under `jax.jit`, of the arrays among its arguments alone, and those."""
+    import equinox as eqx
+    import jax
+
+    arrays, others = eqx.partition(arguments, eqx.is_array)
+
+    def of_arrays(*arrays: Any) -> Any:
+        return eqx.filter(function.__wrapped__(*eqx.combine(arrays, others)), eqx.is_array)
+
+    return jax.jit(of_arrays), arrays
+
+
+def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
+    """A function under `jax.jit`, and its arguments."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxhf
+    from jaxhf.io.procedural import fractal
+
+    heights = fractal([size, size], seed=3, exponent=2.4, range=(0.0, 0.15)).astype(np.float32)
+    if name in ("linearise", "step"):
+        from jaxhf.fitting import problem, residuals, solvers
+        from jaxhf.fitting.options import FitOptions
+
+        scene = make_scene(heights, 128)
+        target = np.asarray(jaxhf.render(scene))[..., 0]
+        defaults = {name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items()}
+        given: dict[str, Any] = {"settings": jaxhf.Settings(edge_samples=8192)}
+        options = FitOptions(**{name: defaults[name] for name in FitOptions.__dataclass_fields__} | given)
+        made, unknowns = problem.make_problem([scene], [target], options)
+        if name == "linearise":
+            at = residuals.heights_of(unknowns, made.basis)
+            return arrays_only(residuals._linearised, at, unknowns, made)
+        known = residuals.linearised(unknowns, made)
+        solver = solvers.make_solver(options)
+        state = solvers.init_state(solver, unknowns, known)
+        return arrays_only(solvers._advance, solver, unknowns, state, known)
+    settings = {
+        "frame": jaxhf.Settings(),
+        "gradient": jaxhf.Settings(samples=4),
+        "edges": jaxhf.Settings(samples=4, edge_samples=10_000),
+    }[name]
+    scene = make_scene(heights, 512)
+
+    def picture(heights: Any) -> Any:
+        return jaxhf.render(scene.with_heights(heights), settings)
+
+    function = picture if name == "frame" else jax.value_and_grad(lambda heights: jnp.sum(picture(heights) ** 2))
+    return jax.jit(function), (jnp.asarray(heights),)
+
+
+def measure(name: str, size: int) -> dict[str, float]:
+    import jax
+
+    import jaxhf
+
+    jax.config.update("jax_enable_compilation_cache", False)
+    function, arguments = program(name, size)
+    jax.clear_caches()
+    cost: dict[str, float] = {}
+
+    def timed(stage: str, work: Callable[[], Any]) -> Any:
+        begin = time.process_time()
+        made = work()
+        cost[stage] = time.process_time() - begin
+        return made
+
+    traced = timed("trace", lambda: function.trace(*arguments))
+    lowered = timed("lower", traced.lower)
+    begin = time.perf_counter()
+    timed("compile", lambda: lowered.compile(compiler_options=jaxhf.compiler_options()))
+    cost["wall"] = time.perf_counter() - begin
+    text = lowered.as_text()
+    return cost | {"equations": sum(1 for _ in equations(traced.jaxpr.jaxpr)), "lines": text.count("\n")}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--heights", type=int, default=256, help="a side (256)")
+    parser.add_argument("--repeats", type=int, default=3, help="processes for each program, of which the median is told (3)")
+    parser.add_argument("programs", nargs="*", help=f"out of {', '.join(PROGRAMS)} (all)")
+    parser.add_argument("--child", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        print(json.dumps(measure(options.child, options.heights)))
+        return
+    print(f"{'program':12} {'equations':>10} {'lines':>8} {'CPU s':>8} = {'trace':>7} {'lower':>7} {'compile':>8}", flush=True)
+    for name in options.programs or PROGRAMS:
+        runs = []
+        for _ in range(options.repeats):
+            command = [sys.executable, __file__, "--child", name, "--heights", str(options.heights)]
+            runs.append(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+        total = float(np.median([sum(run[stage] for stage in STAGES) for run in runs]))
+        stages = [float(np.median([run[stage] for run in runs])) for stage in STAGES]
+        print(
+            f"{name:12} {runs[0]['equations']:10} {runs[0]['lines']:8} {total:8.2f} = "
+            f"{stages[0]:7.2f} {stages[1]:7.2f} {stages[2]:8.2f}   {PROGRAMS[name]}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""Programs that are compiled in less time, wherever they are called from."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhf.core import compilation
+from jaxhf.core.compilation import compiled, compiler_options
+
+
+def test_options_are_used_at_the_top_level_alone():
+    given = []
+
+    def spied(fun, **options):
+        given.append(options)
+        return jax.jit(fun, **options)
+
+    doubled = compiled(lambda x: 2 * x, jit=spied)
+    assert given == [{}]
+    for inside in (jax.jit(doubled), jax.vmap(doubled), jax.checkpoint(doubled)):
+        np.testing.assert_array_equal(inside(jnp.ones(3)), 2)
+    assert jax.grad(doubled)(1.0) == 2
+    assert jax.jit(jax.grad(doubled))(1.0) == 2
+    assert given == [{}]
+    assert doubled(1.0) == 2
+    assert given == [{}, {"compiler_options": compiler_options()}]
+    assert compiler_options() is not None
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+    compiler_options.cache_clear()
+    monkeypatch.setattr(compilation, "_OPTIONS", {"xla_cpu_no_such_option": False})
+    try:
+        assert compiler_options() is None
+        assert compiled(lambda x: 2 * x)(1.0) == 2
+    finally:
+        compiler_options.cache_clear()
+
+
+def test_the_first_use_may_be_within_a_trace():
+    """All is imported late: here while the user's function is being traced."""
+    script = (
+        "import jax, numpy as np, jaxhf\n"
+        "def top(z):\n"
+        "    camera = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), width=4, height=4)\n"
+        "    field = jaxhf.Object(jaxhf.Heightfield(z))\n"
+        "    scene = jaxhf.Scene([field], camera, [jaxhf.Directional((0.0, 0.0, 1.0))])\n"
+        "    return jaxhf.render(scene)\n"
+        "z = np.zeros((3, 3), np.float32)\n"
+        "inside = jax.jit(top)(z)\n"
+        "from jaxhf.core import compilation\n"
+        "made = []\n"
+        "options = compilation.compiler_options\n"
+        "compilation.compiler_options = lambda: made.append(1) or options()\n"
+        "np.testing.assert_allclose(inside, top(z), rtol=1e-6)\n"
+        "assert made == [1], made\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
