@@ -61,7 +61,14 @@ def test_no_circle():
 
 def test_rays_are_batched_and_compiled_in_few_places():
     """Rays are batched where pictures, boundaries and a fit's matrix are made; two modules say what `vmap` makes of one ray."""
-    batching = {"rendering/tiles", "rendering/render", "rendering/cast", "boundary/term", "fitting/linearise"}
+    batching = {
+        "rendering/tiles",
+        "rendering/samples",
+        "rendering/render",
+        "rendering/cast",
+        "boundary/term",
+        "fitting/linearise",
+    }
     rules = {"core/masked", "trace/search"}
     for path in MODULES:
         text, name = path.read_text(), "/".join(_parts(path))

@@ -1,7 +1,7 @@
-"""The boundary term of a picture's derivative: samples of moving boundaries, drawn, traced and summed.
+"""The boundary term of a picture's derivative: samples of moving boundaries, drawn and traced.
 
-And a finer look at the pixels in which they were seen. Beside a silhouette the interior derivative is as large as one over a
-cosine, and at a shadow it ends: a few pixels hold nearly all of its error.
+And which pixels are to be sampled once more. Beside a silhouette the interior derivative is as large as one over a cosine, and
+at a shadow it ends: a few pixels hold nearly all of its error.
 """
 
 import functools
@@ -16,10 +16,8 @@ from jaxtyping import Float, Int
 
 from ..core.devices import map_over, on_every_device
 from ..core.materialise import materialise
-from ..core.sampling import sample_offset
 from ..core.settings import Settings
 from ..scene.camera import Camera
-from ..shade.radiance import radiance
 from ..trace.world import World
 from .guiding import GuidingDistribution, initial_weights, make_distribution, refined_weights
 from .jump import boundary_segment, pass_edge, radiance_jump
@@ -36,30 +34,6 @@ def default_key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Ar
     if not settings.edge_samples:
         return None
     return on_every_device(jax.random.key(0) if key is None else key, mesh)
-
-
-def boundary_term(
-    world: World, camera: Camera, key: jax.Array, mesh: Mesh, image: Float[jax.Array, "h w 3"]
-) -> Float[jax.Array, "h w 3"]:
-    """The boundary term as an image: its value is meaningless, its tangent is d(pixel)/d(scene) from moving silhouettes and
-    shadow edges, and from resampling the pixels that they cross.
-
-    Use only as `with_tangent(image, ...)`, `image` being the picture.
-    """
-    drawn = draw_boundaries(world, camera, key, mesh)
-
-    @jax.checkpoint
-    def moved_light(world: World, camera: Camera, sample: BoundarySample, flow: jax.Array):
-        x, _ = picture_point(world, camera, sample, sample.s)
-        return flow[:, 0] * x[0] + flow[:, 1] * x[1]
-
-    def chunk(seen: tuple[World, Camera], drawn: tuple[BoundarySample, jax.Array]):
-        return jax.vmap(moved_light, in_axes=(None, None, 0, 0))(*seen, *drawn)
-
-    light = map_over(mesh, chunk, (world, camera), (drawn.samples, drawn.flows)).reshape(-1, 3)
-    flat = image.reshape(-1, 3)
-    finer = _resampled(world, camera, mesh, drawn.resampled) - flat[drawn.resampled]
-    return jnp.zeros_like(flat).at[drawn.pixel].add(light).at[drawn.resampled].add(finer).reshape(image.shape)
 
 
 class Boundaries(eqx.Module):
@@ -109,30 +83,19 @@ def resampled_side(settings: Settings) -> int:
     return max(_RESAMPLED_SIDE, 2 * math.isqrt(settings.samples or 1))
 
 
-def resampled_points(camera: Camera, settings: Settings, pixel: jax.Array, sample: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The positions in the picture, x and y, of these samples of these pixels."""
-    dtype = camera.world_from_camera.dtype
-    dx, dy = sample_offset(sample, resampled_side(settings), dtype)
-    return (pixel % camera.width).astype(dtype) + dx, (pixel // camera.width).astype(dtype) + dy
+def moved_light(world: World, camera: Camera, drawn: Boundaries, mesh: Mesh) -> Float[jax.Array, "points 3"]:
+    """For each boundary sample a number whose value is meaningless; its derivative is what the boundary's moving adds to the
+    sample's pixel."""
 
+    @jax.checkpoint
+    def moved(world: World, camera: Camera, sample: BoundarySample, flow: jax.Array):
+        x, _ = picture_point(world, camera, sample, sample.s)
+        return flow[:, 0] * x[0] + flow[:, 1] * x[1]
 
-def _resampled(world: World, camera: Camera, mesh: Mesh, pixels: Int[jax.Array, " n"]) -> Float[jax.Array, "n 3"]:
-    """The radiance of pixels, as the mean over many samples each."""
-    settings = world.settings
-    side = resampled_side(settings)
-    together = min(max(settings.chunk // side**2, 1), pixels.shape[0])
-    samples = jnp.arange(side * side, dtype=jnp.int32)
+    def chunk(seen: tuple[World, Camera], drawn: tuple[BoundarySample, jax.Array]):
+        return jax.vmap(moved, in_axes=(None, None, 0, 0))(*seen, *drawn)
 
-    def one(world: World, camera: Camera, pixel: jax.Array, sample: jax.Array) -> jax.Array:
-        ray = camera.ray(*resampled_points(camera, world.settings, pixel, sample))
-        return radiance(world, materialise(ray))[0]
-
-    def chunk(seen: tuple[World, Camera], pixels: jax.Array) -> jax.Array:
-        light = jax.vmap(functools.partial(one, *seen))(jnp.repeat(pixels, side * side), jnp.tile(samples, together))
-        return light.reshape(together, side * side, 3).mean(1)
-
-    chunks = jnp.pad(pixels, (0, -pixels.shape[0] % together), mode="edge").reshape(-1, together)
-    return map_over(mesh, chunk, (world, camera), chunks).reshape(-1, 3)[: pixels.shape[0]]
+    return map_over(mesh, chunk, (world, camera), (drawn.samples, drawn.flows)).reshape(-1, 3)
 
 
 def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks: int, size: int):

@@ -22,6 +22,11 @@ def _untraced(fun: Callable[[], Any]) -> Any:
 _TOP_LEVEL = _untraced(get_opaque_trace_state)  # this module may be imported in the midst of a user's `jax.jit`
 
 
+def is_traced() -> bool:
+    """Whether JAX is tracing or transforming what calls this."""
+    return get_opaque_trace_state() != _TOP_LEVEL
+
+
 @functools.cache
 def compiler_options() -> dict[str, Any] | None:
     """What `jax.jit` takes as `compiler_options`, so that a program of jaxhf's compiles in less time.
@@ -53,6 +58,6 @@ def compiled(fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, **optio
 
     @functools.wraps(fun)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return (alone() if get_opaque_trace_state() == _TOP_LEVEL else inside)(*args, **kwargs)
+        return (inside if is_traced() else alone())(*args, **kwargs)
 
     return call

@@ -20,13 +20,12 @@ from jaxtyping import Bool, Float, Int
 
 from ..boundary.guiding import edge_sets
 from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
-from ..boundary.term import Boundaries, default_key, draw_boundaries, resampled_points, resampled_side
+from ..boundary.term import default_key, draw_boundaries
 from ..core.autodiff import with_tangent
 from ..core.devices import map_over, on_every_device
 from ..core.materialise import materialise
-from ..core.sampling import sample_offset
 from ..core.settings import Settings
-from ..rendering.tiles import Tiling
+from ..rendering.samples import PictureSamples
 from ..scene.camera import Camera
 from ..scene.scene import Scene
 from ..shade.radiance import direct, has_mirrors
@@ -129,24 +128,23 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int, stil
     drawn = None
     if key is not None and edge_sets(world):
         drawn = draw_boundaries(world, camera, key, mesh, math.ceil((world.settings.edge_samples or 0) / _POINTS_PER_PIXEL))
-    points = _sample_points(camera, world.settings)
-    if drawn is not None:
-        points = _in_a_row(points, _resampled_points(camera, world.settings, drawn))
-    light, slopes, vertices, view = map_over(mesh, functools.partial(_samples, channels), (world, camera, still), points)
-    image, edges = _in_pixels(light, camera, world.settings), None
-    sampling = _in_pixels(light, camera, world.settings, _sampling_error)
+    samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
+    sampled = functools.partial(_samples, channels)
+    light, slopes, vertices, view = map_over(mesh, sampled, (world, camera, still), samples.positions())
+    image, edges = samples.in_pixels(light), None
+    sampling = samples.in_pixels(light, _sampling_error)
     if drawn is not None:
         followed = functools.partial(_boundary_samples, channels)
         edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, (world, camera, still), (drawn.samples, drawn.flows))
         kind = jnp.where(drawn.samples.valid, jnp.where(drawn.samples.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
         edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled, edge_view)
-        finer = _resampled(light, edges, camera, world.settings)
+        finer = samples.of_resampled(light)
         image, sampling = (
             known.reshape(-1, channels).at[drawn.resampled].set(new, unique_indices=True).reshape(image.shape)
             for known, new in ((image, finer.mean(1)), (sampling, _sampling_error(finer)))
         )
     moving = (slopes != 0).any(axis=(1, 2)).astype(light.dtype)[..., None]
-    depends = _in_pixels(moving, camera, world.settings)[..., 0] > 0
+    depends = samples.in_pixels(moving)[..., 0] > 0
     return Linearised(image, depends, jnp.sqrt(jnp.mean(sampling * sampling, axis=-1)), slopes, vertices, edges, view)
 
 
@@ -168,10 +166,11 @@ def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) ->
     numbers = motion(scene.lights, scene.camera, known.view)
     of_samples = _product(mesh, at_vertices, known.slopes, known.vertices)
     of_samples = _with_view(of_samples, known.view, numbers)
-    change = _in_pixels(of_samples, scene.camera, settings)
+    samples = PictureSamples(scene.camera, settings, None if known.edges is None else known.edges.resampled)
+    change = samples.in_pixels(of_samples)
     if known.edges is not None:
         edges, flat = known.edges, change.reshape(-1, change.shape[-1])
-        finer = _resampled(of_samples, edges, scene.camera, settings).mean(1)
+        finer = samples.of_resampled(of_samples).mean(1)
         heights = at_vertices[:, 0].at[edges.vertices].get(mode="promise_in_bounds")
         light = jnp.moveaxis(jnp.sum(edges.slopes * heights[:, None], axis=2), 1, -1)
         light = _with_view(light, edges.view, numbers)
@@ -188,61 +187,8 @@ def _with_view(change: Float[jax.Array, "chunks n c"], slopes: View, numbers: Vi
     return change
 
 
-def _in_pixels(
-    values: Float[jax.Array, "chunks n c"],
-    camera: Camera,
-    settings: Settings,
-    summary: Callable[[jax.Array], jax.Array] = lambda values: jnp.mean(values, axis=1),
-) -> Float[jax.Array, "h w c"]:
-    """The means over the samples of each pixel, or another summary of theirs."""
-    tiling, samples = Tiling(camera, settings), settings.samples
-    assert samples is not None
-    tiles = values[: tiling.count * samples].reshape(tiling.count, samples, *values.shape[1:])
-    pixels = jnp.moveaxis(tiles, 1, 2).reshape(-1, samples, values.shape[-1])
-    return tiling.assemble(summary(pixels).reshape(tiling.count, *values.shape[1:]))
-
-
-def _resampled(
-    values: Float[jax.Array, "chunks n c"], edges: LinearisedEdges, camera: Camera, settings: Settings
-) -> Float[jax.Array, "pixels samples c"]:
-    """The samples of the pixels that are resampled."""
-    tiling, samples = Tiling(camera, settings), settings.samples
-    assert samples is not None
-    shape = (edges.resampled.shape[0], resampled_side(settings) ** 2)
-    return values[tiling.count * samples :].reshape(-1, values.shape[-1])[: shape[0] * shape[1]].reshape(*shape, -1)
-
-
 def _channels(light: Float[jax.Array, "*rest 3"], channels: int) -> Float[jax.Array, "*rest c"]:
     return light if channels == 3 else jnp.mean(light, axis=-1, keepdims=True)
-
-
-def _in_a_row(*parts: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-    return tuple(jnp.concatenate(arrays) for arrays in zip(*parts, strict=True))
-
-
-def _sample_points(camera: Camera, settings: Settings) -> tuple[jax.Array, ...]:
-    """The positions of all samples in the picture, x and y, (chunks, n) each, tile by tile."""
-    tiling, dtype = Tiling(camera, settings), camera.world_from_camera.dtype
-    assert settings.samples is not None
-    pixels = jax.vmap(tiling.pixels)(jnp.arange(tiling.count, dtype=jnp.int32))
-    offsets = sample_offset(jnp.arange(settings.samples, dtype=jnp.int32), math.isqrt(settings.samples), dtype)
-    size = tiling.side * tiling.side
-    return tuple(
-        (pixel.astype(dtype)[:, None, :] + offset[None, :, None]).reshape(-1, size)
-        for pixel, offset in zip(pixels, offsets, strict=True)
-    )
-
-
-def _resampled_points(camera: Camera, settings: Settings, boundaries: Boundaries) -> tuple[jax.Array, ...]:
-    """The same for the pixels that are resampled, one after the other."""
-    size = Tiling(camera, settings).side ** 2
-    samples = resampled_side(settings) ** 2
-    repeated = jnp.repeat(boundaries.resampled, samples)
-    numbers = jnp.tile(jnp.arange(samples, dtype=jnp.int32), boundaries.resampled.shape[0])
-    return tuple(
-        jnp.pad(values, (0, -values.shape[0] % size), mode="edge").reshape(-1, size)
-        for values in resampled_points(camera, settings, repeated, numbers)
-    )
 
 
 def _samples(channels: int, seen: tuple[World, Camera, View], points: tuple[jax.Array, ...]):

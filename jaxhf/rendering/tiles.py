@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.sharding import Mesh
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from ..core.devices import map_over
 from ..core.materialise import materialise
@@ -53,32 +53,30 @@ def trace_tiles(
 
 def _trace_tile(world: World, camera: Camera, aovs: tuple[str, ...], tile: jax.Array) -> dict[str, jax.Array]:
     dtype = camera.world_from_camera.dtype
-
-    def one(x: jax.Array, y: jax.Array) -> dict[str, jax.Array]:
-        image, exhausted = _pixel(world, camera, x, y)
-        outputs = {"image": image}
-        if aovs:
-            outputs |= observe(world, camera.ray(x + 0.5, y + 0.5), aovs)
-        if "exhausted" in aovs:
-            outputs["exhausted"] = exhausted
-        return outputs
-
-    columns, rows = Tiling(camera, world.settings).pixels(tile)
-    return jax.vmap(one)(columns.astype(dtype), rows.astype(dtype))
+    columns, rows = (place.astype(dtype) for place in Tiling(camera, world.settings).pixels(tile))
+    image, exhausted = _pixels(world, camera, columns, rows)
+    outputs = {"image": image}
+    if aovs:
+        outputs |= jax.vmap(lambda x, y: observe(world, camera.ray(x + 0.5, y + 0.5), aovs))(columns, rows)
+    if "exhausted" in aovs:
+        outputs["exhausted"] = exhausted
+    return outputs
 
 
-def _pixel(world: World, camera: Camera, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The mean over the samples of the pixel whose top left corner is (x, y), and how many walks ran out of steps."""
+def _pixels(
+    world: World, camera: Camera, x: Float[jax.Array, " n"], y: Float[jax.Array, " n"]
+) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
+    """The means over the samples of the pixels whose top left corners are (x, y), and how many walks ran out of steps."""
     assert world.settings.samples is not None
     side = math.isqrt(world.settings.samples)
 
-    def sample(k, sums):
+    def sample(k: Int[jax.Array, ""]) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
         dx, dy = sample_offset(k, side, x.dtype)
-        light, exhausted = radiance(world, materialise(camera.ray(x + dx, y + dy)))
-        return sums[0] + light, sums[1] + exhausted
+        return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x + dx, y + dy))))(x, y)
 
-    sums = (jnp.zeros(3, x.dtype), jnp.zeros((), jnp.int32))
     if side == 1:
-        return sample(jnp.zeros((), jnp.int32), sums)
-    total, exhausted = lax.fori_loop(0, side * side, sample, sums)
+        return sample(jnp.zeros((), jnp.int32))
+    # The loop is round `vmap`, not within: else its body would be traced once for one ray and once more for the batch.
+    sums = (jnp.zeros((x.shape[0], 3), x.dtype), jnp.zeros(x.shape, jnp.int32))
+    total, exhausted = lax.fori_loop(0, side * side, lambda k, sums: jax.tree.map(jnp.add, sums, sample(k)), sums)
     return total / (side * side), exhausted
