@@ -12,7 +12,8 @@ from ..scene.light import Point, Sky
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit
 from ..trace.intersect import intersect
-from ..trace.world import World, first_hit, nearest_hit, no_hit, unblocked
+from ..trace.status import Status
+from ..trace.world import World, nearest_hit, no_hit
 from .sample import BoundarySample, between_ends, on_edge
 
 # Other surfaces are looked for beside the edge and from a little before it, so that those that share a border with the edge's
@@ -129,23 +130,61 @@ def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
     return (x == ix) & (y == iy) & jnp.isfinite(z[y, x] + z[y, x + 1] + z[y + 1, x] + z[y + 1, x + 1])
 
 
-def unblocked_source(world: World, fold: Fold, active: Flag) -> Flag:
-    """Whether nothing stands between the edge and the source."""
-    return unblocked(world, Ray(fold.past.o, -fold.past.d), fold.near, active, fold.distance)[0]
+class Probe(eqx.Module):
+    """A ray from a hit, and how far it looks.
 
-
-def hit_beyond(world: World, sample: BoundarySample, fold: Fold, active: Flag) -> Hit:
-    """What the ray past the edge meets next, seen from the edge.
-
-    t counts from the edge. Of another surface that touches the edge there it is between -`back` and `back`.
+    Attributes:
+      ray: by which the edge's own surface is met.
+      beside: by which others are; it begins `back` earlier. None where there are no others.
+      back: in the units of the rays.
+      leaving: the hit.
+      active: whether it looks at all.
+      t_max: how far.
     """
+
+    ray: Ray
+    beside: Ray | None
+    back: Scalar
+    leaving: Hit
+    active: Flag
+    t_max: Scalar
+
+
+def probe(world: World, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar) -> Probe:
+    """One that meets all surfaces by the same ray."""
+    return Probe(ray, ray if len(world.surfaces) > 1 else None, jnp.zeros_like(t_max), leaving, active, t_max)
+
+
+def probe_source(world: World, fold: Fold, active: Flag) -> Probe:
+    """From the edge to the source."""
+    return probe(world, Ray(fold.past.o, -fold.past.d), fold.near, active, fold.distance)
+
+
+def probe_beyond(world: World, fold: Fold, active: Flag) -> Probe:
+    """Past the edge. Another surface that touches the edge there is met at a t between -`back` and `back`."""
     leaving = eqx.tree_at(lambda hit: hit.side, fold.ahead, -fold.source_side)
-    if len(world.surfaces) == 1:
-        return first_hit(world, fold.past, leaving, active)
+    beside = fold.beside if len(world.surfaces) > 1 else None
+    return Probe(fold.past, beside, fold.back, leaving, active, jnp.full_like(fold.back, jnp.inf))
+
+
+def meet(world: World, sample: BoundarySample, probe: Probe) -> tuple[Hit, Flag]:
+    """What a probe meets, t counted from the start of its `ray`; and whether an active one meets nothing before its `t_max`."""
     hits = []
     for number, surface in enumerate(world.surfaces):
-        own = sample.surface == number
-        ray = jax.tree.map(lambda a, b, own=own: jnp.where(own, a, b), fold.past, fold.beside)
-        hit = intersect(surface, number, ray, max_steps=world.settings.max_steps, leaving=leaving, active=active)
-        hits.append(eqx.tree_at(lambda hit: hit.t, hit, hit.t - jnp.where(own, 0, fold.back)))
-    return nearest_hit(hits)
+        ray, back = probe.ray, None
+        if probe.beside is not None:
+            own = sample.surface == number
+            ray = jax.tree.map(lambda a, b, own=own: jnp.where(own, a, b), probe.ray, probe.beside)
+            back = jnp.where(own, 0, probe.back)
+        hit = intersect(
+            surface,
+            number,
+            ray,
+            max_steps=world.settings.max_steps,
+            leaving=probe.leaving,
+            active=probe.active,
+            t_max=probe.t_max if back is None else probe.t_max + back,
+        )
+        hits.append(hit if back is None else eqx.tree_at(lambda hit: hit.t, hit, hit.t - back))
+    hit = nearest_hit(hits)
+    return hit, probe.active & ~((hit.status == int(Status.HIT)) & (hit.t < probe.t_max))

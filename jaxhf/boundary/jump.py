@@ -8,8 +8,10 @@ its edge: a jump belongs to the edge, or there is none.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from ..core.masked import only_where
+from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
 from ..core.vector import dot
@@ -18,8 +20,8 @@ from ..shade.radiance import radiance_from, shadowed_radiance
 from ..trace.hit import Hit
 from ..trace.intersect import hit_on_triangle
 from ..trace.status import Status
-from ..trace.world import World, unblocked
-from .fold import Fold, fold_at, hit_beyond, towards, unblocked_source
+from ..trace.world import World, no_hit
+from .fold import Fold, Probe, fold_at, meet, probe, probe_beyond, probe_source, towards
 from .sample import BoundarySample, picture_point
 
 
@@ -60,26 +62,48 @@ def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[Bou
       source nor, for a shadow, its place from the eye. And the passage.
     """
     fold = fold_at(world, camera, sample)
-    casts = sample.light >= 0
-    free = unblocked_source(world, fold, sample.valid & (fold.bends | ~casts))
-    beyond = hit_beyond(world, sample, fold, free & fold.bends)
-    # On a surface that touches the edge, or shares it as a border, no shadow begins there.
-    contact = jnp.where(beyond.object == sample.surface, 0, fold.back)
-    falls = casts & free & (beyond.status == int(Status.HIT)) & (beyond.t > contact)
-    valid = jnp.where(casts, only_where(falls, _seen, world, camera, beyond, falls), free)
+    casts, never = sample.light >= 0, jnp.zeros((), bool)
+
+    def to_source(free: Flag, beyond: Hit) -> Probe:
+        return probe_source(world, fold, sample.valid & (fold.bends | ~casts))
+
+    def past_edge(free: Flag, beyond: Hit) -> Probe:
+        return probe_beyond(world, fold, free & fold.bends)
+
+    def to_eye(free: Flag, beyond: Hit) -> Probe:
+        """From the side of the place from which it was met."""
+        to, distance = towards(world, camera, jnp.full((), -1, jnp.int32), beyond.p)
+        faces = dot(to, beyond.n) * beyond.side.astype(to.dtype) > 0
+        return probe(world, Ray(beyond.p, to), beyond, _falls(sample, fold, free, beyond) & faces, distance)
+
+    def look(known: tuple[Flag, Hit, Flag], number: Index) -> tuple[tuple[Flag, Hit, Flag], None]:
+        free, beyond, _ = known
+        hit, clear = meet(world, sample, lax.switch(number, [to_source, past_edge, to_eye], free, beyond))
+        beyond = jax.tree.map(lambda new, old: jnp.where(number == 1, new, old), hit, beyond)
+        return (jnp.where(number == 0, clear, free), beyond, clear), None
+
+    # One walk in the compiled program, not three.
+    known = never, no_hit(sample.s.dtype), never
+    (free, beyond, seen), _ = lax.scan(look, known, jnp.arange(3, dtype=jnp.int32))
+    falls = _falls(sample, fold, free, beyond)
     sample = eqx.tree_at(
         lambda sample: (sample.valid, sample.receiver, sample.cell, sample.upper, sample.t),
         sample,
-        (valid, jnp.maximum(beyond.object, 0), beyond.cell, beyond.triangle == 1, jnp.where(falls, beyond.t, 0)),
+        (
+            jnp.where(casts, seen, free),
+            jnp.maximum(beyond.object, 0),
+            beyond.cell,
+            beyond.triangle == 1,
+            jnp.where(falls, beyond.t, 0),
+        ),
     )
     return sample, Passage(fold, beyond)
 
 
-def _seen(world: World, camera: Camera, hit: Hit, active: Flag) -> Flag:
-    """Whether the eye sees the hit on the side from which it was met."""
-    to, distance = towards(world, camera, jnp.full((), -1, jnp.int32), hit.p)
-    faces = dot(to, hit.n) * hit.side.astype(to.dtype) > 0
-    return unblocked(world, Ray(hit.p, to), hit, active & faces, distance)[0]
+def _falls(sample: BoundarySample, fold: Fold, free: Flag, beyond: Hit) -> Flag:
+    """Whether a shadow begins at the hit beyond: not on a surface that touches the edge, or shares it as a border."""
+    contact = jnp.where(beyond.object == sample.surface, 0, fold.back)
+    return (sample.light >= 0) & free & (beyond.status == int(Status.HIT)) & (beyond.t > contact)
 
 
 def boundary_segment(world: World, camera: Camera, sample: BoundarySample, fold: Fold) -> BoundarySegment:
@@ -88,7 +112,7 @@ def boundary_segment(world: World, camera: Camera, sample: BoundarySample, fold:
     def position(s: Scalar) -> tuple[Point2, Flag]:
         return picture_point(world, camera, sample, s)
 
-    x, along, valid = jax.jvp(position, (sample.s,), (jnp.ones_like(sample.s),), has_aux=True)
+    x, along, valid = materialise(jax.jvp(position, (sample.s,), (jnp.ones_like(sample.s),), has_aux=True))
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
     # Of what would cross the whole picture within less than the rounding of s, no position is known.
     valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)

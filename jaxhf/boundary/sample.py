@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from ..core.affine import affine
+from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
@@ -94,8 +95,8 @@ def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u
     )  # fmt: skip
     # Of an edge that is seen where it stands, only the part in the frame is drawn from.
     film = camera.film_from_world()
-    a, b = (film(on_edge(world, point, jnp.full((), end, dtype))) for end in (0, 1))
-    first, last = framed_part(camera, a, b)
+    a, b = materialise(tuple(film(on_edge(world, point, jnp.full((), end, dtype))) for end in (0, 1)))
+    first, last = materialise(framed_part(camera, a, b))
     stands = light < 0
     first, last = jnp.where(stands, first, 0), jnp.where(stands, last, 1)
     return eqx.tree_at(
@@ -212,12 +213,12 @@ def picture_point(
     In every leaf of the scene, and in s while the shadow stays in its triangle; in `perturbation`, which is added to the
     heights at its `deciding_vertices`.
     """
-    p = on_edge(world, point, s, offset, perturbation)
+    p = materialise(on_edge(world, point, s, offset, perturbation))
     if any(edges.light is not None for edges in edge_sets(world)):
         p = jnp.where(point.light >= 0, _fallen(world, point, p, perturbation), p)
     # Of a point that does not count, the position may be larger than any number, and its derivative, times zero, none.
     ahead = affine(jnp.asarray(camera.world_from_camera)).point(jnp.array([0, 0, 1], p.dtype))
-    at = camera.film_from_world()(jnp.where(point.valid, p, lax.stop_gradient(ahead)))
+    at = materialise(camera.film_from_world()(materialise(jnp.where(point.valid, p, lax.stop_gradient(ahead)))))
     before = (at[2] > 0) & (at[3] > 0)
     x = at[:2] / jnp.where(before, at[2], 1)
     size = jnp.array([camera.width, camera.height], x.dtype)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
+from ..core.materialise import materialise
 from ..core.types import Vector
 from ..scene.camera import Camera
 from ..trace.grid import Grid
@@ -102,8 +103,8 @@ def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
     def seen(row: int) -> jax.Array:
         return film.linear[row, 0] * x + film.linear[row, 1] * y + film.linear[row, 2] * z + film.offset[row]
 
-    a, b = zip(*(_ends(seen(row)) for row in range(4)), strict=True)
-    first, last = framed_part(camera, a, b)
+    a, b = zip(*(_ends(row) for row in materialise([seen(row) for row in range(4)])), strict=True)
+    first, last = materialise(framed_part(camera, a, b))
     w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
     ends = [
         tuple((a[k] + s * (b[k] - a[k])) / jnp.where(w > 0, w, 1) for k in (0, 1))

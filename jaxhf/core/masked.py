@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.extend.core import jaxpr_as_fun
 
 from .types import Flag
 
@@ -24,21 +23,21 @@ def only_where(needed: Flag, fun: Callable[..., Any], *args: Any) -> Any:
       args: pytrees of arrays.
     """
 
+    once = jax.jit(fun)
+
     @jax.custom_batching.custom_vmap
     def run(needed: jax.Array, args: tuple[Any, ...]) -> Any:
-        return fun(*args)
+        return once(*args)
 
     @run.def_vmap
     def run_many(axis_size: int, in_batched: Any, needed: jax.Array, args: tuple[Any, ...]) -> Any:
         batched, shared = eqx.partition(args, in_batched[1])
-        many = jax.vmap(lambda batched: fun(*eqx.combine(batched, shared)), axis_size=axis_size)
-        traced, shapes = jax.make_jaxpr(many, return_shape=True)(batched)  # once, for its shapes and for the conditional
-        leaves, structure = jax.tree.flatten(shapes)
+        many = jax.jit(jax.vmap(lambda batched: once(*eqx.combine(batched, shared)), axis_size=axis_size))
+        shapes = jax.eval_shape(many, batched)
 
-        def nothing(*_: Any) -> list[jax.Array]:
-            return [jnp.zeros(leaf.shape, leaf.dtype) for leaf in leaves]
+        def nothing(_: Any) -> Any:
+            return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-        result = lax.cond(needed.any(), jaxpr_as_fun(traced), nothing, *jax.tree.leaves(batched))
-        return jax.tree.unflatten(structure, result), jax.tree.map(lambda _: True, shapes)
+        return lax.cond(needed.any(), many, nothing, batched), jax.tree.map(lambda _: True, shapes)
 
     return run(needed, args)

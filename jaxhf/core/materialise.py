@@ -16,12 +16,7 @@ def materialise(tree: Any) -> Any:
     true at run time, but unknown to the compiler. With this at the borders of the stages a scene with three objects takes
     between a quarter and a ninth of the time (docs/performance.md).
     """
-    leaves, structure = jax.tree.flatten(tree)
-
-    def kept(*leaves: Any) -> tuple[Any, ...]:
-        opaque_true = lax.optimization_barrier(jnp.ones((), bool))
-        return lax.cond(
-            opaque_true, lambda *leaves: leaves, lambda *leaves: tuple(jnp.zeros_like(leaf) for leaf in leaves), *leaves
-        )
-
-    return jax.tree.unflatten(structure, lax.platform_dependent(*leaves, cpu=kept, default=lambda *leaves: leaves))
+    if jax.default_backend() != "cpu":  # `lax.platform_dependent` would have both forms traced and differentiated
+        return tree
+    opaque_true = lax.optimization_barrier(jnp.ones((), bool))
+    return lax.cond(opaque_true, lambda tree: tree, lambda tree: jax.tree.map(jnp.zeros_like, tree), tree)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
+from ..core.autodiff import recomputed
 from ..core.compilation import compiled
 from ..core.errors import ArgumentError, UserError
 from ..core.ray import Ray
@@ -116,5 +117,5 @@ def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, 
         tail = leaf.shape[1:]
         return jnp.pad(leaf, ((0, count * chunk - rays), *((0, 0) for _ in tail))).reshape(count, chunk, *tail)
 
-    hits = lax.map(jax.vmap(one), jax.tree.map(chunked, (start, d)))
+    hits = lax.map(recomputed(jax.vmap(one)), jax.tree.map(chunked, (start, d)))
     return jax.tree.map(lambda leaf: leaf.reshape(count * chunk, *leaf.shape[2:])[:rays], hits)

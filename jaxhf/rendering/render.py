@@ -20,16 +20,14 @@ from ..core.autodiff import with_tangent
 from ..core.compilation import compiled, is_traced
 from ..core.devices import local_mesh, map_over, on_every_device
 from ..core.errors import ArgumentError, UserError
-from ..core.materialise import materialise
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.localise import localise, localise_camera
 from ..scene.scene import Scene
-from ..shade.radiance import radiance
 from ..trace.world import World, make_world, resolve_settings
 from .aovs import AOVS
 from .samples import PictureSamples
-from .tiles import Tiling, trace_tiles
+from .tiles import Tiling, light_along, trace_tiles
 
 
 class Prepared(eqx.Module):
@@ -173,12 +171,8 @@ def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, 
     program compiled for 7 s longer. So they are traced also where nothing is differentiated.
     """
 
-    def chunk(seen: tuple[World, Camera], points: tuple[jax.Array, jax.Array]) -> jax.Array:
-        world, camera = seen
-        return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y)))[0])(*points)
-
     samples = PictureSamples(camera, world.settings, drawn.resampled)
-    light = map_over(mesh, chunk, (world, camera), samples.positions())
+    light = map_over(mesh, lambda seen, points: light_along(*seen, *points)[0], (world, camera), samples.positions())
     image = samples.in_pixels(light)
     finer = samples.of_resampled(light).mean(1)
     light = moved_light(world, camera, drawn, mesh)

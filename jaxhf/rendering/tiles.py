@@ -9,6 +9,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
+from ..core.autodiff import recomputed
 from ..core.devices import map_over
 from ..core.materialise import materialise
 from ..core.sampling import sample_offset
@@ -51,6 +52,14 @@ def trace_tiles(
     return map_over(mesh, lambda seen, tile: _trace_tile(seen[0], seen[1], aovs, tile), (world, camera), tiles)
 
 
+@recomputed
+def light_along(
+    world: World, camera: Camera, x: Float[jax.Array, " n"], y: Float[jax.Array, " n"]
+) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
+    """The radiance of samples at these positions in the picture, and how many of each one's walks ran out of steps."""
+    return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y))))(x, y)
+
+
 def _trace_tile(world: World, camera: Camera, aovs: tuple[str, ...], tile: jax.Array) -> dict[str, jax.Array]:
     dtype = camera.world_from_camera.dtype
     columns, rows = (place.astype(dtype) for place in Tiling(camera, world.settings).pixels(tile))
@@ -72,7 +81,7 @@ def _pixels(
 
     def sample(k: Int[jax.Array, ""]) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
         dx, dy = sample_offset(k, side, x.dtype)
-        return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x + dx, y + dy))))(x, y)
+        return light_along(world, camera, x + dx, y + dy)
 
     if side == 1:
         return sample(jnp.zeros((), jnp.int32))

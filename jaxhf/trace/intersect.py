@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..core.autodiff import stored
 from ..core.masked import only_where
 from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
@@ -36,6 +37,7 @@ def intersect(
     max_steps: int | None,
     leaving: Hit | None = None,
     active: Flag | None = None,
+    t_max: Scalar | None = None,
     count_steps: bool = False,
 ) -> Hit:
     """The first hit of a world-frame ray on one surface.
@@ -48,6 +50,7 @@ def intersect(
       leaving: the hit from which the ray starts, on this surface or on another one, see `first_triangle`; None for rays that
         start in free space.
       active: False spares the ray the search: it ends as a miss.
+      t_max: where the search may give up: a hit beyond it may or may not be found.
       count_steps: whether to count the steps of the search.
     """
     valid = finite(ray.o) & finite(ray.d)
@@ -57,9 +60,16 @@ def intersect(
         return materialise(cylinder_hit(surface, ray, left, number, active, count_steps))
     local, scale = _in_grid(surface, ray)
     found = first_triangle(
-        surface, local, max_steps=max_steps, active=active, leaving=leaving, number=number, count_steps=count_steps
+        surface,
+        local,
+        max_steps=max_steps,
+        active=active,
+        leaving=leaving,
+        number=number,
+        t_max=None if t_max is None else t_max * scale,
+        count_steps=count_steps,
     )
-    return surface_hit(surface, number, local, scale, materialise(found))
+    return surface_hit(surface, number, local, scale, stored(materialise(found)))
 
 
 def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
@@ -92,7 +102,7 @@ def blocked(
     if t_max is not None:
         plane = triangle_plane(grid, found.ix, found.iy, found.upper)
         met = met & (plane_distance(plane, local, found) < t_max)
-    return met, found.status == int(Status.EXHAUSTED)
+    return stored((met, found.status == int(Status.EXHAUSTED)))
 
 
 def leave(grid: Grid, number: int, hit: Hit, d: Vector) -> tuple[Ray, Hit]:

@@ -1,0 +1,70 @@
+"""How large the programs are that are traced: each equation is compiled, and compiling is what users wait for.
+
+The bounds are a few per cent above what there is. Whoever passes one should know why, and what it costs:
+`python benchmarks/compile.py`.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxhf
+
+HEIGHTS = np.random.default_rng(0).uniform(0, 0.1, (17, 17)).astype(np.float32)
+SCENE = jaxhf.Scene(
+    [jaxhf.Object(jaxhf.Heightfield(HEIGHTS))],
+    jaxhf.Perspective.look_at((0.5, -1.2, 1.1), (0.5, 0.5, 0.05), fov=45.0, width=64, height=32),
+    [jaxhf.Directional((-0.5, 0.3, 0.5))],
+)
+
+
+def inner(equation: Any) -> Iterator[Any]:
+    for value in equation.params.values():
+        for found in value if isinstance(value, (tuple, list)) else (value,):
+            jaxpr = getattr(found, "jaxpr", found)
+            if hasattr(jaxpr, "eqns"):
+                yield jaxpr
+
+
+def equations(jaxpr: Any) -> Iterator[Any]:
+    """All of them, those of inner programs included."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for part in inner(equation):
+            yield from equations(part)
+
+
+def traced(settings: jaxhf.Settings, transform: Callable[..., Any]) -> list[Any]:
+    def loss(heights: jax.Array) -> jax.Array:
+        return jnp.sum(jaxhf.render(SCENE.with_heights(heights), settings) ** 2)
+
+    return list(equations(jax.make_jaxpr(transform(loss))(HEIGHTS).jaxpr))
+
+
+@pytest.mark.parametrize(
+    ("settings", "transform", "bound"),
+    [
+        (jaxhf.Settings(), lambda loss: loss, 3750),
+        (jaxhf.Settings(samples=4), jax.value_and_grad, 4750),
+        (jaxhf.Settings(samples=4, edge_samples=1000), jax.value_and_grad, 14000),
+    ],
+    ids=["frame", "gradient", "edges"],
+)
+def test_programs_stay_small(settings, transform, bound):
+    count = len(traced(settings, transform))
+    assert 0.9 * bound < count < bound
+
+
+def test_a_gradient_stores_little_of_each_sample():
+    """Of each sample only what its walks found is stored for the way back; its shading is computed again."""
+    stored = [
+        sum(leaf.aval.size for leaf in equation.outvars)
+        for equation in traced(jaxhf.Settings(samples=4), jax.value_and_grad)
+        if equation.primitive.name == "scan" and equation.params["length"] == 4
+    ]
+    assert stored
+    assert max(stored) < 12 * 4 * 1024  # numbers, of 4 samples of 1024 pixels
