@@ -65,15 +65,22 @@ def add_machine(command: argparse.ArgumentParser) -> None:
         "--devices", type=int, metavar="N", help="cores that share the work, each with a copy [all, at most 16]"
     )
     command.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
+    command.add_argument(
+        "--no-cache", dest="cache", action="store_false",
+        help="keep no compiled programs for the next run [kept in the folder JAXHF_CACHE, by default one in the user's cache "
+        "folder; JAXHF_CACHE=off: keep none]",
+    )  # fmt: skip
 
 
-def set_up_jax(precision: str, devices: int | None) -> None:
+def set_up_jax(options: argparse.Namespace) -> None:
     """Configures JAX by the options of `add_machine`, which can only be done before its first use."""
     import jax
 
     from ..core.machine import default_devices
+    from .cache import keep_programs
 
-    if devices is not None and devices < 1:
-        raise UserError(f"--devices must be a whole number from 1 on, it is {devices}")
-    jax.config.update("jax_enable_x64", precision == "float64")
-    jax.config.update("jax_num_cpu_devices", devices or default_devices())
+    if options.devices is not None and options.devices < 1:
+        raise UserError(f"--devices must be a whole number from 1 on, it is {options.devices}")
+    jax.config.update("jax_enable_x64", options.precision == "float64")
+    jax.config.update("jax_num_cpu_devices", options.devices or default_devices())
+    keep_programs(options.cache)

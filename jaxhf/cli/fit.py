@@ -26,7 +26,7 @@ def add(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> None:
     outputs = Outputs(Path(options.output), Path(options.report) if options.report else None, options.resume)
-    arguments.set_up_jax(options.precision, options.devices)
+    arguments.set_up_jax(options)
     print(fit_file(options.case, outputs, options.precision))
 
 

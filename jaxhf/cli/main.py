@@ -22,7 +22,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides
-            warnings.showwarning = lambda message, *_, **__: print(f"jaxhf: warning: {message}", file=sys.stderr)
+            warnings.showwarning = lambda message, *_, **__: print(
+                f"jaxhf: warning: {' '.join(str(message).split())}", file=sys.stderr
+            )
             options.run(options)
     except KeyboardInterrupt as stopped:
         print(f"\njaxhf: {str(stopped) or 'interrupted'}", file=sys.stderr)

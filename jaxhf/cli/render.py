@@ -40,7 +40,7 @@ def draw(options: argparse.Namespace, load: "Callable[[], Scene]", **saving: Any
 
     require_writable(options.output)
     settings = arguments.settings(options)
-    arguments.set_up_jax(options.precision, options.devices)
+    arguments.set_up_jax(options)
     image, report = _timed_render(load(), settings)
     interruption.raise_from_now_on()
     save_image(options.output, image, **saving)
@@ -92,14 +92,16 @@ def _timed_render(scene: "Scene", settings: Settings) -> tuple[Any, str]:
 
 
 class _CompileTime:
-    """Adds up the seconds that JAX spends on tracing and compiling from now on."""
+    """Adds up the seconds that go to tracing and compiling programs, or to loading kept ones, from now on."""
 
     def __init__(self) -> None:
         import jax
 
-        self.seconds = 0.0
+        from ..core.kept import LOADED
+
+        self.seconds, self.events = 0.0, ("/jax/core/compile/", LOADED)
         jax.monitoring.register_event_duration_secs_listener(self._add)
 
     def _add(self, event: str, duration_secs: float, **_: Any) -> None:
-        if event.startswith("/jax/core/compile/"):
+        if event.startswith(self.events):
             self.seconds += duration_secs

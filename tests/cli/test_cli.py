@@ -32,7 +32,7 @@ def jaxhf_command(*arguments, **options):
 @pytest.fixture
 def in_this_process(monkeypatch, capsys):
     """Runs `main` here, where JAX is set up already; returns exit code, standard output and standard error."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda precision, devices: None)
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
 
     def run(*arguments):
         try:

@@ -17,7 +17,7 @@ from jaxhf.cli.main import main
 @pytest.fixture(autouse=True)
 def in_this_process(monkeypatch):
     """JAX is set up already, with double precision."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda precision, devices: None)
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
 
 
 def slope(east: float, north: float) -> Terrain:
