@@ -1,5 +1,6 @@
 """The command line: how it begins and how errors end. Ctrl-C is looked after first; all else is imported after that."""
 
+import gc
 import sys
 import warnings
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is None:
         interruption.end_at_once()
+        gc.set_threshold(50_000, 50, 100)  # tracing makes many objects that live on, and so do imports
     from ..core.errors import UserError
     from .parser import make_parser
 
@@ -40,4 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
+    finally:
+        if arguments is None:
+            gc.freeze()  # nothing is looked through once more at the end
     return 0

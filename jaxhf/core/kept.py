@@ -7,13 +7,15 @@ import pickle
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
+from jax.experimental.compilation_cache import compilation_cache
 from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
 LOADED = "/jaxhf/program_loaded"
@@ -88,7 +90,8 @@ class Kept:
             return returned
 
         flat.__name__ = self.fun.__name__
-        program = self.jit(flat).lower(*leaves).compile()
+        with _without_jax_cache():
+            program = self.jit(flat).lower(*leaves).compile()
         out = jax.tree.unflatten(trees[0], range(trees[0].num_leaves))  # a structure with modules in it cannot be pickled
         part = path.with_suffix(f".{os.getpid()}")
         try:
@@ -105,6 +108,19 @@ class Kept:
             f"Error {doing} persistent compilation cache entry for '{self.fun.__qualname__}': {type(error).__name__}: {error}"
         )
         warnings.warn(said, stacklevel=3)
+
+
+@contextmanager
+def _without_jax_cache() -> Iterator[None]:
+    """A program out of JAX's cache could not be stored again: XLA leaves its kernels out, without an error."""
+    before = jax.config.values["jax_enable_compilation_cache"]
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
+        compilation_cache.reset_cache()
 
 
 @cache

@@ -64,6 +64,19 @@ def test_another_source_or_configuration_is_traced_again(folder, monkeypatch):
     assert traced == [2, 2, 2]
 
 
+def test_what_jax_has_kept_is_not_kept_again(folder, monkeypatch):
+    """XLA stores a loaded program without its kernels: it loads, and fails where it runs."""
+    before = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    try:
+        for source in (b"old", b"new", b"new"):
+            monkeypatch.setattr("jaxhf.core.kept._source", lambda source=source: source)
+            call(np.arange(5.0))
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
+    assert traced == [2, 2]
+
+
 def flipped(stored):
     return bytes([*stored[:900], stored[900] ^ 1, *stored[901:]])
 
