@@ -72,6 +72,11 @@ def add_machine(command: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def require_devices(devices: int | None) -> None:
+    if devices is not None and devices < 1:
+        raise UserError(f"--devices must be a whole number from 1 on, it is {devices}")
+
+
 def set_up_jax(options: argparse.Namespace) -> None:
     """Configures JAX by the options of `add_machine`, which can only be done before its first use."""
     import jax
@@ -79,8 +84,7 @@ def set_up_jax(options: argparse.Namespace) -> None:
     from ..core.machine import default_devices
     from .cache import keep_programs
 
-    if options.devices is not None and options.devices < 1:
-        raise UserError(f"--devices must be a whole number from 1 on, it is {options.devices}")
+    require_devices(options.devices)
     jax.config.update("jax_enable_x64", options.precision == "float64")
     jax.config.update("jax_num_cpu_devices", options.devices or default_devices())
     keep_programs(options.cache)

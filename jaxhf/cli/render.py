@@ -36,15 +36,30 @@ def draw(options: argparse.Namespace, load: "Callable[[], Scene]", **saving: Any
       load: makes the scene, when JAX is set up.
       saving: for `save_image`.
     """
-    from ..io.images import require_writable, save_image
+    from ..io.images import require_writable
 
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)
     image, report = _timed_render(load(), settings)
+    finish(options.output, image, report, **saving)
+
+
+def finish(path: str, image: Any, report: str, **saving: Any) -> None:
+    """Saves a picture and prints what it took."""
+    from ..io.images import save_image
+
     interruption.raise_from_now_on()
-    save_image(options.output, image, **saving)
-    print(f"{options.output}: {report}")
+    save_image(path, image, **saving)
+    print(f"{path}: {report}")
+
+
+def report_line(width: int, height: int, samples: int, seconds: float, compiling: float, device: str, exhausted: int) -> str:
+    rays = width * height * samples
+    return (
+        f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), {seconds:.3g} s + {compiling:.3g} s compiling, "
+        f"{device}, {rays / seconds:.3g} rays/s, {exhausted} rays exhausted"
+    )
 
 
 def _load(options: argparse.Namespace) -> "Scene":
@@ -82,13 +97,9 @@ def _timed_render(scene: "Scene", settings: Settings) -> tuple[Any, str]:
     seconds = max(elapsed - compiling.seconds, 1e-9)
     samples = resolve_settings(settings, scene).samples or 1
     height, width = image.shape[:2]
-    rays = height * width * samples
-    return image, (
-        f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), "
-        f"{seconds:.3g} s + {compiling.seconds:.3g} s compiling, "
-        f"{jax.local_device_count()} x {jax.devices()[0].device_kind}, {rays / seconds:.3g} rays/s, "
-        f"{int(np.sum(aovs['exhausted']))} rays exhausted"
-    )
+    device = f"{jax.local_device_count()} x {jax.devices()[0].device_kind}"
+    exhausted = int(np.sum(aovs["exhausted"]))
+    return image, report_line(width, height, samples, seconds, compiling.seconds, device, exhausted)
 
 
 class _CompileTime:
