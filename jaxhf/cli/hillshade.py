@@ -39,10 +39,11 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     from ..io.images import require_writable
     from ..io.load_terrain import load_heights
+    from .limits import require_devices
     from .relief import relief, small
 
     require_writable(options.output)
-    arguments.require_devices(options.devices)
+    require_devices(options.devices)
     settings, (width, height) = arguments.settings(options), arguments.size(options)
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
     terrain = replace(terrain, heights=terrain.heights.astype(options.precision))

@@ -41,7 +41,7 @@ def draw(options: argparse.Namespace, load: "Callable[[], Scene]", **saving: Any
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)
-    image, report = _timed_render(load(), settings)
+    image, report = _timed_render(load(), settings, options.devices)
     finish(options.output, image, report, **saving)
 
 
@@ -76,14 +76,21 @@ def _load(options: argparse.Namespace) -> "Scene":
     return resized(scene, width, height or max(1, round(width * old.height / old.width)))
 
 
-def _timed_render(scene: "Scene", settings: Settings) -> tuple[Any, str]:
+def _timed_render(scene: "Scene", settings: Settings, devices: int | None) -> tuple[Any, str]:
+    """The picture and what it took; `devices` None: as many as there are, if they pay."""
     import jax
     import numpy as np
 
+    from ..core.devices import local_mesh
     from ..rendering.render import render
     from ..trace.world import resolve_settings
+    from .limits import require_memory, worthwhile_devices
     from .progress import bar
 
+    samples = resolve_settings(settings, scene).samples or 1
+    on_host = devices is None and jax.default_backend() == "cpu"
+    mesh = local_mesh(worthwhile_devices(scene.camera.width * scene.camera.height * samples) if on_host else None)
+    require_memory(scene, mesh.size)
     compiling = _CompileTime()
     begin = time.perf_counter()
     with bar(unit=" pixels", unit_scale=True, delay=0.5) as shown:
@@ -92,12 +99,11 @@ def _timed_render(scene: "Scene", settings: Settings) -> tuple[Any, str]:
             shown.total = total
             shown.update(done - shown.n)
 
-        image, aovs = render(scene, settings, aovs=("exhausted",), progress=advance)
+        image, aovs = render(scene, settings, aovs=("exhausted",), progress=advance, mesh=mesh)
     elapsed = time.perf_counter() - begin
     seconds = max(elapsed - compiling.seconds, 1e-9)
-    samples = resolve_settings(settings, scene).samples or 1
     height, width = image.shape[:2]
-    device = f"{jax.local_device_count()} x {jax.devices()[0].device_kind}"
+    device = f"{mesh.size} x {jax.devices()[0].device_kind}"
     exhausted = int(np.sum(aovs["exhausted"]))
     return image, report_line(width, height, samples, seconds, compiling.seconds, device, exhausted)
 

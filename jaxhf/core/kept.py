@@ -72,11 +72,12 @@ class Kept:
         path = _folder / f"{name}-{hashlib.sha256(known.encode() + _source()).hexdigest()[:32]}"
         begin = time.perf_counter()
         try:
-            stored, in_tree, out_tree, out = pickle.loads(zlib.decompress(path.read_bytes()))  # with a checksum of zlib's
-            found = deserialize_and_load(stored, in_tree, out_tree), jax.tree.structure(out)
+            stored, in_tree, out_tree, out, ids = pickle.loads(zlib.decompress(path.read_bytes()))  # with a checksum of zlib's
+            devices = {device.id: device for device in jax.devices()}
+            program = deserialize_and_load(stored, in_tree, out_tree, execution_devices=[devices[k] for k in ids])
             path.touch()  # the folder's owner may remove what was used longest ago
             jax.monitoring.record_event_duration_secs(LOADED, time.perf_counter() - begin)
-            return found
+            return program, jax.tree.structure(out)
         except FileNotFoundError:
             pass
         except Exception as error:  # whatever a damaged file leads to
@@ -95,7 +96,8 @@ class Kept:
         out = jax.tree.unflatten(trees[0], range(trees[0].num_leaves))  # a structure with modules in it cannot be pickled
         part = path.with_suffix(f".{os.getpid()}")
         try:
-            part.write_bytes(zlib.compress(pickle.dumps((*serialize(program), out))))
+            ids = [device.id for device in program.runtime_executable().local_devices()]
+            part.write_bytes(zlib.compress(pickle.dumps((*serialize(program), out, ids))))
             part.replace(path)
         except Exception as error:  # no space, or a backend whose programs cannot be stored
             part.unlink(missing_ok=True)
