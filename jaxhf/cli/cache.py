@@ -7,6 +7,7 @@ import platform
 import re
 import sys
 import warnings
+from contextlib import suppress
 from glob import escape
 from importlib.metadata import version
 from pathlib import Path
@@ -21,7 +22,7 @@ def keep_programs(wanted: bool) -> None:
     Where they cannot be kept a warning says so, no more.
 
     Args:
-      wanted: whether to keep any; if not, JAX's own folder is not used either.
+      wanted: whether to keep any; if not, a folder that the user has named to JAX is not used either.
     """
     import jax
 
@@ -29,15 +30,16 @@ def keep_programs(wanted: bool) -> None:
 
     if not wanted:
         jax.config.update("jax_enable_compilation_cache", False)
-    folder = programs_folder()
-    if not wanted or folder is None or "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return
+    asked_otherwise = not jax.config.values["jax_enable_compilation_cache"] or "JAX_COMPILATION_CACHE_DIR" in os.environ
     try:
+        folder = None if not wanted or asked_otherwise else programs_folder()
+        if folder is None:
+            return
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
             raise PermissionError(f"{folder} is read-only")
         _remove_oldest(folder.parent, _MOST)
-    except OSError as error:
+    except (OSError, RuntimeError) as error:  # the latter where there is no home folder
         warnings.warn(f"compiled programs are not kept: {error}", stacklevel=2)
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
@@ -79,7 +81,10 @@ def _processor() -> str:
 
 def _remove_oldest(root: Path, most: int) -> None:
     """Removes the programs used longest ago, of all versions, until the rest has at most so many bytes."""
-    found = [(path, path.stat()) for path in root.glob("jaxhf-*-jax-*/*")]
+    found = []
+    for path in root.glob("jaxhf-*-jax-*/*"):
+        with suppress(FileNotFoundError):  # removed by another process
+            found.append((path, path.stat()))
     total = sum(said.st_size for _, said in found)
     for path, said in sorted(found, key=lambda one: max(one[1].st_atime, one[1].st_mtime)):
         if total <= most:

@@ -53,12 +53,14 @@ def compiled(fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, **optio
     def alone() -> Callable[..., Any]:
         return jit(fun, compiler_options=compiler_options(), **options)
 
-    kept = Kept(fun, lambda flat: jit(flat, compiler_options=compiler_options()), options.get("static_argnames", ()))
+    @functools.cache
+    def kept() -> Kept:
+        return Kept(fun, lambda flat: jit(flat, compiler_options=compiler_options()), options.get("static_argnames", ()))
 
     @functools.wraps(fun)
     def call(*args: Any, **kwargs: Any) -> Any:
         if get_opaque_trace_state() != _TOP_LEVEL:
             return inside(*args, **kwargs)
-        return (kept if jit is jax.jit and Kept.serves(fun) else alone())(*args, **kwargs)
+        return (kept() if jit is jax.jit and Kept.serves(fun) else alone())(*args, **kwargs)
 
     return call

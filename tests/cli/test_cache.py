@@ -116,6 +116,13 @@ def test_a_folder_that_cannot_be_written_gets_one_warning(configured, monkeypatc
     assert len(said) == 1
 
 
+def test_without_a_home_folder_nothing_is_kept(configured, monkeypatch):
+    monkeypatch.delenv("JAXHF_CACHE")
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as it does for a user who is not known
+    with pytest.warns(UserWarning, match="compiled programs are not kept: Could not determine home"):
+        assert "kept" not in configured()
+
+
 def test_the_platform_and_the_processor_choose_a_folder(monkeypatch, tmp_path):
     monkeypatch.delenv("JAXHF_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
