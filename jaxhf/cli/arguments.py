@@ -29,9 +29,17 @@ def add_settings(command: argparse.ArgumentParser, names: Collection[str], **def
             continue
         default = defaults.get(knob.name, knob.metadata.get("none", knob.default))
         command.add_argument(
-            f"--{option}", type=int if int in (knob.type, *get_args(knob.type)) else str, default=argparse.SUPPRESS,
+            f"--{option}", type=whole_number if int in (knob.type, *get_args(knob.type)) else str, default=argparse.SUPPRESS,
             metavar=knob.metadata.get("metavar"), help=f"{knob.metadata['help']} [{default}]",
         )  # fmt: skip
+
+
+def whole_number(text: str) -> int:
+    """Of what may be written as 1e6, too."""
+    value = float(text)
+    if not value.is_integer():
+        raise ValueError(text)
+    return int(value)
 
 
 def settings(options: argparse.Namespace) -> Settings:
@@ -62,18 +70,28 @@ def add_raster(command: argparse.ArgumentParser) -> None:
 
 def add_machine(command: argparse.ArgumentParser) -> None:
     command.add_argument(
-        "--devices", type=int, metavar="N", help="cores that share the work, each with a copy [all, at most 16]"
+        "--devices",
+        type=int,
+        metavar="N",
+        help="cores that share the work, each with a copy [all, at most 16, fewer for a small picture]",
     )
     command.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
+    command.add_argument(
+        "--no-cache", dest="cache", action="store_false",
+        help="keep no compiled programs for the next run [kept in the folder JAXHF_CACHE, by default one in the user's cache "
+        "folder; JAXHF_CACHE=off: keep none]",
+    )  # fmt: skip
 
 
-def set_up_jax(precision: str, devices: int | None) -> None:
+def set_up_jax(options: argparse.Namespace) -> None:
     """Configures JAX by the options of `add_machine`, which can only be done before its first use."""
     import jax
 
     from ..core.machine import default_devices
+    from .cache import keep_programs
+    from .limits import require_devices
 
-    if devices is not None and devices < 1:
-        raise UserError(f"--devices must be a whole number from 1 on, it is {devices}")
-    jax.config.update("jax_enable_x64", precision == "float64")
-    jax.config.update("jax_num_cpu_devices", devices or default_devices())
+    require_devices(options.devices)
+    jax.config.update("jax_enable_x64", options.precision == "float64")
+    jax.config.update("jax_num_cpu_devices", options.devices or default_devices())
+    keep_programs(options.cache)

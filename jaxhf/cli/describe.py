@@ -1,19 +1,21 @@
 """A scene in words, as `jaxhf info` and `convert` print it."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..io.terrain import Terrain
-from ..scene.cylinder import Cylinder
-from ..scene.heightfield import Heightfield
-from ..scene.scene import Scene
-from ..scene.texture import ImageTexture
+if TYPE_CHECKING:
+    from ..io.terrain import Terrain
+    from ..scene.cylinder import Cylinder
+    from ..scene.heightfield import Heightfield
+    from ..scene.scene import Scene
 
 
-def scene_lines(scene: Scene) -> Iterator[str]:
+def scene_lines(scene: "Scene") -> Iterator[str]:
     """A line for the camera, and one for each object and light."""
+    from ..scene.heightfield import Heightfield
+
     eye = np.asarray(scene.camera.world_from_camera)[:3, 3]
     yield f"camera: {type(scene.camera).__name__}, at {_numbers(eye)}"
     for k, obj in enumerate(scene.objects):
@@ -25,7 +27,7 @@ def scene_lines(scene: Scene) -> Iterator[str]:
         yield f"light {k}: {type(light).__name__}, {values}"
 
 
-def heightfield_line(field: Heightfield | Terrain) -> str:
+def heightfield_line(field: "Heightfield | Terrain") -> str:
     heights = np.asarray(field.heights)
     ny, nx = heights.shape
     finite = heights[np.isfinite(heights)]
@@ -37,11 +39,13 @@ def heightfield_line(field: Heightfield | Terrain) -> str:
     )
 
 
-def _cylinder_line(cylinder: Cylinder) -> str:
+def _cylinder_line(cylinder: "Cylinder") -> str:
     return f"Cylinder, radius {float(cylinder.radius):.6g}, z {_numbers([cylinder.z_min, cylinder.z_max])}"
 
 
 def _material(material: Any) -> str:
+    from ..scene.texture import ImageTexture
+
     (name, value), *_ = vars(material).items()
     what = (
         f"an image of {value.texels.shape[1]} x {value.texels.shape[0]}" if isinstance(value, ImageTexture) else _numbers(value)

@@ -26,7 +26,7 @@ def add(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> None:
     outputs = Outputs(Path(options.output), Path(options.report) if options.report else None, options.resume)
-    arguments.set_up_jax(options.precision, options.devices)
+    arguments.set_up_jax(options)
     print(fit_file(options.case, outputs, options.precision))
 
 
@@ -80,14 +80,17 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
       FileNotFoundError, ValueError: anything that is wrong in the file, before anything is traced.
       KeyboardInterrupt: Ctrl-C; its text says how to go on.
     """
+    import jax
     import numpy as np
 
     from ..fitting.fit import fit
     from ..fitting.history import Draws
     from ..io.toml.fit import load_case
+    from .limits import require_memory
     from .progress import bar
 
     case = load_case(path, np.dtype(precision))
+    require_memory(case.scenes[0], jax.local_device_count())
     options: dict[str, Any] = {"checkpoint": outputs.checkpoint, "resume": outputs.resume, **case.options}
     interruption.raise_from_now_on()
     try:

@@ -1,12 +1,14 @@
 """`jaxhf hillshade`: a shaded map, the terrain from straight above, north up."""
 
 import argparse
+import math
+import time
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import ArgumentError, UserError
 from . import arguments
-from .render import draw
+from .render import draw, finish, report_line
 
 if TYPE_CHECKING:
     from ..io.terrain import Terrain
@@ -35,14 +37,44 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
+    from ..io.images import require_writable
     from ..io.load_terrain import load_heights
+    from .limits import require_devices
+    from .relief import relief, small
 
-    def load() -> "Scene":
-        terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
-        terrain = replace(terrain, heights=terrain.heights.astype(options.precision))
-        return hillshade_scene(terrain, options.azimuth, options.altitude, options.sky, *arguments.size(options))
+    require_writable(options.output)
+    require_devices(options.devices)
+    settings, (width, height) = arguments.settings(options), arguments.size(options)
+    terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+    terrain = replace(terrain, heights=terrain.heights.astype(options.precision))
+    view = options.azimuth, options.altitude, options.sky
+    _require(terrain, *view[1:])
+    width, height, extent = _picture(terrain, width, height)
+    samples = settings.samples or 1
+    if not small(terrain, width * height * samples, options.altitude):
+        return draw(options, lambda: hillshade_scene(terrain, *view, width, height), transfer="linear")
+    begin = time.perf_counter()
+    image = relief(terrain, *view, width, height, extent, math.isqrt(samples), settings.shadows)
+    report = report_line(width, height, samples, time.perf_counter() - begin, 0.0, "NumPy", 0)
+    finish(options.output, image, report, transfer="linear")
 
-    draw(options, load, transfer="linear")
+
+def _require(terrain: "Terrain", altitude: float, sky: float) -> None:
+    if not 0 < altitude <= 90:
+        raise ArgumentError("hillshade", "altitude", f"must be above 0 and at most 90 degrees, it is {altitude}")
+    if not 0 <= sky < float("inf"):
+        raise ArgumentError("hillshade", "sky", f"must be 0 or more, it is {sky}")
+    if terrain.nodata.all():
+        raise UserError("hillshade: there is no height in the terrain")
+
+
+def _picture(terrain: "Terrain", width: int | None, height: int | None) -> tuple[int, int, float]:
+    """See `picture_above`; of one pixel a cell across, unless its size is given."""
+    from ..scene.above import picture_above
+
+    if width is None and height is None:
+        width = terrain.heights.shape[1] - 1
+    return picture_above(terrain.heights.shape, terrain.dx, terrain.dy, width, height)
 
 
 def hillshade_scene(
@@ -71,14 +103,8 @@ def hillshade_scene(
     from ..scene.scene import Object, Scene
     from ..scene.views import from_above
 
-    if not 0 < altitude <= 90:
-        raise ArgumentError("hillshade", "altitude", f"must be above 0 and at most 90 degrees, it is {altitude}")
-    if not 0 <= sky < float("inf"):
-        raise ArgumentError("hillshade", "sky", f"must be 0 or more, it is {sky}")
-    if terrain.nodata.all():
-        raise UserError("hillshade: there is no height in the terrain")
+    _require(terrain, altitude, sky)
     field = terrain.heightfield()
     lights = [Directional.from_angles(azimuth, altitude), *([Sky(sky)] if sky else [])]
-    if width is None and height is None:
-        width = terrain.heights.shape[1] - 1
+    width, height, _ = _picture(terrain, width, height)
     return Scene([Object(field, Matte(1.0))], from_above(field, width, height), lights, samples=1)

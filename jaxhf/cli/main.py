@@ -1,5 +1,6 @@
 """The command line: how it begins and how errors end. Ctrl-C is looked after first; all else is imported after that."""
 
+import gc
 import sys
 import warnings
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is None:
         interruption.end_at_once()
+        gc.set_threshold(50_000, 50, 100)  # tracing makes many objects that live on, and so do imports
     from ..core.errors import UserError
     from .parser import make_parser
 
@@ -22,7 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides
-            warnings.showwarning = lambda message, *_, **__: print(f"jaxhf: warning: {message}", file=sys.stderr)
+            warnings.showwarning = lambda message, *_, **__: print(
+                f"jaxhf: warning: {' '.join(str(message).split())}", file=sys.stderr
+            )
             options.run(options)
     except KeyboardInterrupt as stopped:
         print(f"\njaxhf: {str(stopped) or 'interrupted'}", file=sys.stderr)
@@ -38,4 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             file=sys.stderr,
         )
         return 2
+    finally:
+        if arguments is None:
+            gc.freeze()  # nothing is looked through once more at the end
     return 0

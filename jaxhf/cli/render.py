@@ -36,15 +36,30 @@ def draw(options: argparse.Namespace, load: "Callable[[], Scene]", **saving: Any
       load: makes the scene, when JAX is set up.
       saving: for `save_image`.
     """
-    from ..io.images import require_writable, save_image
+    from ..io.images import require_writable
 
     require_writable(options.output)
     settings = arguments.settings(options)
-    arguments.set_up_jax(options.precision, options.devices)
-    image, report = _timed_render(load(), settings)
+    arguments.set_up_jax(options)
+    image, report = _timed_render(load(), settings, options.devices)
+    finish(options.output, image, report, **saving)
+
+
+def finish(path: str, image: Any, report: str, **saving: Any) -> None:
+    """Saves a picture and prints what it took."""
+    from ..io.images import save_image
+
     interruption.raise_from_now_on()
-    save_image(options.output, image, **saving)
-    print(f"{options.output}: {report}")
+    save_image(path, image, **saving)
+    print(f"{path}: {report}")
+
+
+def report_line(width: int, height: int, samples: int, seconds: float, compiling: float, device: str, exhausted: int) -> str:
+    rays = width * height * samples
+    return (
+        f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), {seconds:.3g} s + {compiling:.3g} s compiling, "
+        f"{device}, {rays / seconds:.3g} rays/s, {exhausted} rays exhausted"
+    )
 
 
 def _load(options: argparse.Namespace) -> "Scene":
@@ -61,14 +76,21 @@ def _load(options: argparse.Namespace) -> "Scene":
     return resized(scene, width, height or max(1, round(width * old.height / old.width)))
 
 
-def _timed_render(scene: "Scene", settings: Settings) -> tuple[Any, str]:
+def _timed_render(scene: "Scene", settings: Settings, devices: int | None) -> tuple[Any, str]:
+    """The picture and what it took; `devices` None: as many as there are, if they pay."""
     import jax
     import numpy as np
 
+    from ..core.devices import local_mesh
     from ..rendering.render import render
     from ..trace.world import resolve_settings
+    from .limits import require_memory, worthwhile_devices
     from .progress import bar
 
+    samples = resolve_settings(settings, scene).samples or 1
+    on_host = devices is None and jax.default_backend() == "cpu"
+    mesh = local_mesh(worthwhile_devices(scene.camera.width * scene.camera.height * samples) if on_host else None)
+    require_memory(scene, mesh.size)
     compiling = _CompileTime()
     begin = time.perf_counter()
     with bar(unit=" pixels", unit_scale=True, delay=0.5) as shown:
@@ -77,29 +99,26 @@ def _timed_render(scene: "Scene", settings: Settings) -> tuple[Any, str]:
             shown.total = total
             shown.update(done - shown.n)
 
-        image, aovs = render(scene, settings, aovs=("exhausted",), progress=advance)
+        image, aovs = render(scene, settings, aovs=("exhausted",), progress=advance, mesh=mesh)
     elapsed = time.perf_counter() - begin
     seconds = max(elapsed - compiling.seconds, 1e-9)
-    samples = resolve_settings(settings, scene).samples or 1
     height, width = image.shape[:2]
-    rays = height * width * samples
-    return image, (
-        f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), "
-        f"{seconds:.3g} s + {compiling.seconds:.3g} s compiling, "
-        f"{jax.local_device_count()} x {jax.devices()[0].device_kind}, {rays / seconds:.3g} rays/s, "
-        f"{int(np.sum(aovs['exhausted']))} rays exhausted"
-    )
+    device = f"{mesh.size} x {jax.devices()[0].device_kind}"
+    exhausted = int(np.sum(aovs["exhausted"]))
+    return image, report_line(width, height, samples, seconds, compiling.seconds, device, exhausted)
 
 
 class _CompileTime:
-    """Adds up the seconds that JAX spends on tracing and compiling from now on."""
+    """Adds up the seconds that go to tracing and compiling programs, or to loading kept ones, from now on."""
 
     def __init__(self) -> None:
         import jax
 
-        self.seconds = 0.0
+        from ..core.kept import LOADED
+
+        self.seconds, self.events = 0.0, ("/jax/core/compile/", LOADED)
         jax.monitoring.register_event_duration_secs_listener(self._add)
 
     def _add(self, event: str, duration_secs: float, **_: Any) -> None:
-        if event.startswith("/jax/core/compile/"):
+        if event.startswith(self.events):
             self.seconds += duration_secs

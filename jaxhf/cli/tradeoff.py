@@ -37,11 +37,13 @@ def run(options: argparse.Namespace) -> None:
     from ..study.pareto import advice, markdown
     from ..study.plan import plan
     from ..study.plots import save_plot
+    from .limits import require_devices
 
     for name in ("error", "time", "repeats", "width", "devices"):
         value = getattr(options, name)
         if value is not None and not value > 0:
             raise UserError(f"--{name} must be positive, it is {value}")
+    require_devices(options.devices)
     import_extra("matplotlib", "tradeoff draws with", "plot")
     sweep = plan(
         options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick,

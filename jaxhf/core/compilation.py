@@ -8,6 +8,8 @@ from typing import Any
 import jax
 from jax.extend.core import get_opaque_trace_state
 
+from .kept import Kept
+
 # XLA's older emitters of fused loops for the CPU. The newer ones go through MLIR: frames then compile for 1.7 times as long,
 # and do not run faster. The steps of a fit, however, take 1.4 times as long with these.
 _OPTIONS = {"xla_cpu_use_fusion_emitters": False}
@@ -56,8 +58,14 @@ def compiled(fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, **optio
     def alone() -> Callable[..., Any]:
         return jit(fun, compiler_options=compiler_options(), **options)
 
+    @functools.cache
+    def kept() -> Kept:
+        return Kept(fun, lambda flat: jit(flat, compiler_options=compiler_options()), options.get("static_argnames", ()))
+
     @functools.wraps(fun)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return (inside if is_traced() else alone())(*args, **kwargs)
+        if is_traced():
+            return inside(*args, **kwargs)
+        return (kept() if jit is jax.jit and Kept.serves(fun) else alone())(*args, **kwargs)
 
     return call

@@ -14,9 +14,9 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 
 
 @functools.cache
-def local_mesh() -> Mesh:
-    """All devices of this process, in a row."""
-    devices = jax.local_devices()
+def local_mesh(most: int | None = None) -> Mesh:
+    """All devices of this process, in a row, or so many of them."""
+    devices = jax.local_devices()[:most]
     return jax.make_mesh((len(devices),), ("devices",), axis_types=(AxisType.Auto,), devices=devices)
 
 

@@ -13,6 +13,8 @@ Traversal = Literal["pyramid", "dda"]
 Shading = Literal["smooth", "flat"]
 NormalScheme = Literal["central", "four", "six", "six-angle", "six-equal"]
 
+_MOST_CHUNK = 2**20  # of 1024 x 1024 pixels; each device takes 300 bytes a ray
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -104,6 +106,9 @@ class Settings:
                 continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise ArgumentError("Settings", name, f"must be a whole number from {least} on, it is {value!r}")
+        if self.chunk > _MOST_CHUNK:
+            rule = f"must be at most {_MOST_CHUNK}, it is {self.chunk}; with 1024, the default, rays are traced fastest"
+            raise ArgumentError("Settings", "chunk", rule)
         if self.samples is not None and math.isqrt(self.samples) ** 2 != self.samples:
             raise ArgumentError("Settings", "samples", f"must be a square number (1, 4, 9, ...), it is {self.samples}")
 

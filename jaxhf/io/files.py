@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import jax
 import numpy as np
 from numpy.typing import DTypeLike
 
@@ -116,6 +115,8 @@ def require_precision(dtype: DTypeLike) -> np.dtype:
     found = np.dtype(dtype)
     if found not in (np.float32, np.float64):
         raise ArgumentError("", "dtype", f"must be float32 or float64, it is {found}")
+    import jax  # which converting a file does without
+
     if jax.dtypes.canonicalize_dtype(found) != found:
         raise ArgumentError("", "dtype", "float64 needs JAX's x64 mode: jax.config.update('jax_enable_x64', True)")
     return found

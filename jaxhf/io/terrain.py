@@ -2,16 +2,18 @@
 
 import dataclasses
 import math
+from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import DTypeLike
 
 from ..core.errors import ArgumentError
-from ..scene.heightfield import Heightfield
 from .errors import FileError
 from .georeference import WGS84, CoordinateSystem, metres_per_degree
+
+if TYPE_CHECKING:
+    from ..scene.heightfield import Heightfield
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,7 +48,7 @@ class Terrain:
         """Where there is no height: bool, shape (ny, nx)."""
         return np.isnan(self.heights)
 
-    def heightfield(self, dtype: DTypeLike | None = None) -> Heightfield:
+    def heightfield(self, dtype: DTypeLike | None = None) -> "Heightfield":
         """The surface, to be rendered.
 
         Args:
@@ -55,6 +57,10 @@ class Terrain:
         Raises:
           ValueError: heights do not fit into `dtype`, or there are more than a `Heightfield` holds.
         """
+        import jax  # which converting a file does without
+
+        from ..scene.heightfield import Heightfield
+
         wanted = np.dtype(jax.dtypes.canonicalize_dtype(self.heights.dtype) if dtype is None else dtype)
         return Heightfield(fitted(self.heights, wanted), self.dx, self.dy, self.x0, self.y0)
 

@@ -32,7 +32,7 @@ def jaxhf_command(*arguments, **options):
 @pytest.fixture
 def in_this_process(monkeypatch, capsys):
     """Runs `main` here, where JAX is set up already; returns exit code, standard output and standard error."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda precision, devices: None)
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
 
     def run(*arguments):
         try:
@@ -127,7 +127,7 @@ def rendered(monkeypatch):
     """Replaces the renderer by noise with two exhausted rays in it; lists the scenes and settings that it was given."""
     given = []
 
-    def render(scene, settings, *, aovs, progress):
+    def render(scene, settings, *, aovs, progress, mesh):
         given.append((scene, settings))
         shape = scene.camera.height, scene.camera.width
         progress(0, shape[0] * shape[1])
@@ -312,6 +312,8 @@ BAD = {
         r"scene\.toml:5: .*width must be .*-3",
     ),
     "samples that are no square": (GOOD, "scene.toml", ["--samples", "3"], r"samples must be a square number .* it is 3"),
+    "chunk that is no number": (GOOD, "scene.toml", ["--chunk", "many"], r"--chunk: .*'many'"),
+    "chunk of a whole picture and more": (GOOD, "scene.toml", ["--chunk", "1e8"], r"chunk must be at most 1048576, .*1024"),
     "unknown shading": (GOOD, "scene.toml", ["--shading", "x"], r"shading.*smooth.*flat.*'x'"),
     "unknown traversal": (GOOD, "scene.toml", ["--traversal", "x"], r"traversal.*'x'"),
     "unknown normals": (GOOD, "scene.toml", ["--normals", "x"], r"normals.*six-angle.*'x'"),

@@ -80,7 +80,7 @@ def folder(tmp_path_factory) -> Path:
 @pytest.fixture(autouse=True)
 def in_this_process(monkeypatch):
     """JAX is set up already, with double precision."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda precision, devices: None)
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
 
 
 def run(folder, name, *more) -> int:

@@ -1,6 +1,8 @@
 """`jaxhf hillshade` and `jaxhf convert`: maps held against a closed form, terrains that come back as they were."""
 
 import itertools
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,13 @@ import jaxhf
 from jaxhf import Terrain
 from jaxhf.cli.hillshade import hillshade_scene
 from jaxhf.cli.main import main
+from jaxhf.cli.relief import small
 
 
 @pytest.fixture(autouse=True)
 def in_this_process(monkeypatch):
     """JAX is set up already, with double precision."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda precision, devices: None)
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
 
 
 def slope(east: float, north: float) -> Terrain:
@@ -26,9 +29,12 @@ def slope(east: float, north: float) -> Terrain:
     return Terrain(30.0 * east * columns + 60.0 * north * rows, 30.0, 60.0, 5e5, 4.1e6)
 
 
+@pytest.mark.parametrize("rendered", [False, True])
 @pytest.mark.parametrize(("east", "north"), [(0.5, 0.0), (0.0, -0.7), (-0.3, 0.4)])
-def test_planes_have_the_shade_of_their_slope(tmp_path, east, north):
+def test_planes_have_the_shade_of_their_slope(tmp_path, monkeypatch, east, north, rendered):
     """All formulae agree on a plane: the cosine between its normal and the light; as GDAL's, but for the sky."""
+    if rendered:
+        monkeypatch.setattr("jaxhf.cli.relief.small", lambda *_: False)
     path = tmp_path / "plane.npz"
     jaxhf.save_heights(path, slope(east, north))
     options = ["--azimuth", "30", "--altitude", "60", "--sky", "0.25", "--precision", "float64"]
@@ -75,6 +81,50 @@ def test_all_of_the_terrain_is_seen(shape, size):
     assert np.isclose(half, middle).any()
     if len(size) < 2:  # less than half a pixel on either side is beside it
         assert (half - middle < half / np.array([width, height])).all()
+
+
+@pytest.mark.parametrize(("rough", "samples"), [(True, 4), (False, 1)])
+def test_a_small_map_is_that_of_the_renderer(tmp_path, monkeypatch, rough, samples):
+    """Attached and cast shadows, and pixels beside the terrain. No sample lies on an edge, where either triangle may count."""
+    rows, columns = np.mgrid[:20, :30]
+    heights = 80 * np.sin(rows / 4) * np.cos(columns / 5)
+    if rough:
+        heights = np.random.default_rng(0).uniform(0, 90, rows.shape)
+    jaxhf.save_heights(tmp_path / "small.npz", Terrain(heights, 30.0, 50.7, 5e5, 4.1e6))
+    options = ["--azimuth", "290", "--altitude", "20", "--sky", "0.2", "--width", "37", "--height", "45"]
+    maps = []
+    for name in ("numpy.npy", "jax.npy"):
+        more = ["--samples", str(samples), "--precision", "float64"]
+        assert main(["hillshade", str(tmp_path / "small.npz"), "-o", str(tmp_path / name), *options, *more]) == 0
+        maps.append(np.load(tmp_path / name))
+        monkeypatch.setattr("jaxhf.cli.relief.small", lambda *_: False)
+    np.testing.assert_allclose(*maps, rtol=1e-9)  # the renderer subtracts an origin of 4e6 from the camera's position
+    dark = maps[0][..., 0] < 0.2  # less than the sky gives to level ground
+    assert 0.05 < dark.mean() < 0.9
+
+
+def test_which_maps_are_small():
+    """Those without holes, unless rays to the light cross too much."""
+    heights = np.random.default_rng(0).uniform(0, 10, (200, 200))
+    assert small(Terrain(heights), 40_000, 45.0)
+    assert not small(Terrain(heights), 4_000_000, 45.0)
+    assert not small(Terrain(100 * heights), 160_000, 5.0)
+    heights[3, 3] = np.nan
+    assert not small(Terrain(heights), 40_000, 45.0)
+
+
+def test_small_maps_and_conversions_do_without_jax(tmp_path):
+    heights = np.random.default_rng(0).uniform(0, 1, (41, 41))
+    np.save(tmp_path / "in.npy", heights)
+    script = (
+        "import sys\n"
+        "from jaxhf.cli.main import main\n"
+        "for command in (['convert', 'in.npy', 'out.npz'], ['hillshade', 'out.npz', '-o', 'out.png']):\n"
+        "    assert main(command) == 0\n"
+        "print({'jax', 'equinox'} & sys.modules.keys())\n"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert run.stdout.splitlines()[-1:] == ["set()"], run.stderr
 
 
 def test_holes_are_black_and_the_rest_is_not():

@@ -163,6 +163,10 @@ BAD = [
     (settings(max_depth=-1), "Settings: max_depth must be a whole number from 0 on, it is -1"),
     (settings(max_depth=True), "Settings: max_depth must be a whole number from 0 on, it is True"),
     (settings(chunk=63), "Settings: chunk must be a whole number from 64 on, it is 63"),
+    (
+        settings(chunk=10**8),
+        "Settings: chunk must be at most 1048576, it is 100000000; with 1024, the default, rays are traced fastest",
+    ),
     (settings(chunk="1024"), "Settings: chunk must be a whole number from 64 on, it is '1024'"),
     (lambda: jaxhf.Cylinder(radius=0), "Cylinder: radius must be positive, it is 0.0"),
     (lambda: jaxhf.Cylinder(radius=INF), "Cylinder: radius must be positive"),

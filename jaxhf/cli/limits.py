@@ -1,0 +1,44 @@
+"""What this machine can do: too many devices are refused, and pictures that do not fit into its memory."""
+
+from typing import TYPE_CHECKING
+
+from ..core.errors import UserError
+from ..core.machine import available_bytes, default_devices, usable_cores
+
+if TYPE_CHECKING:
+    from ..scene.scene import Scene
+
+# In single precision, without what a process needs anyway: for each height 52 on each device, for each pixel 45 on the host
+# while it is rendered and 110 while a .png is written. These are refused less than that, so that what might fit is tried.
+_BYTES_A_HEIGHT = 45
+_BYTES_A_PIXEL = 40
+# A device more costs 7 ms a run, and rays take 10 (one terrain) to 300 ms (mirrors) to trace.
+_RAYS_A_DEVICE = 2**16
+
+
+def require_devices(devices: int | None) -> None:
+    """UserError where there are more devices than could ever pay; None: those of `default_devices`."""
+    most = max(16, usable_cores())
+    if devices is not None and not 1 <= devices <= most:
+        raise UserError(
+            f"--devices must be a whole number from 1 to {most}, it is {devices}; {default_devices()} are best here"
+        )
+
+
+def worthwhile_devices(rays: int) -> int:
+    """How many devices at most pay for so many camera rays."""
+    return max(1, rays // _RAYS_A_DEVICE)
+
+
+def require_memory(scene: "Scene", devices: int) -> None:
+    """UserError where a picture of this scene certainly needs more memory than there is."""
+    width, height = scene.camera.width, scene.camera.height
+    heights = sum(field.heights.size for field in scene.heightfields)
+    single = scene.heights.dtype.itemsize / 4 if scene.heightfields else 1
+    needed, available = single * (_BYTES_A_HEIGHT * heights * devices + _BYTES_A_PIXEL * width * height), available_bytes()
+    if needed > available:
+        raise UserError(
+            f"{width} x {height} pixels of {heights} heights take more than {needed / 1e9:.3g} GB of memory on {devices} "
+            f"device{'s' * (devices > 1)}, {available / 1e9:.3g} GB are free; a smaller picture or terrain, or fewer "
+            "--devices, take less"
+        )

@@ -1,0 +1,67 @@
+"""What does not fit on the machine is refused in one line, before anything is traced."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxhf.cli import limits
+from jaxhf.cli.main import main
+from jaxhf.core.errors import UserError
+
+SCENE = str(Path(__file__).parents[2] / "scenes" / "debug4x4.toml")  # 320 x 240, 4 samples
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys, tmp_path):
+    """The one line of a command that is refused."""
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: limits.require_devices(options.devices))
+    monkeypatch.setattr("jaxhf.rendering.render.render", lambda *_, **__: pytest.fail("began to render"))
+
+    def run(*arguments):
+        assert main([*arguments, "-o", str(tmp_path / "out.npy")]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        return line.removeprefix("jaxhf: error: ")
+
+    return run
+
+
+@pytest.mark.parametrize("count", ["0", "1000"])
+def test_devices_that_cannot_pay(refused, monkeypatch, count):
+    monkeypatch.setattr(limits, "usable_cores", lambda: 24)
+    monkeypatch.setattr(limits, "default_devices", lambda: 16)
+    wanted = f"--devices must be a whole number from 1 to 24, it is {count}; 16 are best here"
+    assert refused("render", SCENE, "--devices", count) == wanted
+    assert refused("tradeoff", SCENE, "--devices", "1000") == wanted.replace("it is 0", "it is 1000")
+
+
+def test_a_picture_that_does_not_fit(refused, monkeypatch):
+    monkeypatch.setattr(limits, "available_bytes", lambda: 4e9)
+    line = refused("render", SCENE, "--width", "20000", "--devices", "1")
+    assert line.startswith("20000 x 15000 pixels of 16 heights take more than 12 GB of memory on 1 device, 4 GB are free")
+
+
+def test_what_may_fit_is_tried(refused, monkeypatch):
+    monkeypatch.setattr(limits, "available_bytes", lambda: 40.5 * 320 * 240)
+    with pytest.raises(pytest.fail.Exception, match="began to render"):
+        refused("render", SCENE, "--devices", "1")
+    monkeypatch.setattr(limits, "available_bytes", lambda: 39.5 * 320 * 240)
+    assert "pixels of 16 heights" in refused("render", SCENE, "--devices", "1")
+
+
+def test_a_terrain_counts_on_each_device(refused, monkeypatch):
+    """A map of 100 million heights, which is not made: only its size counts."""
+
+    heights: Any = SimpleNamespace(size=10**8, dtype=np.dtype(np.float64))
+    camera, field = SimpleNamespace(width=10, height=10), SimpleNamespace(heights=heights)
+    scene: Any = SimpleNamespace(camera=camera, heightfields=[field], heights=heights)
+    monkeypatch.setattr(limits, "available_bytes", lambda: 10e9)
+    limits.require_memory(scene, 1)
+    with pytest.raises(UserError, match="take more than 18 GB of memory on 2 devices, 10 GB are free"):
+        limits.require_memory(scene, 2)
+
+
+def test_small_pictures_get_fewer_devices():
+    assert [limits.worthwhile_devices(rays) for rays in (1, 70_000, 140_000, 10**7)] == [1, 1, 2, 152]

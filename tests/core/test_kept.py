@@ -1,0 +1,114 @@
+"""Programs in a folder: found by all that tracing depends on, and replaced where they are damaged."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxhf.core.compilation import compiled
+from jaxhf.core.kept import LOADED, Kept, keep_in
+
+traced = []
+
+
+class Pair(eqx.Module):
+    a: jax.Array
+    b: jax.Array
+    name: str = eqx.field(static=True, default="pair")
+
+
+def scaled(pair, factor, *, power):
+    traced.append(power)
+    return Pair(factor * pair.a**power, factor * pair.b**power), {"sum": jnp.sum(pair.a)}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    keep_in(tmp_path)
+    traced.clear()
+    yield tmp_path
+    keep_in(None)
+
+
+def call(a, factor=2.0, power=2):
+    """As a new process does, which knows of the folder alone."""
+    pair, more = compiled(scaled, static_argnames=("power",))(Pair(a, jnp.ones(3)), factor, power=power)
+    np.testing.assert_array_equal(pair.a, factor * np.asarray(a) ** power)
+    np.testing.assert_array_equal(pair.b, np.full(3, factor))
+    assert pair.name == "pair"
+    assert more["sum"] == a.sum()
+
+
+def test_a_kept_program_is_not_traced_again(folder):
+    loaded = []
+    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: loaded.append(event))
+    call(np.arange(3.0))
+    call(np.arange(3.0) + 1, factor=5.0)
+    assert traced == [2]
+    assert len(list(folder.iterdir())) == 1
+    assert LOADED in loaded
+    call(np.arange(3.0), power=3)
+    call(np.arange(3.0, dtype=np.float32))
+    call(np.arange(4.0))
+    call(jax.device_put(jnp.arange(4.0), jax.devices()[0]))
+    assert traced == [2, 3, 2, 2, 2]
+
+
+def test_another_source_or_configuration_is_traced_again(folder, monkeypatch):
+    call(np.arange(3.0))
+    with jax.default_matmul_precision("float32"):
+        call(np.arange(3.0))
+    monkeypatch.setattr("jaxhf.core.kept._source", lambda: b"another")
+    call(np.arange(3.0))
+    assert traced == [2, 2, 2]
+
+
+def test_what_jax_has_kept_is_not_kept_again(folder, monkeypatch):
+    """XLA stores a loaded program without its kernels: it loads, and fails where it runs."""
+    before = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    try:
+        for source in (b"old", b"new", b"new"):
+            monkeypatch.setattr("jaxhf.core.kept._source", lambda source=source: source)
+            call(np.arange(5.0))
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
+    assert traced == [2, 2]
+
+
+def flipped(stored):
+    return bytes([*stored[:900], stored[900] ^ 1, *stored[901:]])
+
+
+@pytest.mark.parametrize("damaged", [lambda stored: stored[:500], lambda _: b"", flipped])
+def test_a_damaged_program_is_replaced(folder, damaged):
+    call(np.arange(3.0))
+    (path,) = folder.iterdir()
+    path.write_bytes(damaged(path.read_bytes()))
+    with pytest.warns(UserWarning, match="Error reading persistent compilation cache entry for 'scaled'") as said:
+        call(np.arange(3.0))
+    assert len(said) == 1
+    call(np.arange(3.0))
+    assert traced == [2, 2]
+
+
+def test_a_folder_that_is_gone_gets_one_warning(folder):
+    folder.rmdir()
+    with pytest.warns(UserWarning, match="Error writing persistent compilation cache entry for 'scaled'") as said:
+        call(np.arange(3.0))
+    assert len(said) == 1
+    folder.mkdir()
+
+
+def test_only_what_its_arguments_describe_is_kept(folder):
+    """A function within another may hold values of it; and JAX's transformations see through."""
+    inner = compiled(lambda x: scaled(Pair(x, x), 1.0, power=2)[0].a)
+    assert inner(jnp.ones(2)).sum() == 2
+    keeps = compiled(scaled, static_argnames=("power",))
+    gradient = jax.grad(lambda x: keeps(Pair(x, x), 2.0, power=2)[0].a.sum())(jnp.ones(2))
+    np.testing.assert_array_equal(gradient, 4)
+    assert not list(folder.iterdir())
+    assert Kept.serves(scaled)
+    keep_in(None)
+    assert not Kept.serves(scaled)
