@@ -84,6 +84,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256, 1024], help="vertices a side")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="cores that share the work")
+    parser.add_argument("--fixed", action="store_true", help="without early exit, also with a budget of 64 steps")
     parser.add_argument("--mitsuba", action="store_true")
     parser.add_argument("--embree", action="store_true", help="with embreex, and shading in NumPy")
     parser.add_argument("--povray", action="store_true", help="what povray says of itself, after the others")
@@ -98,6 +99,10 @@ def main() -> None:
                 "dda": ours(heights, camera, jaxhf.Settings(traversal="dda")),
                 "pyramid, prepared": prepared(heights, camera),
             }
+            if options.fixed:
+                variants["64 steps"] = ours(heights, camera, jaxhf.Settings(max_steps=64))
+                variants["no early exit, 64 steps"] = ours(heights, camera, jaxhf.Settings(early_exit=False, max_steps=64))
+                variants["no early exit"] = ours(heights, camera, jaxhf.Settings(early_exit=False))
             if options.mitsuba:
                 variants |= mitsuba(heights, camera)
             if options.embree:

@@ -141,7 +141,7 @@ def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkRes
             normals = _moved(normals, grid.perturbation.normals)
     plane = plane_through(heights, found.upper)
     met = found.status == int(Status.HIT)
-    t, *geometry = only_where(met, _geometry, grid, ray, found, plane, normals)
+    t, *geometry = only_where(met, _geometry, grid, ray, found, plane, normals, skips=grid.early_exit)
     t = jnp.where(met, t / scale, jnp.inf)
     t, p, n, ns, uv, dp_du, dp_dv, dn_du, dn_dv = materialise((t, *geometry))
     return Hit(

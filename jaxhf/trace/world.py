@@ -71,7 +71,8 @@ def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: S
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
         normals = settings.normals if settings.shading == "smooth" else None
-        return make_grid(shape, world, normals, levels=0 if settings.traversal == "dda" else None)
+        levels = 0 if settings.traversal == "dda" else None
+        return make_grid(shape, world, normals, levels, settings.early_exit)
     return make_tube(shape, world)
 
 

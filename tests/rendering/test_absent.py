@@ -15,7 +15,7 @@ import pytest
 
 import jaxhf
 from jaxhf.boundary import guiding, sample
-from jaxhf.core import affine, autodiff
+from jaxhf.core import affine, autodiff, masked
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import localise
 from jaxhf.shade import lighting, radiance
@@ -181,6 +181,11 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
         Case(scene(), jaxhf.Settings(shading="flat", shadows=False, max_steps=6)),
         [fails_everywhere(search.first_triangle, lambda max_steps=None, **_: max_steps is not None)],
     ),
+    "fixed number of steps": (
+        "plain",
+        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, early_exit=False)),
+        [fails_everywhere(masked.only_where, lambda skips=True, **_: not skips)],
+    ),
 }
 
 
@@ -197,7 +202,7 @@ def test_a_feature_that_is_used_is_in_the_program(name, monkeypatch):
     without_it, with_it, changes = FEATURES[name]
     program, other = baseline(without_it), with_it.program()
     assert other != program
-    assert len(other) > len(program) or name == "step budget"  # that is another number of steps, no more
+    assert len(other) > len(program) or name in ("step budget", "fixed number of steps")  # another loop, no more
     for change in changes:
         with monkeypatch.context() as patch:
             change(patch)
