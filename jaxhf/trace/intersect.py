@@ -71,14 +71,7 @@ def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
 
 
 def blocked(
-    surface: Surface,
-    number: int,
-    ray: Ray,
-    leaving: Hit,
-    *,
-    max_steps: int | None,
-    active: Flag,
-    t_max: Scalar | None,
+    surface: Surface, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, *, number: int, max_steps: int | None
 ) -> tuple[Flag, Flag]:
     """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out; no derivative."""
     if isinstance(surface, Tube):

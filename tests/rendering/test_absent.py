@@ -19,7 +19,7 @@ from jaxhf.core import affine, autodiff, masked
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import localise
 from jaxhf.shade import lighting, radiance
-from jaxhf.trace import cylinder, intersect, normals, search, world as trace_world
+from jaxhf.trace import ceiling, cylinder, intersect, normals, search, world as trace_world
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
@@ -125,7 +125,7 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
     "shadows": (
         "plain",
         Case(scene(), jaxhf.Settings(shading="flat")),
-        [fails_everywhere(intersect.blocked)],
+        [fails_everywhere(intersect.blocked), fails_everywhere(ceiling.make_ceiling), fails_everywhere(ceiling.clears)],
     ),
     "image texture": ("plain", Case(scene(material=TEXTURE)), [fails_in(jaxhf.ImageTexture, "__call__")]),
     "mirror": (
@@ -227,3 +227,12 @@ def test_max_depth_means_nothing_without_mirrors():
     mirror = jaxhf.Scene([jaxhf.Object(FIELD, jaxhf.Mirror())], CAMERA, [SUN])
     one, two = (jaxhf.Settings(max_depth=depth, shading="flat", shadows=False) for depth in (1, 2))
     assert Case(mirror, one).program() != Case(mirror, two).program()
+
+
+@pytest.mark.parametrize(
+    ("lights", "knobs"), [((jaxhf.Point((1, 2, 3)), SKY), {}), ((SUN,), {"max_steps": 9}), ((SUN,), {"early_exit": False})]
+)
+def test_bounds_under_a_light_only_where_they_spare_walks(lights, knobs, monkeypatch):
+    """Not where a walk is to take a number of steps, as its steps are those of the settings."""
+    fails_everywhere(ceiling.make_ceiling)(monkeypatch)
+    Case(scene(lights=lights), jaxhf.Settings(shading="flat", **knobs)).program()
