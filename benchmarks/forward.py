@@ -16,11 +16,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from peers import embree_frame, mitsuba_scene, povray_seconds
 
 import jaxhf
+from jaxhf.core.vector import dot, unit
 from jaxhf.io.procedural import fractal
+from jaxhf.rendering.tiles import Tiling
+from jaxhf.scene.localise import localise
+from jaxhf.trace.ceiling import clears
+from jaxhf.trace.world import first_hit, make_world, resolve_settings
 
 CAMERAS = {  # eye, target, field of view: a fifth of the picture covered, all of it covered
     "A": ((1.2, -0.9, 0.7), (0.5, 0.5, 0.05), 45.0),
@@ -54,6 +60,31 @@ def prepared(heights: np.ndarray, camera: str) -> Callable[[], object]:
     return lambda: jax.block_until_ready(jaxhf.render(ready))
 
 
+def shadow_rays(heights: np.ndarray, camera: str) -> tuple[float, float]:
+    """Of the shadow rays the share that has to walk, and of the tiles with shadow rays that in which one does."""
+    seen = scene(heights, camera)
+    settings = resolve_settings(jaxhf.Settings(), seen)
+
+    @jax.jit
+    def judge(seen: jaxhf.Scene) -> tuple[jax.Array, jax.Array]:
+        world, wi = make_world(seen, settings), unit(jnp.asarray(LIGHTS[camera], heights.dtype))
+        tiling, (_, grid, _), ceiling = Tiling(seen.camera, settings), world.grids[0], world.ceilings[0][0]
+        assert ceiling is not None
+
+        def one(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+            hit = first_hit(world, seen.camera.ray(x + 0.5, y + 0.5))
+            wanted = (hit.object == 0) & (dot(wi, hit.n) * hit.side > 0)
+            return wanted, wanted & ~clears(ceiling, grid, 0, hit)
+
+        def tile(number: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jax.vmap(one)(*(place.astype(heights.dtype) for place in tiling.pixels(number)))
+
+        return jax.lax.map(tile, np.arange(tiling.count, dtype=np.int32))
+
+    wanted, walks = map(np.asarray, judge(localise(seen)))
+    return walks.sum() / wanted.sum(), walks.any(1).sum() / wanted.any(1).sum()
+
+
 def mitsuba(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]:
     dr, mi, loaded, parameters, positions = made = mitsuba_scene(heights, CAMERAS[camera], LIGHTS[camera], PIXELS, "direct")
 
@@ -84,6 +115,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256, 1024], help="vertices a side")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="cores that share the work")
+    parser.add_argument("--fixed", action="store_true", help="without early exit, also with a budget of 64 steps")
     parser.add_argument("--mitsuba", action="store_true")
     parser.add_argument("--embree", action="store_true", help="with embreex, and shading in NumPy")
     parser.add_argument("--povray", action="store_true", help="what povray says of itself, after the others")
@@ -98,11 +130,17 @@ def main() -> None:
                 "dda": ours(heights, camera, jaxhf.Settings(traversal="dda")),
                 "pyramid, prepared": prepared(heights, camera),
             }
+            if options.fixed:
+                variants["64 steps"] = ours(heights, camera, jaxhf.Settings(max_steps=64))
+                variants["no early exit, 64 steps"] = ours(heights, camera, jaxhf.Settings(early_exit=False, max_steps=64))
+                variants["no early exit"] = ours(heights, camera, jaxhf.Settings(early_exit=False))
             if options.mitsuba:
                 variants |= mitsuba(heights, camera)
             if options.embree:
                 variants |= embree(heights, camera)
             report(f"{size}² heights, camera {camera}", variants, options.repeats)
+            rays, tiles = shadow_rays(heights, camera)
+            print(f"  shadow rays that walk: {rays:.1%}, in {tiles:.0%} of the tiles that have shadow rays", flush=True)
             if options.povray:
                 with tempfile.TemporaryDirectory() as folder:
                     said = [

@@ -11,7 +11,7 @@ from jax import lax
 from .types import Flag
 
 
-def only_where(needed: Flag, fun: Callable[..., Any], *args: Any) -> Any:
+def only_where(needed: Flag, fun: Callable[..., Any], *args: Any, skips: bool = True) -> Any:
     """`fun(*args)`; under `vmap` zeros instead, without computing anything, where not one of the rays needs it.
 
     Half of a picture's tiles may show nothing but background. Without `vmap` the function is simply called. It takes part in
@@ -21,7 +21,10 @@ def only_where(needed: Flag, fun: Callable[..., Any], *args: Any) -> Any:
       needed: whether this ray's result is going to be used. Others must not look at theirs.
       fun: a function of one ray, with no other traced values than its arguments.
       args: pytrees of arrays.
+      skips: False computes it in any case, by the same program but for that.
     """
+    if not skips:
+        needed = lax.optimization_barrier(jnp.ones((), bool))
 
     once = jax.jit(fun)
 

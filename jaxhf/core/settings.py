@@ -39,6 +39,14 @@ class Settings:
             "metavar": "N",
         },
     )
+    early_exit: bool = field(
+        default=True,
+        metadata={
+            "help": "the end of a search when all rays of its batch have ended; without it each search is a loop of max_steps "
+            "steps, or of as many as any ray needs, nothing else is skipped either where no ray needs it, and all views of "
+            "a scene take the same time; the hits are the same, bit for bit",
+        },
+    )
     shading: Shading = field(
         default="smooth", metadata={"help": "smooth, by interpolated normals, or flat, by the triangle's own normal"}
     )
@@ -98,8 +106,9 @@ class Settings:
                 raise ArgumentError(
                     "Settings", name, f"must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}"
                 )
-        if not isinstance(self.shadows, bool):
-            raise ArgumentError("Settings", "shadows", f"must be True or False, it is {self.shadows!r}")
+        for name in ("early_exit", "shadows"):
+            if not isinstance(getattr(self, name), bool):
+                raise ArgumentError("Settings", name, f"must be True or False, it is {getattr(self, name)!r}")
         for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("edge_samples", 0), ("chunk", 64)):
             value = getattr(self, name)
             if value is None and name in ("max_steps", "samples", "edge_samples"):

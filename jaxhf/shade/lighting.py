@@ -9,7 +9,7 @@ from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, largest_component, unit
-from ..scene.light import Directional, Light, Point, Sky
+from ..scene.light import Directional, Point, Sky
 from ..trace.hit import Hit
 from ..trace.world import World, unblocked
 
@@ -17,13 +17,14 @@ from ..trace.world import World, unblocked
 GRAZING = 0.01
 
 
-def irradiance(world: World, light: Light, hit: Hit, active: Flag) -> tuple[Vector, Index]:
-    """What arrives at the side of the surface that the ray came from, (3,), and how many walks ran out of steps."""
+def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vector, Index]:
+    """What one light sends to the side of the surface that the ray came from, (3,), and how many walks ran out of steps."""
+    light = world.lights[number]
     if isinstance(light, Sky):
         cosine = hit.ns[2] * hit.side.astype(hit.ns.dtype)
         return light.radiance * (jnp.pi * (1 + cosine) / 2), jnp.zeros((), jnp.int32)
     wi, arriving, distance = materialise(_towards(light, hit.p))
-    lit, exhausted = _visible(world, wi, distance, hit, active)
+    lit, exhausted = _visible(number, world, wi, distance, hit, active)
     return jnp.where(lit, arriving * _cosine(world, wi, hit), 0), exhausted
 
 
@@ -41,10 +42,10 @@ def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:
     """For each light but the sky, whether it fails to reach the hit: blocked, or behind the surface; shape (lights,)."""
     met = hit.object >= 0
     flags = []
-    for light in world.lights:
+    for number, light in enumerate(world.lights):
         if not isinstance(light, Sky):
             wi, _, distance = _towards(light, hit.p)
-            flags.append(met & ~_visible(world, wi, distance, hit, met)[0])
+            flags.append(met & ~_visible(number, world, wi, distance, hit, met)[0])
     return jnp.stack(flags) if flags else jnp.zeros(0, bool)
 
 
@@ -62,14 +63,14 @@ def _towards(light: Directional | Point, p: Vector) -> tuple[Vector, Vector, Sca
     return to / distance, light.intensity / square / size / size, distance * size
 
 
-def _visible(world: World, wi: Vector, distance: Scalar | None, hit: Hit, active: Flag) -> tuple[Flag, Index]:
-    """Whether light from `wi` reaches the side that the ray came from, and how many walks ran out of steps.
+def _visible(number: int, world: World, wi: Vector, distance: Scalar | None, hit: Hit, active: Flag) -> tuple[Flag, Index]:
+    """Whether a light, seen at `wi`, reaches the side that the ray came from, and how many walks ran out of steps.
 
     The triangle's own normal decides on which side the light stands (Veach 1997, section 5.3; pbrt-v2's BSDF::f).
     """
     lit = active & (dot(wi, hit.n) * hit.side.astype(wi.dtype) > 0)
     if world.settings.shadows:
-        return unblocked(world, Ray(hit.p, wi), hit, lit, distance)
+        return unblocked(world, Ray(hit.p, wi), hit, lit, distance, number)
     return lit, jnp.zeros((), jnp.int32)
 
 

@@ -1,5 +1,6 @@
 """Radiance along one ray: direct light, and what mirrors show."""
 
+import functools
 from collections.abc import Iterable
 
 import jax.numpy as jnp
@@ -52,7 +53,7 @@ def _path(world: World, ray: Ray, leaving: Hit, active: Flag, length: int) -> tu
 
     def bounce(carry, _):
         ray, leaving, throughput, total, active, exhausted = carry
-        arrived = only_where(active, _bounce, world, ray, leaving, active)
+        arrived = only_where(active, _bounce, world, ray, leaving, active, skips=world.settings.early_exit)
         mirrored_ray, hit, reflectance, light, goes_on, more = arrived
         carry = mirrored_ray, hit, throughput * reflectance, total + throughput * light, goes_on, exhausted + more
         return carry, None
@@ -107,8 +108,10 @@ def _outgoing(world: World, ray: Ray, hit: Hit, active: Flag) -> tuple[Vector, I
     albedo = _albedo(world, hit)
     if albedo is not None:
         matte = met & _has_material(world, hit, Matte)
-        for light in world.lights:
-            arriving, more = only_where(matte, irradiance, world, light, hit, matte)
+        for number in range(len(world.lights)):
+            arriving, more = only_where(
+                matte, functools.partial(irradiance, number), world, hit, matte, skips=world.settings.early_exit
+            )
             total, exhausted = total + arriving, exhausted + more
         total = jnp.where(matte, albedo / jnp.pi * total, 0)
     for light in world.lights:

@@ -37,9 +37,9 @@ ERRORS = {"picture": "rmse", "derivative": "relative_error", "fit": "rmse"}
 # What each knob is set to besides its value in the base; a scene without mirrors or lights that cast shadows has fewer.
 _VALUES: dict[str, dict[str, tuple[Any, ...]]] = {
     "picture": {
-        "precision": ("float64",), "traversal": ("dda",), "max_steps": (8, 16, 32, 64, 128), "samples": (1, 4, 9, 16, 64),
-        "shading": ("flat",), "normals": ("central", "four", "six-angle", "six-equal"), "shadows": (False,),
-        "max_depth": (0, 1, 2), "chunk": (256, 4096, 16384),
+        "precision": ("float64",), "traversal": ("dda",), "max_steps": (8, 16, 32, 64, 128), "early_exit": (False,),
+        "samples": (1, 4, 9, 16, 64), "shading": ("flat",), "normals": ("central", "four", "six-angle", "six-equal"),
+        "shadows": (False,), "max_depth": (0, 1, 2), "chunk": (256, 4096, 16384),
     },
     "derivative": {
         "edge_samples": (0, 1000, 100_000), "samples": (1, 16), "precision": ("float64",), "shading": ("flat",),
@@ -200,6 +200,8 @@ def _configurations(scene: Scene, knobs: Collection[str], quick: bool, fits: boo
 
     picture = Configuration("picture", settings=resolve_settings(Settings(), scene))
     yield from one_at_a_time(picture, knobs)
+    if {"early_exit", "max_steps"} <= knobs:
+        yield picture.replace(early_exit=False, max_steps=64)
     for changes in ({"shading": "flat"}, {"shadows": False}, {"shading": "flat", "shadows": False}):
         for samples in (picture.settings.samples, *((1, 16) if "samples" in knobs else ())):
             if changes.keys() <= knobs:

@@ -32,6 +32,7 @@ class Grid(eqx.Module):
       pyramid: bounds over blocks of cells.
       normals: at the vertices, object frame; None where shading is flat.
       shape: (ny, nx).
+      early_exit: whether searches on it end early, see `first_triangle`.
       perturbation: what is added at the vertices of the triangle that a ray meets, for derivatives of one ray in those
         numbers alone; None: nothing.
     """
@@ -44,6 +45,7 @@ class Grid(eqx.Module):
     grid_from_world: Affine
     object_from_world: Affine | None
     shape: tuple[int, int] = eqx.field(static=True)
+    early_exit: bool = eqx.field(static=True, default=True)
     perturbation: Corners | None = None
 
     @property
@@ -59,7 +61,11 @@ class Grid(eqx.Module):
 
 
 def make_grid(
-    field: Heightfield, world_from_object: Affine | None, normals: NormalScheme | None, levels: int | None = None
+    field: Heightfield,
+    world_from_object: Affine | None,
+    normals: NormalScheme | None,
+    levels: int | None = None,
+    early_exit: bool = True,
 ) -> Grid:
     """Prepares `field` for tracing: dense array arithmetic, differentiable in the heights and in the transform.
 
@@ -68,6 +74,7 @@ def make_grid(
       world_from_object: None for the identity.
       normals: the scheme at the vertices; None for none.
       levels: of the pyramid, above its finest; None for all.
+      early_exit: see `Grid`.
     """
     heights = jnp.asarray(field.heights)
     (ny, nx), dtype = heights.shape, heights.dtype
@@ -93,7 +100,9 @@ def make_grid(
     at_vertices = None if normals is None else vertex_normals(heights, field.dx, field.dy, normals)
     pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels)
     normal_rows = None if at_vertices is None else at_vertices.reshape(-1, 3)
-    return Grid(z.reshape(-1), z_top, pyramid, normal_rows, world_from_grid, grid_from_world, object_from_world, (ny, nx))
+    return Grid(
+        z.reshape(-1), z_top, pyramid, normal_rows, world_from_grid, grid_from_world, object_from_world, (ny, nx), early_exit
+    )
 
 
 def triangle_plane(grid: Grid, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:

@@ -81,14 +81,7 @@ def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
 
 
 def blocked(
-    surface: Surface,
-    number: int,
-    ray: Ray,
-    leaving: Hit,
-    *,
-    max_steps: int | None,
-    active: Flag,
-    t_max: Scalar | None,
+    surface: Surface, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, *, number: int, max_steps: int | None
 ) -> tuple[Flag, Flag]:
     """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out; no derivative."""
     if isinstance(surface, Tube):
@@ -151,7 +144,7 @@ def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkRes
             normals = _moved(normals, grid.perturbation.normals)
     plane = plane_through(heights, found.upper)
     met = found.status == int(Status.HIT)
-    t, *geometry = only_where(met, _geometry, grid, ray, found, plane, normals)
+    t, *geometry = only_where(met, _geometry, grid, ray, found, plane, normals, skips=grid.early_exit)
     t = jnp.where(met, t / scale, jnp.inf)
     t, p, n, ns, uv, dp_du, dp_dv, dn_du, dn_dv = materialise((t, *geometry))
     return Hit(

@@ -1,5 +1,6 @@
 """Which triangle does a ray meet? A discrete search: integers come out, which carry no derivative."""
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -33,7 +34,8 @@ def first_triangle(
     With one level of bounds this is the walk of Amanatides and Woo (A fast voxel traversal algorithm, Eurographics 1987), with
     the distance to each crossing recomputed from the integer cell, as a running sum drifts; with all levels, that of Tevs
     et al. (I3D 2008) over their maximum mipmaps. The loop has a fixed budget of steps and ends early, when all rays of the
-    batch have ended. The search is discrete and under `stop_gradient`; derivatives begin at the hit, see `surface_hit`.
+    batch have ended; without the grid's `early_exit` it always takes all of them. The search is discrete and under
+    `stop_gradient`; derivatives begin at the hit, see `surface_hit`.
 
     Args:
       grid: the surface.
@@ -49,7 +51,8 @@ def first_triangle(
     grid, ray, leaving, t_max = lax.stop_gradient((grid, ray, leaving, t_max))
     walk, state, valid = walk_start(grid, ray, leaving, number, t_max, active)
     bound = enough_steps(grid)
-    state, steps = _search(walk, state, bound if max_steps is None else min(max_steps, bound), count_steps)
+    budget = bound if max_steps is None else min(max_steps, bound)
+    state, steps = _search(walk, state, budget, count_steps, grid.early_exit)
     return walk.finish(state, valid, steps)
 
 
@@ -71,7 +74,7 @@ Step = Callable[[jax.Array], jax.Array]
 _SKIPS = 2
 
 
-def _search(walk: Walk, state: jax.Array, budget: int, count: bool) -> tuple[jax.Array, Index | None]:
+def _search(walk: Walk, state: jax.Array, budget: int, count: bool, early_exit: bool) -> tuple[jax.Array, Index | None]:
     """The state in which a walk ends, and the number of its steps if they are to be counted.
 
     Under `vmap` the steps are repeated until the last walk of the batch has ended. JAX's own rule for `while_loop` would
@@ -81,7 +84,7 @@ def _search(walk: Walk, state: jax.Array, budget: int, count: bool) -> tuple[jax
 
     @jax.custom_batching.custom_vmap
     def run(walk: Walk, state: jax.Array):
-        return _until_done(walk.skip, walk.visit, state, budget, count)
+        return _steps(walk.skip, walk.visit, state, budget, count, early_exit)
 
     @run.def_vmap
     def run_many(axis_size: int, in_batched, walk: Walk, state: jax.Array):
@@ -89,29 +92,30 @@ def _search(walk: Walk, state: jax.Array, budget: int, count: bool) -> tuple[jax
         state = state if in_batched[1] else jnp.broadcast_to(state, (axis_size,))
         skip = jax.vmap(lambda batched, state: eqx.combine(batched, shared).skip(state))
         visit = jax.vmap(lambda batched, state: eqx.combine(batched, shared).visit(state))
-        ended = _until_done(lambda state: skip(batched, state), lambda state: visit(batched, state), state, budget, count)
+        skip_all, visit_all = (functools.partial(step, batched) for step in (skip, visit))
+        ended = _steps(skip_all, visit_all, state, budget, count, early_exit)
         return ended, jax.tree.map(lambda _: True, ended)
 
     return run(walk, state)
 
 
-def _until_done(
-    skip: Step, visit: Step, state: UInt32[jax.Array, "*batch"], budget: int, count: bool
+def _steps(
+    skip: Step, visit: Step, state: UInt32[jax.Array, "*batch"], budget: int, count: bool, early_exit: bool
 ) -> tuple[UInt32[jax.Array, "*batch"], Int[jax.Array, "*batch"] | None]:
     """Repeats steps, each of which skips a few blocks and visits one cell, for one ray or a batch of them."""
 
-    def going(carry):
-        step, state, _ = carry
-        return (step < budget) & walking(state).any()
-
-    def advance(carry):
-        step, state, steps = carry
+    def advance(state, steps):
         if steps is not None:
             steps = steps + walking(state).astype(jnp.int32)
         state = lax.fori_loop(0, _SKIPS, lambda _, state: skip(state), state)
-        return step + 1, visit(state), steps
+        return visit(state), steps
 
-    none = jnp.zeros((), jnp.int32)
-    steps = jnp.zeros(state.shape, jnp.int32) if count else None
-    _, state, steps = lax.while_loop(going, advance, (none, state, steps))
-    return state, steps
+    init = state, jnp.zeros(state.shape, jnp.int32) if count else None
+    if not early_exit:
+        return lax.fori_loop(0, budget, lambda _, carry: advance(*carry), init)
+
+    def going(carry):
+        step, (state, _) = carry
+        return (step < budget) & walking(state).any()
+
+    return lax.while_loop(going, lambda carry: (carry[0] + 1, advance(*carry[1])), (jnp.zeros((), jnp.int32), init))[1]

@@ -1,22 +1,27 @@
 """A scene made ready for tracing, and the first hit over all its objects."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from ..core.affine import affine
+from ..core.masked import only_where
 from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.sampling import grid_side
 from ..core.settings import Settings
 from ..core.types import Flag, Index, MatrixLeaf, Scalar
+from ..core.vector import unit
 from ..scene.heightfield import Heightfield
-from ..scene.light import Light
+from ..scene.light import Directional, Light
 from ..scene.material import Material
 from ..scene.scene import Scene, Shape
-from .cylinder import make_tube
+from .ceiling import Ceiling, clears, make_ceiling
+from .cylinder import Tube, make_tube
 from .grid import Grid, make_grid
 from .hit import Hit
 from .intersect import Surface, blocked, intersect
@@ -30,12 +35,15 @@ class World(eqx.Module):
       surfaces: of each object, see `make_grid` and `make_tube`.
       materials: of each object.
       lights: as the scene's.
+      ceilings: for each light and each object, where that object cannot keep the light from itself; None for all but a
+        heightfield under a directional light, and where no walk is to be spared.
       settings: nothing in them is left to the scene, see `resolve_settings`.
     """
 
     surfaces: tuple[Surface, ...]
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
+    ceilings: tuple[tuple[Ceiling | None, ...], ...]
     settings: Settings = eqx.field(static=True)
 
     @property
@@ -58,12 +66,22 @@ def resolve_settings(settings: Settings, scene: Scene) -> Settings:
 def make_world(scene: Scene, settings: Settings) -> World:
     """Prepares what does not depend on the ray; `scene` must be `localise`d."""
     settings = resolve_settings(settings, scene)
+    surfaces = tuple(make_surface(obj.shape, obj.world_from_object, settings) for obj in scene.objects)
+    # A walk whose steps are counted is not to be spared.
+    spared = settings.shadows and settings.early_exit and settings.max_steps is None
     return World(
-        surfaces=tuple(make_surface(obj.shape, obj.world_from_object, settings) for obj in scene.objects),
+        surfaces=surfaces,
         materials=tuple(obj.material for obj in scene.objects),
         lights=scene.lights,
+        ceilings=tuple(tuple(_make_ceiling(surface, light, spared) for surface in surfaces) for light in scene.lights),
         settings=settings,
     )
+
+
+def _make_ceiling(surface: Surface, light: Light, wanted: bool) -> Ceiling | None:
+    if not wanted or not isinstance(surface, Grid) or not isinstance(light, Directional):
+        return None
+    return make_ceiling(surface, unit(light.towards))
 
 
 def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: Settings) -> Surface:
@@ -71,7 +89,8 @@ def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: S
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
         normals = settings.normals if settings.shading == "smooth" else None
-        return make_grid(shape, world, normals, levels=0 if settings.traversal == "dda" else None)
+        levels = 0 if settings.traversal == "dda" else None
+        return make_grid(shape, world, normals, levels, settings.early_exit)
     return make_tube(shape, world)
 
 
@@ -104,11 +123,28 @@ def nearest_hit(hits: list[Hit]) -> Hit:
     return materialise(dataclasses.replace(nearest, object=number))
 
 
-def unblocked(world: World, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None) -> tuple[Flag, Index]:
-    """Whether an active ray from the hit `leaving` meets nothing before `t_max`, and how many walks ran out of steps."""
+def unblocked(
+    world: World, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, light: int | None = None
+) -> tuple[Flag, Index]:
+    """Whether an active ray meets nothing before `t_max`, and how many walks ran out of steps; no derivative.
+
+    Args:
+      world: what may be in the way.
+      ray: from the hit `leaving`.
+      active: False spares the ray the search; it then counts as blocked.
+      t_max: where to give up; None: nowhere.
+      light: the number of the light to which the ray goes, whose ceilings then spare walks; None: of no light.
+    """
+    surfaces, ray, leaving, t_max = lax.stop_gradient((world.surfaces, ray, leaving, t_max))
     free, exhausted = active, jnp.zeros((), jnp.int32)
-    for number, surface in enumerate(world.surfaces):
-        met, ran_out = blocked(surface, number, ray, leaving, max_steps=world.settings.max_steps, active=free, t_max=t_max)
+    for number, surface in enumerate(surfaces):
+        search = functools.partial(blocked, number=number, max_steps=world.settings.max_steps)
+        ceiling = None if light is None else world.ceilings[light][number]
+        if ceiling is None or isinstance(surface, Tube):
+            met, ran_out = search(surface, ray, leaving, free, t_max)
+        else:
+            walks = free & ~clears(ceiling, surface, number, leaving)
+            met, ran_out = only_where(walks, search, surface, ray, leaving, walks, t_max)
         free, exhausted = free & ~met, exhausted + ran_out.astype(jnp.int32)
     return free, exhausted
 

@@ -15,11 +15,11 @@ import pytest
 
 import jaxhf
 from jaxhf.boundary import guiding, sample
-from jaxhf.core import affine, autodiff
+from jaxhf.core import affine, autodiff, masked
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import localise
 from jaxhf.shade import lighting, radiance
-from jaxhf.trace import cylinder, intersect, normals, search, world as trace_world
+from jaxhf.trace import ceiling, cylinder, intersect, normals, search, world as trace_world
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
@@ -125,7 +125,7 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
     "shadows": (
         "plain",
         Case(scene(), jaxhf.Settings(shading="flat")),
-        [fails_everywhere(intersect.blocked)],
+        [fails_everywhere(intersect.blocked), fails_everywhere(ceiling.make_ceiling), fails_everywhere(ceiling.clears)],
     ),
     "image texture": ("plain", Case(scene(material=TEXTURE)), [fails_in(jaxhf.ImageTexture, "__call__")]),
     "mirror": (
@@ -181,6 +181,11 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
         Case(scene(), jaxhf.Settings(shading="flat", shadows=False, max_steps=6)),
         [fails_everywhere(search.first_triangle, lambda max_steps=None, **_: max_steps is not None)],
     ),
+    "fixed number of steps": (
+        "plain",
+        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, early_exit=False)),
+        [fails_everywhere(masked.only_where, lambda skips=True, **_: not skips)],
+    ),
 }
 
 
@@ -197,7 +202,7 @@ def test_a_feature_that_is_used_is_in_the_program(name, monkeypatch):
     without_it, with_it, changes = FEATURES[name]
     program, other = baseline(without_it), with_it.program()
     assert other != program
-    assert len(other) > len(program) or name == "step budget"  # that is another number of steps, no more
+    assert len(other) > len(program) or name in ("step budget", "fixed number of steps")  # another loop, no more
     for change in changes:
         with monkeypatch.context() as patch:
             change(patch)
@@ -222,3 +227,12 @@ def test_max_depth_means_nothing_without_mirrors():
     mirror = jaxhf.Scene([jaxhf.Object(FIELD, jaxhf.Mirror())], CAMERA, [SUN])
     one, two = (jaxhf.Settings(max_depth=depth, shading="flat", shadows=False) for depth in (1, 2))
     assert Case(mirror, one).program() != Case(mirror, two).program()
+
+
+@pytest.mark.parametrize(
+    ("lights", "knobs"), [((jaxhf.Point((1, 2, 3)), SKY), {}), ((SUN,), {"max_steps": 9}), ((SUN,), {"early_exit": False})]
+)
+def test_bounds_under_a_light_only_where_they_spare_walks(lights, knobs, monkeypatch):
+    """Not where a walk is to take a number of steps, as its steps are those of the settings."""
+    fails_everywhere(ceiling.make_ceiling)(monkeypatch)
+    Case(scene(lights=lights), jaxhf.Settings(shading="flat", **knobs)).program()

@@ -156,6 +156,7 @@ BAD = [
     (settings(shading="gouraud"), "Settings: shading must be one of smooth, flat; it is 'gouraud'"),
     (settings(normals="five"), "Settings: normals must be one of central, four, six, six-angle, six-equal; it is 'five'"),
     (settings(shadows=1), "Settings: shadows must be True or False, it is 1"),
+    (settings(early_exit=None), "Settings: early_exit must be True or False, it is None"),
     (settings(max_steps=0), "Settings: max_steps must be a whole number from 1 on, it is 0"),
     (settings(max_steps=2.0), "Settings: max_steps must be a whole number from 1 on, it is 2.0"),
     (settings(samples=0), "Settings: samples must be a whole number from 1 on, it is 0"),

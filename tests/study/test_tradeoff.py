@@ -156,7 +156,7 @@ def test_plan_sweeps_what_the_scene_has():
     landsea, texture, debug = (plan(SCENES / f"{name}.toml") for name in ("landsea", "texture", "debug4x4"))
     swept = {knob for changed in knobs_of(landsea) for knob in changed}
     assert swept == {
-        "precision", "traversal", "max_steps", "samples", "shading", "normals", "shadows", "max_depth", "chunk",
+        "precision", "traversal", "max_steps", "early_exit", "samples", "shading", "normals", "shadows", "max_depth", "chunk",
     }  # fmt: skip
     assert {knob for changed in knobs_of(texture) for knob in changed} == swept - {"max_depth"}
     assert knobs_of(texture)[0] == set()
