@@ -5,7 +5,8 @@ light its gradient_B_low.npz is the reference, central differences of another re
 central differences of our own picture with `--fine` samples a pixel, at two steps whose difference is printed as its error.
 Medians over the directions: cosine and relative error, and the noise of the edge points alone, from two keys.
 
-Cost: `--cost` heights a side and as many pixels, value and gradient of a loss against the plain frame, interleaved.
+Cost: value and gradient of a loss against the plain frame, interleaved; with `--mitsuba` also against its `direct` and
+`direct_projective` integrators.
 
 With `--precision` the derivative in single precision against that in double, direction by direction, with the same key: the
 difference relative to the norm, the cosine, the pixel that differs most relative to the largest, and how many pixels hold 99 %
@@ -26,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from forward import report
-from peers import common_work, mitsuba_scene
+from peers import MitsubaScene, common_work, mitsuba_scene
 
 import jaxhf
 
@@ -199,33 +200,51 @@ def mitsuba(
         dr.forward(z)
         rows.append(np.array(dr.grad(image))[..., 0].astype(float))
 
+    return rows, median_ms(mitsuba_step(made, samples))
+
+
+def mitsuba_step(made: MitsubaScene, samples: int) -> Callable[[int], None]:
+    """New heights, picture, gradient of a loss in every vertex; takes a seed."""
+    dr, mi = made.dr, made.mi
+
     def step(seed: int) -> None:
-        positions = mi.Float(base)
+        positions = mi.Float(made.positions)
         dr.enable_grad(positions)
-        parameters[place] = positions
-        parameters.update()
-        image = mi.render(scene, parameters, spp=samples, seed=seed)
+        made.parameters[made.place] = positions
+        made.parameters.update()
+        image = mi.render(made.scene, made.parameters, spp=samples, seed=seed)
         dr.backward(dr.sum(image * image, axis=None))
         dr.eval(dr.grad(positions))
         dr.sync_thread()
 
-    return rows, median_ms(step)
+    return step
 
 
-def cost(work: Any, side: int, edge_samples: list[int]) -> None:
+def cost(work: Any, options: argparse.Namespace) -> None:
+    side, pixels, samples = options.cost, options.cost_pixels, options.cost_samples
     heights = work.bumps(side)[0].astype(np.float32)
-    scene = make_scene(work, heights, "B", "low", side)
+    scene = make_scene(work, heights, "B", "low", pixels)
 
     def loss(heights: jax.Array, key: jax.Array, settings: jaxhf.Settings) -> jax.Array:
         return jnp.sum(jaxhf.render(scene.with_heights(heights), settings, key=key) ** 2)
 
+    def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+        return jax.jit(function, compiler_options=jaxhf.compiler_options())
+
     key = jax.random.key(0)
-    frame = jax.jit(lambda heights: jaxhf.render(scene.with_heights(heights), jaxhf.Settings()))
+    frame = compiled(lambda heights: jaxhf.render(scene.with_heights(heights), jaxhf.Settings(samples=samples)))
     variants: dict[str, Callable[[], object]] = {"frame": lambda: jax.block_until_ready(frame(scene.heights))}
-    for count in edge_samples:
-        step = jax.jit(jax.value_and_grad(lambda heights, key, s=jaxhf.Settings(edge_samples=count): loss(heights, key, s)))
+    for count in options.edge_samples:
+        settings = jaxhf.Settings(samples=samples, edge_samples=count)
+        step = compiled(jax.value_and_grad(lambda heights, key, s=settings: loss(heights, key, s)))
         variants[f"value and gradient, {count} points"] = lambda step=step: jax.block_until_ready(step(scene.heights, key))
-    report(f"{side} x {side} heights and pixels, camera B, low light, float32, one sample", variants, repeats=9)
+    if options.mitsuba:
+        for integrator in ("direct", "direct_projective"):
+            made = mitsuba_scene(heights, work.CAMERAS["B"], work.light("low"), pixels, integrator, samples, work.ALBEDO)
+            step = mitsuba_step(made, samples)
+            variants[f"value and gradient, Mitsuba, {integrator}"] = lambda step=step: step(0)
+    title = f"{side} x {side} heights, {pixels} x {pixels} pixels, {samples} samples, camera B, low light, float32"
+    report(title, variants, repeats=9)
 
 
 def main() -> None:
@@ -236,6 +255,8 @@ def main() -> None:
     parser.add_argument("--edge-samples", type=int, nargs="*", default=[0, 10000, 100000])
     parser.add_argument("--fine", type=int, default=48 * 48, help="samples a pixel of the differences made here")
     parser.add_argument("--cost", type=int, default=256, help="heights a side; 0: leave it out")
+    parser.add_argument("--cost-pixels", type=int, default=256, help="a side (256)")
+    parser.add_argument("--cost-samples", type=int, default=1, help="a pixel (1)")
     parser.add_argument("--interior", action="store_true", help="the interior derivative's error, in place of the whole's")
     parser.add_argument("--precision", action="store_true", help="float32 against float64, in place of either's accuracy")
     parser.add_argument("--keys", type=int, default=1, help="of random numbers, for --precision")
@@ -246,7 +267,7 @@ def main() -> None:
     jax.config.update("jax_num_cpu_devices", options.devices)
     work = common_work(options.peers)
     if options.cost:
-        cost(work, options.cost, options.edge_samples)
+        cost(work, options)
     jax.config.update("jax_enable_x64", True)
     measured = precision if options.precision else interior if options.interior else accuracy
     for view in options.views:

@@ -74,6 +74,7 @@ def mitsuba_scene(
     """
     dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")
     mi.set_variant("llvm_ad_rgb")
+    mi.set_log_level(mi.LogLevel.Error)  # it warns of every picture without mirrored silhouettes
     vertices, faces = mesh_of(heights, extent)
     mesh = mi.Mesh("terrain", len(vertices), len(faces), has_vertex_normals=True)
     parameters = mi.traverse(mesh)

@@ -48,9 +48,9 @@ def traced(settings: jaxhf.Settings, transform: Callable[..., Any]) -> list[Any]
 @pytest.mark.parametrize(
     ("settings", "transform", "bound"),
     [
-        (jaxhf.Settings(), lambda loss: loss, 3750),
-        (jaxhf.Settings(samples=4), jax.value_and_grad, 4750),
-        (jaxhf.Settings(samples=4, edge_samples=1000), jax.value_and_grad, 14000),
+        (jaxhf.Settings(), lambda loss: loss, 4150),
+        (jaxhf.Settings(samples=4), jax.value_and_grad, 5250),
+        (jaxhf.Settings(samples=4, edge_samples=1000), jax.value_and_grad, 14600),
     ],
     ids=["frame", "gradient", "edges"],
 )
