@@ -120,7 +120,9 @@ def test_reverse_mode_keeps_no_heights_a_tile():
     scene = parallel()
     place = scene.objects[0].world_from_object
     field = jaxhf.Heightfield(waves(37, 53, 5, 0.06))
-    scene = jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(0.5), place)], scene.camera, scene.lights)
+    # Under a directional light one conditional a picture, not a tile, has all of a terrain's bounds.
+    light = jaxhf.Point((0.5, 0.5, 3.0), 10.0)
+    scene = jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(0.5), place)], scene.camera, [light])
     gradient = jax.jit(jax.grad(lambda heights: jnp.sum(jaxhf.render(scene.with_heights(heights), SETTINGS))))
     program = gradient.lower(jnp.asarray(scene.heights)).compile().as_text()
     assert program is not None
