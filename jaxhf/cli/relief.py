@@ -106,7 +106,7 @@ def _blocked(
 ) -> Bool[np.ndarray, " n"]:
     """Whether the surface rises above rays from points on it towards a light above the horizon, all in cells.
 
-    Between the lines x = i, y = j and the diagonals x - y = k both are linear, so that the crossings settle it.
+    Between the lines x = i, y = j and the diagonals x - y = k both are linear, so that only the crossings have to be looked at.
     """
     (ny, nx), top, rounding = z.shape, z.max(), 8 * np.finfo(float).eps * np.abs(z).max()
     found = np.zeros(start.size, bool)
