@@ -152,7 +152,7 @@ def _trace_world(
     world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
 ) -> dict[str, jax.Array]:
     if key is not None and edge_sets(world):
-        others = _trace_picture(lax.stop_gradient(world), camera, aovs, mesh) if aovs else {}
+        others = _trace_picture(world, camera, aovs, mesh) if aovs else {}
         drawn = draw_boundaries(world, camera, key, mesh)
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
     return _trace_picture(world, camera, aovs, mesh)

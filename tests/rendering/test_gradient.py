@@ -3,6 +3,7 @@
 No leaf is named here: they are found in the pytree, so that a new one is tested as soon as it is in a scene.
 """
 
+import dataclasses
 import functools
 import math
 import re
@@ -174,3 +175,20 @@ def test_a_miss_has_no_derivative():
     for path, leaf in jax.tree.leaves_with_path(gradient):
         name = jax.tree_util.keystr(path)
         np.testing.assert_array_equal(leaf, missed.sum() if name.endswith("lights[1].radiance") else 0, name)
+
+
+def test_what_rays_met_has_its_derivative_beside_points_on_edges():
+    scene = jax.tree.map(jnp.asarray, parallel())
+
+    def depth(heights: jax.Array, edge_samples: int) -> jax.Array:
+        settings = dataclasses.replace(SETTINGS, edge_samples=edge_samples)
+        return jaxhf.render(scene.with_heights(heights), settings, aovs=("depth",))[1]["depth"]
+
+    plain, beside = (
+        jax.jit(jax.grad(lambda heights, count=count: jnp.sum(jnp.where(jnp.isfinite(d := depth(heights, count)), d, 0))))(
+            scene.heights
+        )
+        for count in (0, 64)
+    )
+    assert np.abs(plain).max() > 0.1
+    np.testing.assert_allclose(beside, plain, rtol=1e-10, atol=1e-12)
