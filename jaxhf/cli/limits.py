@@ -8,8 +8,8 @@ from ..core.machine import available_bytes, default_devices, usable_cores
 if TYPE_CHECKING:
     from ..scene.scene import Scene
 
-# In single precision, without what a process needs anyway: for each height 52 on each device, for each pixel 45 on the host
-# while it is rendered and 110 while a .png is written. These are refused less than that, so that what might fit is tried.
+# Bytes in single precision. Measured at the peak: 57 for each height and device, 50 for each pixel, 116 while a .png is written
+# (docs/performance.md). Less than that is asked for, so that what might fit is tried.
 _BYTES_A_HEIGHT = 45
 _BYTES_A_PIXEL = 40
 # A device more costs 7 ms a run, and rays take 10 (one terrain) to 300 ms (mirrors) to trace.

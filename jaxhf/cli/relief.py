@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from ..io.terrain import Terrain
 
 _MOST = 2e7  # crossings, which take two seconds; the renderer's program compiles for four
-_GRAZING = 0.01
+_GRAZING = 0.01  # that of shade/lighting.py, which imports JAX
 
 _Points = tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]
 

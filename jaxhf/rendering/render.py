@@ -170,7 +170,6 @@ def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, 
     One loop traces all samples, also those of pixels in which boundaries were seen: with a loop of their own for these the
     program compiled for 7 s longer. So they are traced also where nothing is differentiated.
     """
-
     samples = PictureSamples(camera, world.settings, drawn.resampled)
     light = map_over(mesh, lambda seen, points: light_along(*seen, *points)[0], (world, camera), samples.positions())
     image = samples.in_pixels(light)

@@ -83,17 +83,19 @@ def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
 def blocked(
     surface: Surface, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, *, number: int, max_steps: int | None
 ) -> tuple[Flag, Flag]:
-    """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out; no derivative."""
+    """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out.
+
+    Neither has a derivative: the arguments come under `stop_gradient`, see `unblocked`.
+    """
     if isinstance(surface, Tube):
-        t, found = lax.stop_gradient(tube_distance(surface, ray, leaving.object == number))
+        t, found = tube_distance(surface, ray, leaving.object == number)
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
     local, scale = _in_grid(surface, ray)
     t_max = None if t_max is None else t_max * scale
-    grid, local, t_max = lax.stop_gradient((surface, local, t_max))
-    found = first_triangle(grid, local, max_steps=max_steps, active=active, leaving=leaving, number=number, t_max=t_max)
+    found = first_triangle(surface, local, max_steps=max_steps, active=active, leaving=leaving, number=number, t_max=t_max)
     met = found.status == int(Status.HIT)
     if t_max is not None:
-        plane = triangle_plane(grid, found.ix, found.iy, found.upper)
+        plane = triangle_plane(surface, found.ix, found.iy, found.upper)
         met = met & (plane_distance(plane, local, found) < t_max)
     return stored((met, found.status == int(Status.EXHAUSTED)))
 
