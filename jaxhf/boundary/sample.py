@@ -26,8 +26,9 @@ from ..core.types import Flag, Index, Point2, Scalar, Vector
 from ..core.vector import largest_component, unit
 from ..scene.camera import Camera
 from ..scene.light import Point, Sky
-from ..trace.cylinder import tube_distance
+from ..trace.cylinder import Tube, tube_distance
 from ..trace.grid import Grid
+from ..trace.skirt import wall_distance
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
 from ..trace.world import World
 from .guiding import GuidingDistribution, edge_sets
@@ -195,7 +196,9 @@ def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Float[
             step = jnp.where(grazing, 0, (c + a * u + b * v - local.o[2]) / jnp.where(grazing, 1, slope)) / size
             landed = jnp.where(point.receiver == k, near + step * away, landed)
         else:
-            t, found = tube_distance(surface, Ray(p, away), None)
+            ray = Ray(p, away)
+            tube = isinstance(surface, Tube)
+            t, found = tube_distance(surface, ray, None) if tube else wall_distance(surface, ray, None, None)[:2]
             landed = jnp.where(point.receiver == k, p + jnp.where(found, t, point.t) * away, landed)
     return landed
 

@@ -7,7 +7,6 @@ import numpy as np
 
 if TYPE_CHECKING:
     from ..io.terrain import Terrain
-    from ..scene.cylinder import Cylinder
     from ..scene.heightfield import Heightfield
     from ..scene.scene import Scene
 
@@ -19,7 +18,7 @@ def scene_lines(scene: "Scene") -> Iterator[str]:
     eye = np.asarray(scene.camera.world_from_camera)[:3, 3]
     yield f"camera: {type(scene.camera).__name__}, at {_numbers(eye)}"
     for k, obj in enumerate(scene.objects):
-        what = heightfield_line(obj.shape) if isinstance(obj.shape, Heightfield) else _cylinder_line(obj.shape)
+        what = heightfield_line(obj.shape) if isinstance(obj.shape, Heightfield) else repr(obj.shape)
         place = "" if obj.world_from_object is None else ", with a transform"
         yield f"object {k}: {what}, {_material(obj.material)}{place}"
     for k, light in enumerate(scene.lights):
@@ -37,10 +36,6 @@ def heightfield_line(field: "Heightfield | Terrain") -> str:
         f"Heightfield, {ny} x {nx} heights, cells {field.dx:.6g} x {field.dy:.6g}, "
         f"origin {_numbers([field.x0, field.y0])}, range {span}{holes}"
     )
-
-
-def _cylinder_line(cylinder: "Cylinder") -> str:
-    return f"Cylinder, radius {float(cylinder.radius):.6g}, z {_numbers([cylinder.z_min, cylinder.z_max])}"
 
 
 def _material(material: Any) -> str:

@@ -13,6 +13,8 @@ from ..core.errors import ArgumentError
 from ..core.ray import Ray
 from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
 from ..core.vector import unit
+from .framing import framing_pose
+from .heightfield import Heightfield
 from .show import known, numbers
 
 Convention = Literal["opencv", "opengl"]
@@ -123,6 +125,35 @@ class Perspective(eqx.Module):
         columns = xp.stack([right * (f / fx), up * (f / fy), middle, pose[:3, 3]], axis=1)
         fov = xp.rad2deg(2 * xp.arctan(min(width, height) / 2 / f))
         return cls(xp.concatenate([columns, pose[3:]]), fov, width=width, height=height)
+
+    @classmethod
+    def framing(
+        cls,
+        field: Heightfield,
+        azimuth: float = 135.0,
+        altitude: float = 30.0,
+        fov: float = 30.0,
+        *,
+        width: int = 512,
+        height: int = 512,
+        margin: float = 0.05,
+        base: float | None = None,
+    ) -> "Perspective":
+        """The nearest camera that has all of a heightfield in its picture.
+
+        Args:
+          field: what is to be seen, in the world's frame, with its heights known (not traced).
+          azimuth: where the camera stands as seen from the terrain, degrees clockwise from north (+y): 135 is south-east.
+          altitude: of the camera above the horizon, as seen from the terrain, degrees.
+          fov: full angle of view across the shorter side, degrees.
+          width, height: of the picture, pixels.
+          margin: the share of the picture that stays empty at each border at least.
+          base: the level of a `Skirt`'s floor, which is to be seen, too; None: there is none.
+
+        Raises:
+          ValueError: angles out of range, or a terrain without heights.
+        """
+        return cls(framing_pose(field, azimuth, altitude, fov, width, height, margin, base), fov, width=width, height=height)
 
     def ray(self, x: Scalar, y: Scalar) -> Ray:
         """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""

@@ -1,5 +1,6 @@
 """A scene moved to the terrain's corner, in the precision of its heights."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +13,7 @@ from .camera import Camera
 from .heightfield import Heightfield
 from .light import Light, Point
 from .scene import Object, Scene, Shape
+from .skirt import Skirt
 
 
 def localise(scene: Scene) -> Scene:
@@ -26,6 +28,8 @@ def localise(scene: Scene) -> Scene:
         shape, corner = obj.shape, _grid_corner(obj.shape)
         if isinstance(shape, Heightfield):
             shape = Heightfield(shape.heights, shape.dx, shape.dy)
+        elif isinstance(shape, Skirt):
+            shape = dataclasses.replace(shape, x0=0.0, y0=0.0)
         world: Any = np.eye(4) if obj.world_from_object is None else obj.world_from_object
         shift = world[:3, :3] @ _like(world, corner) - _like(world, origin)
         if obj.world_from_object is None and not np.any(shift):
@@ -60,8 +64,8 @@ def _in_precision(leaf: Any, dtype: Any) -> Any:
 
 
 def _grid_corner(shape: Shape) -> np.ndarray:
-    """The position of a heightfield's vertex (0, 0) at height 0, in its object's frame."""
-    return np.array([shape.x0, shape.y0, 0.0]) if isinstance(shape, Heightfield) else np.zeros(3)
+    """The position of a heightfield's vertex (0, 0) at height 0, in its object's frame; also that of its skirt."""
+    return np.array([shape.x0, shape.y0, 0.0]) if isinstance(shape, Heightfield | Skirt) else np.zeros(3)
 
 
 def anchor(scene: Scene) -> np.ndarray:

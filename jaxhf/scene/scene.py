@@ -17,15 +17,16 @@ from .heightfield import Heightfield
 from .light import Light, Sky
 from .material import Material, Matte
 from .show import numbers
+from .skirt import Skirt
 
-Shape = Heightfield | Cylinder
+Shape = Heightfield | Cylinder | Skirt
 
 
 class Object(eqx.Module):
     """A shape with its material and its transform.
 
     Attributes:
-      shape: a `Heightfield` or a `Cylinder`.
+      shape: a `Heightfield`, a `Cylinder` or a `Skirt`.
       material: `Matte` or `Mirror`.
       world_from_object: 4x4, affine and invertible; None: the object's frame is the world's.
     """
@@ -39,7 +40,7 @@ class Object(eqx.Module):
         self.material = Matte(0.7) if material is None else material
         self.world_from_object = None if world_from_object is None else float_leaf(world_from_object)
         if not isinstance(shape, Shape):
-            raise ArgumentError("Object", "shape", f"must be a Heightfield or a Cylinder, it is {type(shape).__name__}")
+            raise ArgumentError("Object", "shape", f"must be a Heightfield, Cylinder or Skirt, it is {type(shape).__name__}")
         if not isinstance(self.material, Material):
             raise ArgumentError("Object", "material", f"must be Matte or Mirror, it is {type(self.material).__name__}")
         if self.world_from_object is not None:

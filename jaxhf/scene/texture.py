@@ -1,5 +1,7 @@
 """Textures: images spread over a surface."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -9,14 +11,25 @@ from ..core.errors import ArgumentError
 from ..core.types import AnyArray, Point2, Vector, float_leaf
 
 
+def _texels(value: Any) -> Any:
+    dtype = getattr(value, "dtype", None)
+    if dtype is not None and not np.issubdtype(dtype, np.floating):
+        rule = f"must be linear floats, 0 to 1, they are {dtype}; load_image makes them of a picture"
+        raise ArgumentError("ImageTexture", "texels", rule)
+    return float_leaf(value)
+
+
 class ImageTexture(eqx.Module):
     """An image spread over (u, v) in 0..1 and repeated outside, looked up bilinearly.
 
     Attributes:
       texels: linear colours, shape (h, w, 3): row 0 is v = 0, u runs along a row, texel centres lie at half steps.
+      at_vertices: whether the outermost texel centres lie on 0 and 1 instead: an image of (ny, nx) texels then gives each
+        vertex of a heightfield of that shape its colour.
     """
 
-    texels: Float[AnyArray, "h w 3"] = eqx.field(converter=float_leaf)
+    texels: Float[AnyArray, "h w 3"] = eqx.field(converter=_texels)
+    at_vertices: bool = eqx.field(static=True, default=False, kw_only=True)
 
     def __check_init__(self):
         if len(self.texels.shape) != 3 or self.texels.shape[2] != 3 or 0 in self.texels.shape:
@@ -30,7 +43,10 @@ class ImageTexture(eqx.Module):
     def __call__(self, uv: Point2) -> Vector:
         texels = jnp.asarray(self.texels)
         h, w, _ = texels.shape
-        x, y = uv[0] * w - 0.5, uv[1] * h - 0.5
+        if self.at_vertices:
+            x, y = jnp.clip(uv[0], 0, 1) * (w - 1), jnp.clip(uv[1], 0, 1) * (h - 1)
+        else:
+            x, y = uv[0] * w - 0.5, uv[1] * h - 0.5
         column, row = jnp.floor(x), jnp.floor(y)
         fx, fy = x - column, y - row
         ix, iy = column.astype(jnp.int32), row.astype(jnp.int32)

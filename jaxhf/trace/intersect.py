@@ -21,12 +21,13 @@ from .cylinder import Tube, cylinder_hit, tube_distance
 from .grid import Grid, triangle_plane
 from .hit import Hit, orthogonal_tangents
 from .search import first_triangle
+from .skirt import Walls, wall_distance, wall_hit
 from .status import Status
 from .triangle import plane_through, triangle_corners
 from .walk import WalkResult
 from .walk_start import place_on_grid
 
-Surface = Grid | Tube
+Surface = Grid | Tube | Walls
 
 
 def intersect(
@@ -58,6 +59,8 @@ def intersect(
     if isinstance(surface, Tube):
         left = None if leaving is None else leaving.object == number
         return materialise(cylinder_hit(surface, ray, left, number, active, count_steps))
+    if isinstance(surface, Walls):
+        return materialise(wall_hit(surface, ray, leaving, number, active, count_steps))
     local, scale = _in_grid(surface, ray)
     found = first_triangle(
         surface,
@@ -89,6 +92,9 @@ def blocked(
     """
     if isinstance(surface, Tube):
         t, found = tube_distance(surface, ray, leaving.object == number)
+        return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
+    if isinstance(surface, Walls):
+        t, found, _ = wall_distance(surface, ray, leaving.object == number, leaving.cell[0])
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
     local, scale = _in_grid(surface, ray)
     t_max = None if t_max is None else t_max * scale

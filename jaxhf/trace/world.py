@@ -20,11 +20,13 @@ from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Light
 from ..scene.material import Material
 from ..scene.scene import Scene, Shape
+from ..scene.skirt import Skirt
 from .ceiling import Ceiling, clears, make_ceiling
-from .cylinder import Tube, make_tube
+from .cylinder import make_tube
 from .grid import Grid, make_grid
 from .hit import Hit
 from .intersect import Surface, blocked, intersect
+from .skirt import make_walls
 from .status import Status
 
 
@@ -32,7 +34,7 @@ class World(eqx.Module):
     """A scene made ready for tracing, with the settings for which it was made.
 
     Attributes:
-      surfaces: of each object, see `make_grid` and `make_tube`.
+      surfaces: of each object, see `make_grid`, `make_tube` and `make_walls`.
       materials: of each object.
       lights: as the scene's.
       ceilings: for each light and each object, where that object cannot keep the light from itself; None for all but a
@@ -91,7 +93,7 @@ def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: S
         normals = settings.normals if settings.shading == "smooth" else None
         levels = 0 if settings.traversal == "dda" else None
         return make_grid(shape, world, normals, levels, settings.early_exit)
-    return make_tube(shape, world)
+    return make_walls(shape, world) if isinstance(shape, Skirt) else make_tube(shape, world)
 
 
 def first_hit(world: World, ray: Ray, leaving: Hit | None = None, active: Flag | None = None, count_steps: bool = False) -> Hit:
@@ -140,7 +142,7 @@ def unblocked(
     for number, surface in enumerate(surfaces):
         search = functools.partial(blocked, number=number, max_steps=world.settings.max_steps)
         ceiling = None if light is None else world.ceilings[light][number]
-        if ceiling is None or isinstance(surface, Tube):
+        if ceiling is None or not isinstance(surface, Grid):
             met, ran_out = search(surface, ray, leaving, free, t_max)
         else:
             walks = free & ~clears(ceiling, surface, number, leaving)

@@ -1,0 +1,104 @@
+"""A picture of a terrain as a solid block, in light, colours and haze that suit most: the look of `jaxhf view`."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.errors import ArgumentError
+from ..scene.camera import Perspective
+from ..scene.heightfield import Heightfield
+from ..scene.light import Directional, Sky
+from ..scene.material import Matte
+from ..scene.scene import Object, Scene
+from ..scene.skirt import Skirt
+from ..scene.texture import ImageTexture
+from .render import Prepared, render
+
+_SUN, _SKY = 0.8, 0.3  # radiance of white ground that faces the sun, and what the whole sky adds
+_ABOVE, _BELOW = (0.60, 0.72, 0.86), (0.95, 0.95, 0.93)  # the background's highest and lowest row
+_HAZE = (0.78, 0.84, 0.90)
+_WALLS = (0.16, 0.14, 0.125)
+
+
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """What a terrain is shown in.
+
+    Attributes:
+      azimuth, altitude: of the sun, degrees clockwise from north and above the horizon.
+      haze: the share of light that haze takes over the length of the terrain, 0 to 1.
+      samples: rays a pixel, a square number.
+    """
+
+    azimuth: float = 315.0
+    altitude: float = 35.0
+    haze: float = 0.15
+    samples: int = 9
+
+    def __post_init__(self):
+        if not 0 < self.altitude <= 90:
+            raise ArgumentError("view", "altitude", f"of the sun must be above 0 and at most 90 degrees, it is {self.altitude}")
+        if not 0 <= self.haze < 1:
+            raise ArgumentError("view", "haze", f"must be at least 0 and below 1, it is {self.haze}")
+
+
+def block(field: Heightfield, colours: Any, camera: Perspective, look: Look, base: float | None) -> Scene:
+    """A terrain with walls and a floor, under the sun and a sky.
+
+    Args:
+      field: the terrain.
+      colours: linear, 0 to 1: one (3,), of each vertex (ny, nx, 3), or an `ImageTexture` over all of it.
+      camera: that is to see it.
+      look: the sun.
+      base: the level of the floor; None: neither walls nor a floor.
+    """
+    albedo = colours if isinstance(colours, ImageTexture) or np.ndim(colours) < 3 else ImageTexture(colours, at_vertices=True)
+    objects = [Object(field, Matte(albedo))]
+    if base is not None:
+        objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))
+    return Scene(objects, camera, _lights(look))
+
+
+def _lights(look: Look) -> list[Any]:
+    return [Directional.from_angles(look.azimuth, look.altitude, math.pi * _SUN), Sky(_SKY)]
+
+
+def photograph(scene: Prepared, camera: Perspective, look: Look) -> Float[np.ndarray, "h w 3"]:
+    """Linear radiance of a prepared `block`, with haze before a background.
+
+    Each of a pixel's samples gets haze by its own distance, so it is a picture of its own, from a camera that looks past the
+    pixel's centre.
+    """
+    side = math.isqrt(look.samples)
+    size = _length(scene.scene.objects[0].shape)
+    total = np.zeros((camera.height, camera.width, 3))
+    for k in range(side * side):
+        dx, dy = ((k % side + 0.5) / side - 0.5, (k // side + 0.5) / side - 0.5)
+        image, aovs = render(scene.with_camera(_moved(camera, dx, dy)), aovs=("depth",))
+        total += _in_haze(np.asarray(image, np.float64), np.asarray(aovs["depth"], np.float64), size, look.haze)
+    return (total / side**2).astype(np.float32)
+
+
+def _in_haze(image: np.ndarray, depth: np.ndarray, size: float, haze: float) -> np.ndarray:
+    rows = np.linspace(0, 1, len(image))[:, None, None]
+    behind = (1 - rows) * np.array(_ABOVE) + rows * np.array(_BELOW)
+    met = np.isfinite(depth)
+    near = depth[met].min(initial=np.inf)
+    share = (1 - haze) ** (np.where(met, depth - near, 0) / size)
+    return np.where(met[..., None], image * share[..., None] + np.array(_HAZE) * (1 - share[..., None]), behind)
+
+
+def _length(field: Any) -> float:
+    ny, nx = field.heights.shape
+    return math.hypot((nx - 1) * field.dx, (ny - 1) * field.dy)
+
+
+def _moved(camera: Perspective, dx: float, dy: float) -> Perspective:
+    """The camera whose pixels are seen where those of `camera` are after so many pixels to the right and down."""
+    pose = np.array(camera.world_from_camera)
+    scale = 2 * math.tan(math.radians(float(camera.fov)) / 2) / min(camera.width, camera.height)
+    pose[:, 2] += scale * (dx * pose[:, 0] - dy * pose[:, 1])
+    return dataclasses.replace(camera, world_from_camera=pose)

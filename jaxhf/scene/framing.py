@@ -1,0 +1,73 @@
+"""Where a camera must stand so that it sees all of a terrain."""
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.errors import ArgumentError
+from .heightfield import Heightfield
+
+
+def framing_pose(
+    field: Heightfield, azimuth: float, altitude: float, fov: float, width: int, height: int, margin: float, base: float | None
+) -> Float[np.ndarray, "4 4"]:
+    """The pose of the nearest pinhole that looks at a heightfield from a direction and has all of it in its picture.
+
+    See `Perspective.framing`. In the camera's frame a point lies within the left and right borders of the picture where
+    |X - x| <= (Z - z) tan(half the angle of view). For the camera's place (x, z) that is linear; the nearest place follows
+    from the points that are farthest out on either side. Likewise for the upper and lower borders.
+    """
+    for name, value, rule, holds in (
+        ("azimuth", azimuth, "finite", math.isfinite(azimuth)),
+        ("altitude", altitude, "from -90 to 90 degrees", -90 <= altitude <= 90),
+        ("fov", fov, "between 0 and 180 degrees", 0 < fov < 180),
+        ("margin", margin, "at least 0 and below 1", 0 <= margin < 1),
+    ):
+        if not holds:
+            raise ArgumentError("framing", name, f"must be {rule}, it is {value}")
+    points = _outline(field, base)
+    turn, lift = math.radians(azimuth), math.radians(altitude)
+    forward = -np.array([math.sin(turn) * math.cos(lift), math.cos(turn) * math.cos(lift), math.sin(lift)])
+    right = np.array([-math.cos(turn), math.sin(turn), 0.0])
+    up = np.cross(right, forward)
+    middle = (points.min(0) + points.max(0)) / 2
+    x, y, z = np.stack([right, up, forward]) @ (points - middle).T
+    half, short = math.tan(math.radians(fov) / 2) * (1 - margin), min(width, height)
+    tangents = half * width / short, half * height / short
+    along = min(
+        -((across - tangent * z).max() + (-across - tangent * z).max()) / (2 * tangent)
+        for across, tangent in zip((x, y), tangents, strict=True)
+    )
+    eye = middle + _central(x, z - along) * right + _central(y, z - along) * up + along * forward
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, up, forward, eye], axis=1)
+    return pose
+
+
+def _central(across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) -> float:
+    """The place from which points are seen equally far out on both sides."""
+    place = 0.0
+    for _ in range(20):
+        slope = (across - place) / depth
+        ends = [slope.argmin(), slope.argmax()]
+        better = (across[ends] / depth[ends]).sum() / (1 / depth[ends]).sum()
+        if better == place:
+            break
+        place = better
+    return place
+
+
+def _outline(field: Heightfield, base: float | None) -> Float[np.ndarray, "n 3"]:
+    """The vertices that have a height, and where the border stands on the level `base`."""
+    heights = np.asarray(field.heights, np.float64)
+    iy, ix = np.nonzero(np.isfinite(heights))
+    if not iy.size:
+        raise ArgumentError("framing", "field", "must have a height, all of its vertices are holes")
+    points = np.stack([field.x0 + ix * field.dx, field.y0 + iy * field.dy, heights[iy, ix]], axis=1)
+    if base is None:
+        return points
+    ny, nx = heights.shape
+    x1, y1 = field.x0 + (nx - 1) * field.dx, field.y0 + (ny - 1) * field.dy
+    floor = [(x, y, base) for x in (field.x0, x1) for y in (field.y0, y1)]
+    return np.concatenate([points, floor])

@@ -1,0 +1,124 @@
+"""Where a ray meets the walls and the floor under a terrain."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from ..core.affine import Affine
+from ..core.ray import Ray
+from ..core.types import Flag, Index, Scalar
+from ..core.vector import largest_component, unit
+from ..scene.skirt import Skirt
+from .hit import Hit, orthogonal_tangents
+from .status import Status
+
+_FLOOR = 4  # the number of that side; the walls are 0 to 3
+_WIDE = 16  # units in the last place by which a ray's place on a side may be off
+
+
+class Walls(eqx.Module):
+    """A skirt made ready for tracing.
+
+    Attributes:
+      tops: heights of the border: south, north, west, east, one after the other.
+      base: z of the floor.
+      size: of the footprint, x and y.
+    """
+
+    tops: Float[jax.Array, " vertices"]
+    base: Scalar
+    size: tuple[float, float] = eqx.field(static=True)
+    cells: tuple[int, int] = eqx.field(static=True)
+    world_from_object: Affine
+    object_from_world: Affine
+
+
+def make_walls(skirt: Skirt, world_from_object: Affine | None) -> Walls:
+    tops = jnp.concatenate([jnp.asarray(side) for side in (skirt.south, skirt.north, skirt.west, skirt.east)])
+    dtype = tops.dtype
+    world = Affine(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)) if world_from_object is None else world_from_object
+    cells = len(skirt.south) - 1, len(skirt.west) - 1
+    size = cells[0] * skirt.dx, cells[1] * skirt.dy
+    return Walls(tops, jnp.asarray(skirt.base, dtype), size, cells, world, world.inverse())
+
+
+def wall_distance(walls: Walls, ray: Ray, left: Flag | None, left_side: Index | None) -> tuple[Scalar, Flag, Index]:
+    """The smallest t > 0 at which a world-frame ray meets a wall or the floor, whether it does, and which of the five.
+
+    For rays from outside each side is wider by rounding, for those from inside narrower: so nothing gets in between two sides,
+    or a side and the terrain, and who grazes an edge from outside does not see the inside.
+
+    Args:
+      walls: the surface.
+      ray: world frame.
+      left: whether it starts on these walls; None for rays that start in free space.
+      left_side: then, on which side, which it cannot meet again.
+    """
+    local = walls.object_from_world.ray(ray)
+    o, d = local.o, local.d
+    (size_x, size_y), (cells_x, cells_y) = walls.size, walls.cells
+    wide = _WIDE * jnp.finfo(o.dtype).eps
+    best, found, number = jnp.full_like(walls.base, jnp.inf), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+    first = 0
+    planes = [(1, 0.0, 0, size_x, cells_x), (1, size_y, 0, size_x, cells_x), (0, 0.0, 1, size_y, cells_y),
+              (0, size_x, 1, size_y, cells_y), (2, walls.base, 0, size_x, 0)]  # fmt: skip
+    for side, (axis, place, along, length, cells) in enumerate(planes):
+        still = d[axis] == 0
+        rate = jnp.where(still, 1, d[axis])
+        t = (place - o[axis]) / rate
+        at = o + t * d
+        off = jnp.abs(o) + jnp.abs(at) + (jnp.abs(o[axis]) + jnp.abs(place)) / jnp.abs(rate) * jnp.abs(d)
+        outwards = -1 if side in (0, 2, _FLOOR) else 1
+        wider = jnp.where(outwards * d[axis] < 0, wide, -wide) * off
+        inside = (at[along] >= -wider[along]) & (at[along] <= length + wider[along])
+        if side == _FLOOR:
+            inside = inside & (at[1] >= -wider[1]) & (at[1] <= size_y + wider[1])
+        else:
+            position = jnp.clip(at[along] / length, 0, 1) * cells
+            cell = jnp.clip(position.astype(jnp.int32), 0, cells - 1)
+            low, high = walls.tops[first + cell], walls.tops[first + cell + 1]
+            top = low + (position - cell.astype(low.dtype)) * (high - low)
+            more = wider[2] + jnp.abs(high - low) * (cells / length) * wider[along]
+            inside = inside & (at[2] >= walls.base - wider[2]) & (at[2] <= top + more)
+            first += cells + 1
+        met = ~still & (t > 0) & (t < best) & inside
+        if left is not None:
+            met = met & ~(left & (left_side == side))
+        best, found, number = jnp.where(met, t, best), found | met, jnp.where(met, side, number)
+    return jnp.where(found, best, 0), found, number
+
+
+def wall_hit(walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: Flag | None, count_steps: bool) -> Hit:
+    """The first hit of a world-frame ray on walls or floor; `number` is that of their object. `Hit.cell[0]` says which side."""
+    left = None if leaving is None else leaving.object == number
+    t, found, side = wall_distance(walls, ray, left, None if leaving is None else leaving.cell[0])
+    found = found if active is None else found & active
+    valid = largest_component(ray.d) > 0
+    met = found & valid
+    t = jnp.where(found, t, 0)
+    p = ray(t)
+    local = walls.object_from_world.point(p)
+    (size_x, size_y), dtype = walls.size, t.dtype
+    outwards = jnp.array([[0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, -1]], dtype)[side]
+    along_x, floor = (side < 2) | (side == _FLOOR), side == _FLOOR
+    tallest = jnp.maximum(jnp.nanmax(walls.tops) - walls.base, jnp.finfo(dtype).tiny)
+    u = jnp.where(along_x, local[0] / size_x, local[1] / size_y)
+    v = jnp.where(floor, local[1] / size_y, (local[2] - walls.base) / tallest)
+    n = unit(walls.object_from_world.covector(outwards))
+    zero = jnp.zeros((), dtype)
+    per_u = jnp.where(along_x, jnp.stack([zero + size_x, zero, zero]), jnp.stack([zero, zero + size_y, zero]))
+    per_v = jnp.where(floor, jnp.stack([zero, zero + size_y, zero]), jnp.stack([zero, zero, tallest]))
+    dp_du, dp_dv = orthogonal_tangents(walls.world_from_object.vector(per_u), walls.world_from_object.vector(per_v), n)
+    none = jnp.zeros((), jnp.int32)
+    faces = (n * ray.d).sum() < 0
+    # At the rim a wall comes before the terrain, whose lower side would be seen there.
+    nearer = jnp.where(faces, 1 - _WIDE * jnp.finfo(dtype).eps, 1)
+    status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID))
+    t = jnp.where(met, t * nearer, jnp.inf)
+    return Hit(
+        status=status.astype(jnp.int32), object=jnp.where(met, number, -1).astype(jnp.int32), t=t,
+        p=p, n=n, ns=n, uv=jnp.stack([u, v]), dp_du=dp_du, dp_dv=dp_dv, dn_du=jnp.zeros_like(n), dn_dv=jnp.zeros_like(n),
+        cell=jnp.stack([side, none]), triangle=none, side=jnp.where(faces, 1, -1).astype(jnp.int32),
+        steps=none if count_steps else None,
+    )  # fmt: skip

@@ -1,0 +1,71 @@
+"""Cameras that have all of a terrain in their picture, and textures with a colour for each vertex."""
+
+import math
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxhf
+
+RNG = np.random.default_rng(3)
+HEIGHTS = RNG.uniform(0, 3, (7, 12))
+HEIGHTS[2, 3] = np.nan
+FIELD = jaxhf.Heightfield(HEIGHTS.astype(np.float32), 2.0, 1.0, 100.0, -50.0)
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "altitude", "fov", "width", "height", "base"),
+    [(135.0, 30.0, 30.0, 512, 512, None), (20.0, 60.0, 50.0, 640, 360, -4.0), (300.0, 5.0, 80.0, 300, 500, -1.0),
+     (0.0, 90.0, 20.0, 64, 64, None), (77.0, -20.0, 40.0, 400, 300, None)],
+)  # fmt: skip
+def test_a_framing_camera_sees_all_of_a_terrain(azimuth, altitude, fov, width, height, base):
+    camera = jaxhf.Perspective.framing(FIELD, azimuth, altitude, fov, width=width, height=height, margin=0.1, base=base)
+    y, x = np.mgrid[: HEIGHTS.shape[0], : HEIGHTS.shape[1]]
+    points = np.stack([100 + 2 * x, -50 + y, HEIGHTS], -1).reshape(-1, 3)
+    points = points[np.isfinite(points).all(1)]
+    if base is not None:
+        points = np.concatenate([points, [(px, py, base) for px in (100, 122) for py in (-50, -44)]])
+    film = camera.film_from_world()
+    x, y, w, depth = np.asarray(film.linear, float) @ points.T + np.asarray(film.offset, float)[:, None]
+    share = np.stack([np.abs(2 * x / w / width - 1), np.abs(2 * y / w / height - 1)])
+    assert (depth > 0).all()
+    assert share.max() == pytest.approx(0.9, abs=2e-3)  # the nearest one: something touches the margin
+    for values, size in ((x / w, width), (y / w, height)):  # and all of it stands in the middle
+        assert values.min() + values.max() == pytest.approx(size, abs=0.01 * size)
+    eye, forward = np.asarray(camera.world_from_camera)[:3, 3], np.asarray(camera.world_from_camera)[:3, 2]
+    assert math.degrees(math.asin(-forward[2])) == pytest.approx(altitude)
+    if altitude < 90:
+        assert math.degrees(math.atan2(-forward[0], -forward[1])) % 360 == pytest.approx(azimuth)
+    looking = jaxhf.Perspective.look_at(eye, eye + forward, up=(0, 0, 1) if altitude < 90 else (0, 1, 0))
+    if altitude < 90:
+        np.testing.assert_allclose(camera.world_from_camera, looking.world_from_camera, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [({"altitude": 91.0}, "altitude must be from -90 to 90"), ({"fov": 0.0}, "fov must be"),
+     ({"margin": 1.0}, "margin must be"), ({"azimuth": math.inf}, "azimuth must be finite")],
+)  # fmt: skip
+def test_a_view_that_cannot_be_is_refused(options: dict, said: str):
+    with pytest.raises(jaxhf.ArgumentError, match=said):
+        jaxhf.Perspective.framing(FIELD, **options)
+
+
+def test_a_terrain_without_heights_has_no_view():
+    with pytest.raises(jaxhf.ArgumentError, match="must have a height"):
+        jaxhf.Perspective.framing(jaxhf.Heightfield(np.full((3, 3), np.nan, np.float32)))
+
+
+def test_a_texture_at_vertices_gives_each_its_colour():
+    texels = RNG.uniform(size=(4, 6, 3))
+    texture = jaxhf.ImageTexture(texels, at_vertices=True)
+    for iy, ix in np.ndindex(4, 6):
+        np.testing.assert_allclose(texture(jnp.array([ix / 5, iy / 3])), texels[iy, ix], atol=1e-6)
+    between = texture(jnp.array([1.5 / 5, 0.0]))
+    np.testing.assert_allclose(between, (texels[0, 1] + texels[0, 2]) / 2, atol=1e-6)
+
+
+def test_bytes_are_no_texture():
+    with pytest.raises(jaxhf.ArgumentError, match="must be linear floats, 0 to 1, they are uint8; load_image"):
+        jaxhf.ImageTexture(np.zeros((2, 2, 3), np.uint8))
