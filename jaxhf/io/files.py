@@ -69,11 +69,15 @@ def require_folder(path: Path, what: str) -> None:
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, beside: Mapping[Path, str] | None = None) -> Iterator[Path]:
     """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong.
 
     The new content is on the disk before it gets the name, and the name when this ends: a power failure leaves the old file
     or the new one, not an empty one (Pillai et al., All file systems are not created equal, 2014).
+
+    Args:
+      path: the file.
+      beside: small text files that go with it, and their contents, which are written before any file takes its place.
     """
     path = path.resolve()  # what a link points to is replaced, not the link
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
@@ -81,9 +85,16 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
+        with contextlib.ExitStack() as others:
+            for other, text in (beside or {}).items():
+                others.enter_context(replacing(other)).write_text(text, encoding="utf-8")
         os.replace(temporary, path)
         with contextlib.suppress(OSError):  # Windows opens no folders, some network file systems synchronise none
             _synchronise_folder(path.parent)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise type(error)(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 

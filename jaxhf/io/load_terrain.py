@@ -16,8 +16,10 @@ from ..core.extras import import_extra
 from .errors import FileError
 from .files import PathLike, by_ending, read_npy, reading, require_file
 from .georeference import WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
-from .images import read_png
+from .grids import read_asc, read_hgt, read_mujoco
+from .images import read_grey
 from .rasters import DRIVERS, read_raster
+from .sidecars import by_world_file
 from .terrain import Terrain, heights_of
 
 
@@ -36,7 +38,10 @@ def load_heights(
     - .npy: shape (ny, nx), in jaxhf's order (row 0 in the south), spacing 1.
     - .npz: the array `heights`, or the only one, in jaxhf's order, with dx, dy, x0, y0 where the file has them. Or an
       array `elevation` as in matplotlib's `jacksboro_fault_dem.npz`: north row first, bounds and spacing in degrees.
-    - .png: 16-bit grey, north row first, spacing 1; a height is the stored whole number.
+    - .png, of grey with 8 or 16 bits, .pfm (grey), .exr (one channel; needs OpenEXR): north row first, spacing 1; a height is
+      the stored number. A .png has the place that a world file (.pgw) beside it gives.
+    - .asc (ESRI ASCII grid, its reference system in a .prj beside it), .hgt (a tile of SRTM, placed by its name).
+    - .hfield, .bin (MuJoCo's binary height field): row 0 in the south, spacing 1; a height is the stored number.
     - .tif, .tiff and other rasters that GDAL reads (.img, .dt2, .bil, .flt, .dem, .grd, .jp2, .nc, .vrt, .xyz; needs rasterio):
       one band of numbers, placed by its geotransform. A height stands at its pixel's centre: half a pixel inside the
       raster's corner. The file's scale and offset are applied.
@@ -139,16 +144,17 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
         return Terrain(heights, dx, dy, number("xmin") + dx / 2, south + dy / 2, crs, place)
 
 
-def _read_png(path: Path, nodata: float | None, _: bool) -> Terrain:
-    values = read_png(path)
-    if values.dtype != np.uint16:
-        raise FileError("heights in a PNG must be 16-bit grey, its samples have at most 8 bits")
-    return Terrain(heights_of(values[::-1], nodata))
+def _read_image(path: Path, nodata: float | None, _: bool) -> Terrain:
+    heights = heights_of(read_grey(path)[::-1], nodata)
+    return by_world_file(path, heights) if path.suffix.lower() == ".png" else Terrain(heights)
 
 
 _READERS: dict[str, Callable[[Path, float | None, bool], Terrain]] = {
     ".npy": _read_npy,
     ".npz": _read_npz,
-    ".png": _read_png,
+    ".asc": read_asc,
+    ".hgt": read_hgt,
+    **dict.fromkeys((".hfield", ".bin"), read_mujoco),
+    **dict.fromkeys((".png", ".exr", ".pfm"), _read_image),
     **dict.fromkeys(DRIVERS, read_raster),
 }

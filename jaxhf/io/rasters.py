@@ -14,6 +14,8 @@ from ..core.extras import import_extra
 from .errors import FileError
 from .files import PathLike, by_ending, reading, replacing, require_folder, require_pixels, write_npy
 from .georeference import CoordinateSystem, Georeference, coordinate_system
+from .images import write_png
+from .sidecars import beside
 from .terrain import Terrain, heights_of
 
 # GDAL's driver by ending: what a file holds does not decide, as some drivers follow addresses on the network.
@@ -96,15 +98,17 @@ def require_writable_raster(path: PathLike) -> Path:
     path = Path(path)
     by_ending(dict.fromkeys((".npy", ".png", ".tif", ".tiff")), path, "write a map with")
     require_folder(path, "a map")
-    require_rasterio(path)
+    require_extras(path)
     return path
 
 
-def require_rasterio(path: Path) -> None:
-    """FileError where writing this file needs rasterio, and it is missing."""
-    if path.suffix.lower() in (".tif", ".tiff"):
-        with reading(path):
+def require_extras(path: Path) -> None:
+    """FileError where writing this file needs a package that is missing."""
+    with reading(path):
+        if path.suffix.lower() in (".tif", ".tiff"):
             import_extra("rasterio", "writing .tif needs", "geo")
+        if path.suffix.lower() == ".exr":
+            import_extra("OpenEXR", "writing .exr needs", "exr")
 
 
 def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None = None) -> None:
@@ -135,29 +139,13 @@ def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None
         raise ArgumentError(
             "save_raster", "values", f"must have the terrain's shape, {like.heights.shape}, theirs is {values.shape}"
         )
-    with contextlib.ExitStack() as files:
-        temporary = files.enter_context(replacing(path))
+    with replacing(path, beside(path, like)) as temporary:
         if ending == ".npy":
             write_npy(temporary, values)
         elif ending == ".png":
             write_png(temporary, values[::-1])
-            files.enter_context(replacing(path.with_suffix(".pgw"))).write_text(world_file(like), encoding="ascii")
         else:
             temporary.write_bytes(geotiff(values, like, nodata))
-
-
-def world_file(terrain: Terrain) -> str:
-    """ESRI's world file: the pixel's width, two rotations, minus its height, and the centre of the north-western pixel."""
-    dx, dy, x0, y0 = terrain.in_file
-    numbers = dx, 0.0, 0.0, -dy, x0, y0 + (len(terrain.heights) - 1) * dy
-    return "".join(f"{number!r}\n" for number in numbers)
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    import imageio.v3 as imageio
-
-    with path.open("wb") as file:
-        imageio.imwrite(file, np.ascontiguousarray(pixels), plugin="pillow", extension=".png")
 
 
 def geotiff(values: np.ndarray, like: Terrain, nodata: float | None) -> memoryview:

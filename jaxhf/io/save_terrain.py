@@ -10,19 +10,28 @@ from numpy.typing import ArrayLike
 
 from .errors import FileError
 from .files import PathLike, by_ending, reading, replacing, require_file, require_folder, write_npy
-from .rasters import georeference_of, geotiff, require_rasterio
+from .grids import write_asc
+from .images import write_exr, write_png
+from .rasters import georeference_of, geotiff, require_extras
+from .sidecars import beside
 from .terrain import Terrain
 
 
 def save_heights(path: PathLike, terrain: Terrain | ArrayLike, like: PathLike | None = None) -> None:
-    """Writes heights, .npy, .npz or .tif, with their spacing and origin (.npy: without). The file appears whole or not at all.
+    """Writes heights with their place: spacing, origin and, where they are known, reference system and value for holes.
 
-    .tif starts in the north and is a GeoTIFF, in the coordinates of the file that `terrain` is from, with its reference system
-    and its value for holes; without one, in those of `terrain`, of no named system.
+    The file appears whole or not at all. Its coordinates are those of the file that `terrain` is from, which may be degrees.
+
+    - .npz: all that a `Terrain` holds. .npy: the heights alone.
+    - .tif: a GeoTIFF, in the terrain's precision (needs rasterio). .asc: an ESRI ASCII grid.
+    - .png: whole heights of 0 to 65535, as 16-bit grey, rounded; its place is in a world file (.pgw) beside it.
+    - .exr: one channel Y in float32, without a place (needs OpenEXR).
+
+    The reference system of a .png or an .asc is in a .prj beside it.
 
     Args:
       path: the file.
-      terrain: the heights; nan and inf are kept. For .npy, which holds no more, floats of shape (ny, nx) will do.
+      terrain: the heights. For .npy, which holds no more, floats of shape (ny, nx) will do.
       like: a GeoTIFF of the same shape, whose place and reference system a .tif takes over.
 
     Raises:
@@ -33,8 +42,11 @@ def save_heights(path: PathLike, terrain: Terrain | ArrayLike, like: PathLike | 
     terrain = _terrain(path, terrain)
     if like is not None and path.suffix.lower() in (".tif", ".tiff"):
         terrain = _placed_like(terrain, require_file(like))
-    with replacing(path) as temporary:
-        _WRITERS[path.suffix.lower()](temporary, terrain)
+    with replacing(path, beside(path, terrain)) as temporary:
+        try:
+            _WRITERS[path.suffix.lower()](temporary, terrain)
+        except FileError as error:
+            raise FileError(f"{path}: {error}") from error
 
 
 def _placed_like(terrain: Terrain, like: Path) -> Terrain:
@@ -63,14 +75,14 @@ def require_writable_heights(path: PathLike) -> Path:
     """Checks that `save_heights` can write to `path`, so that nobody fits for an hour first.
 
     Raises:
-      ValueError: the ending is not known, rasterio is missing, or `path` is a folder.
+      ValueError: the ending is not known, a package for it is missing, or `path` is a folder.
       FileNotFoundError: the folder does not exist.
       PermissionError: the folder cannot be written to.
     """
     path = Path(path)
     by_ending(_WRITERS, path, "write heights with")
     require_folder(path, "heights")
-    require_rasterio(path)
+    require_extras(path)
     return path
 
 
@@ -96,7 +108,22 @@ def _write_tiff(path: Path, terrain: Terrain) -> None:
     path.write_bytes(geotiff(heights, terrain, np.nan if nodata is None else nodata))
 
 
+def _write_exr(path: Path, terrain: Terrain) -> None:
+    write_exr(path, {"Y": terrain.heights[::-1]})
+
+
+def _write_png(path: Path, terrain: Terrain) -> None:
+    low, high = (float(bound(terrain.heights)) for bound in (np.min, np.max))
+    if not (low >= -0.5 and high < 65535.5):
+        span = "has holes" if terrain.nodata.any() else f"goes from {low:.6g} to {high:.6g}"
+        raise FileError(f"a .png holds whole heights of 0 to 65535 everywhere, this terrain {span}")
+    write_png(path, np.clip(np.rint(terrain.heights[::-1]), 0, 65535).astype(np.uint16))
+
+
 _WRITERS: dict[str, Callable[[Path, Terrain], None]] = {
+    ".asc": write_asc,
+    ".exr": _write_exr,
+    ".png": _write_png,
     ".npy": _write_npy,
     ".npz": _write_npz,
     ".tif": _write_tiff,

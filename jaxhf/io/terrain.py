@@ -56,7 +56,9 @@ class Terrain:
         """Its dx, dy, x0 and y0 in the coordinates of its file, which may be degrees."""
         place = self.georeference or Georeference()
         (scale_x, scale_y), (offset_x, offset_y) = place.scale, place.offset
-        return scale_x * self.dx, scale_y * self.dy, offset_x + scale_x * self.x0, offset_y + scale_y * self.y0
+        found = scale_x * self.dx, scale_y * self.dy, offset_x + scale_x * self.x0, offset_y + scale_y * self.y0
+        dx, dy, x0, y0 = map(float, found)
+        return dx, dy, x0, y0
 
     def heightfield(self, dtype: DTypeLike | None = None) -> "Heightfield":
         """The surface, to be rendered.

@@ -291,7 +291,7 @@ BAD_FILES = [
     ),
     ("cut.npz", cut_npz, {}, "not a zip file"),
     ("lying.npz", lying_npz, {}, "its header declares 2048000000 bytes of data, 0 are there"),
-    ("byte.png", lambda path: Image.new("L", (2, 2)).save(path), {}, "must be 16-bit grey, its samples have at most 8 bits"),
+    ("rgb.png", lambda path: Image.new("RGB", (2, 2)).save(path), {}, "it has red, green and blue of 8 bits"),
     ("bomb.png", bomb_png, {}, f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000"),
     ("cut.tif", cut_tiff, {}, "cut.tif: it is cut off, damaged or of another kind"),
     ("text.tif", lambda path: path.write_text("no"), {}, "text.tif: it is cut off, damaged or of another kind"),
@@ -428,8 +428,8 @@ def test_bare_heights_are_written_where_no_place_goes_with_them(tmp_path):
 
 def test_where_heights_cannot_be_written(tmp_path):
     terrain = Terrain(np.zeros((2, 2)))
-    with pytest.raises(ValueError, match=r"x\.asc: cannot write heights with the ending '\.asc'"):
-        save_heights(tmp_path / "x.asc", terrain)
+    with pytest.raises(ValueError, match=r"x\.hgt: cannot write heights with the ending '\.hgt'"):
+        save_heights(tmp_path / "x.hgt", terrain)
     with pytest.raises(FileNotFoundError, match=r"x\.npy: there is no folder"):
         save_heights(tmp_path / "none" / "x.npy", terrain)
     (tmp_path / "x.npz").mkdir()
