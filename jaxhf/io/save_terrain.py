@@ -1,7 +1,7 @@
 """Heights to terrain files that `load_heights` reads back as they were."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +71,12 @@ def _terrain(path: Path, given: Any) -> Terrain:
     return Terrain(heights)
 
 
-def require_writable_heights(path: PathLike) -> Path:
+def require_writable_heights(path: PathLike, also: Iterable[str] = ()) -> Path:
     """Checks that `save_heights` can write to `path`, so that nobody fits for an hour first.
+
+    Args:
+      path: the file.
+      also: endings that the caller knows besides, for the message.
 
     Raises:
       ValueError: the ending is not known, a package for it is missing, or `path` is a folder.
@@ -80,7 +84,7 @@ def require_writable_heights(path: PathLike) -> Path:
       PermissionError: the folder cannot be written to.
     """
     path = Path(path)
-    by_ending(_WRITERS, path, "write heights with")
+    by_ending({**_WRITERS, **dict.fromkeys(also)}, path, "write heights with")
     require_folder(path, "heights")
     require_extras(path)
     return path
