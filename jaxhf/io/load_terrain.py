@@ -158,3 +158,4 @@ _READERS: dict[str, Callable[[Path, float | None, bool], Terrain]] = {
     **dict.fromkeys((".png", ".exr", ".pfm"), _read_image),
     **dict.fromkeys(DRIVERS, read_raster),
 }
+ENDINGS = frozenset(_READERS)

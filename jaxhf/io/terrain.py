@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,7 +10,14 @@ from numpy.typing import DTypeLike
 
 from ..core.errors import ArgumentError
 from .errors import FileError
-from .georeference import WGS84, CoordinateSystem, Georeference, metres_per_degree
+from .georeference import (
+    WGS84,
+    WGS84_DEGREES,
+    CoordinateSystem,
+    Georeference,
+    coordinate_system,
+    metres_per_degree,
+)
 
 if TYPE_CHECKING:
     from ..scene.heightfield import Heightfield
@@ -45,6 +52,47 @@ class Terrain:
             if not math.isfinite(value) or (name in ("dx", "dy") and value <= 0):
                 rule = "positive and finite" if name in ("dx", "dy") else "finite"
                 raise ArgumentError("", name, f"must be {rule}, it is {value}")
+
+    @classmethod
+    def from_xarray(cls, array: Any, nodata: float | None = None) -> "Terrain":
+        """The terrain in a `DataArray` of xarray, or of rioxarray with its reference system.
+
+        Its dimensions are y and x, northing and easting, or lat and lon, in any order and either direction, besides those of
+        length 1, with evenly spaced coordinates. The reference system and the value of holes are those of its `rio` accessor,
+        else of CF's `spatial_ref` coordinate and of `_FillValue`; lat and lon without a system are WGS84. Degrees become metres
+        as in `load_heights`.
+
+        Args:
+          array: read by its `dims`, `coords`, `values` and `attrs`; xarray is not needed.
+          nodata: a value that means no height; overrules the array's.
+
+        Raises:
+          ValueError: `array` is no DataArray, or has other dimensions, or no coordinates, or they are not evenly spaced.
+        """
+        owner = "Terrain.from_xarray"
+        if not all(hasattr(array, name) for name in ("dims", "coords", "values", "attrs")):
+            raise ArgumentError(owner, "array", f"must be an xarray.DataArray, it is a {type(array).__name__}")
+        values = np.asarray(array.values)
+        names = [str(name) for name, size in zip(array.dims, values.shape, strict=True) if size > 1]
+        axes = [axis for words in _AXES for axis in range(len(names)) if names[axis].lower() in words]
+        if len(names) != 2 or len(axes) != 2:
+            raise ArgumentError(owner, "array", f"must have dimensions y and x, or lat and lon, it has {tuple(array.dims)}")
+        values = values.squeeze().transpose(axes)
+        (y0, dy), (x0, dx) = (_even(owner, array, names[axis]) for axis in axes)
+        values = values[:: 1 if dy > 0 else -1, :: 1 if dx > 0 else -1]
+        x0, y0 = min(x0, x0 + (values.shape[1] - 1) * dx), min(y0, y0 + (values.shape[0] - 1) * dy)
+        rio, attrs, reference = getattr(array, "rio", None), array.attrs, array.coords.get("spatial_ref")
+        found = getattr(rio, "crs", None)
+        wkt = "" if reference is None else str(reference.attrs.get("crs_wkt", ""))
+        wkt = found.to_wkt() if found else wkt
+        if not wkt and names[axes[0]].lower() in _AXES[0][2:]:
+            wkt = WGS84_DEGREES
+        own = getattr(rio, "nodata", None)
+        own = attrs.get("_FillValue") if own is None else own
+        nodata = nodata if nodata is not None or own is None else float(own)
+        heights = heights_of(values, nodata, float(attrs.get("scale_factor", 1)), float(attrs.get("add_offset", 0)))
+        crs = coordinate_system(wkt) if wkt else CoordinateSystem()
+        return cls(heights, abs(dx), abs(dy), x0, y0, crs, Georeference(wkt, nodata=nodata)).in_metres()
 
     @property
     def nodata(self) -> Bool[np.ndarray, "ny nx"]:
@@ -96,6 +144,24 @@ class Terrain:
             scale = dx / grid["dx"], dy / grid["dy"]
             place = place._replace(scale=scale, offset=(x0 - scale[0] * grid["x0"], y0 - scale[1] * grid["y0"]))
         return dataclasses.replace(self, **grid, crs=crs, georeference=place)
+
+
+_AXES = ("y", "northing", "lat", "latitude"), ("x", "easting", "lon", "longitude")
+
+
+def _even(owner: str, array: Any, name: str) -> tuple[float, float]:
+    """The first coordinate along a dimension, and the step."""
+    if name not in array.coords:
+        raise ArgumentError(owner, "array", f"must have coordinates along {name}")
+    stored = np.asarray(array.coords[name].values)
+    values = stored.astype(np.float64)
+    step = (values[-1] - values[0]) / (len(values) - 1)
+    rounding = 4 * np.finfo(stored.dtype if stored.dtype.kind == "f" else np.float64).eps * np.abs(values).max()
+    steps = np.diff(values)
+    if not np.abs(steps - step).max() <= max(1e-3 * abs(step), rounding):
+        rule = f"must have evenly spaced coordinates along {name}, their steps go from {steps.min()} to {steps.max()}"
+        raise ArgumentError(owner, "array", rule)
+    return float(values[0]), float(step)
 
 
 def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, offset: float = 0.0) -> Float[np.ndarray, "ny nx"]:
