@@ -15,9 +15,11 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
+    from ..io.files import by_ending
     from ..io.load_terrain import ENDINGS, read_terrain
 
-    if Path(options.file).suffix.lower() in ENDINGS:
+    of_scene = dict.fromkeys((".toml", ".pbrt"), True)
+    if not by_ending({**dict.fromkeys(ENDINGS, False), **of_scene}, Path(options.file), "describe"):
         from .describe import terrain_lines
 
         print("\n".join(terrain_lines(options.file, read_terrain(options.file))))

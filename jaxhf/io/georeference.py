@@ -58,13 +58,24 @@ class Georeference(NamedTuple):
         found = re.search(r'"([^"]*)"', self.wkt)
         return found[1] if found else ""
 
+    @property
+    def unit(self) -> str:
+        """The name of the unit of x and y, "" where it is not known."""
+        found = re.findall(r'\b(?:ANGLE|LENGTH)?UNIT\["([^"]*)"', _horizontal(self.wkt))
+        return found[-1] if found else ""
+
 
 _GEOGRAPHIC = r'\s*(?:COMP\w*\["[^"]*",\s*)?(?:GEOGCS|GEOGCRS|GEODCRS|GEOGRAPHICCRS|GEODETICCRS)\b'
 
 
+def _horizontal(wkt: str) -> str:
+    """The part of well-known text that is not about heights, without what closes it."""
+    return re.split(r"VERT_?C\w*\[", wkt)[0].rstrip(", \n]")
+
+
 def coordinate_system(wkt: str) -> CoordinateSystem:
     """What well-known text says, in either form, of the horizontal coordinates; FileError where its angles are not degrees."""
-    horizontal = re.split(r"VERT_?C\w*\[", wkt)[0].rstrip(", \n]")
+    horizontal = _horizontal(wkt)
     code = re.search(r'(?:AUTHORITY|\bID)\["EPSG",\s*"?(\d+)"?$', horizontal)
     number = int(code[1]) if code else None
     if not re.match(_GEOGRAPHIC, wkt):

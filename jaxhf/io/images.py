@@ -257,14 +257,11 @@ def write_exr(path: Path, planes: Mapping[str, np.ndarray]) -> None:
     """
     exr = import_extra("OpenEXR", "writing .exr needs", "exr")
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
-    with exr.File(
-        {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, dict(channels)
-    ) as file:  # it replaces the values
-        file.write(str(path))
-    try:
+    options, found = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {}
+    with contextlib.suppress(FileError, OSError, RuntimeError):
+        with exr.File(options, dict(channels)) as file:
+            file.write(str(path))
         found = _exr_channels(path)
-    except (FileError, OSError):
-        found = {}
     if not all(name in found and np.array_equal(found[name], plane, equal_nan=True) for name, plane in channels.items()):
         raise OSError(errno.ENOSPC, "OpenEXR left it incomplete, the disk is probably full")
 

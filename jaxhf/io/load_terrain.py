@@ -77,6 +77,8 @@ def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = No
         if not math.isfinite(z_scale) or z_scale == 0:
             raise FileError(f"z_scale must be finite and not zero, it is {z_scale}")
         terrain = reader(path, nodata, nodata_overrules)
+        if z_scale == 1:
+            return terrain
         with np.errstate(over="ignore"):
             scaled = terrain.heights * terrain.heights.dtype.type(z_scale)
         if np.isinf(scaled).any():
