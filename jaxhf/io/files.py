@@ -94,7 +94,9 @@ def replacing(path: Path, beside: Mapping[Path, str] | None = None) -> Iterator[
     except OSError as error:
         if error.errno is None:
             raise
-        raise type(error)(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
+        named = type(error)(f"{path}: cannot be written: {error.strerror}")
+        named.errno = error.errno
+        raise named from error
     finally:
         temporary.unlink(missing_ok=True)
 
