@@ -54,7 +54,7 @@ def _load(path: PathLike, decode: Callable[[np.ndarray], np.ndarray]) -> np.ndar
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
-def save_image(path: PathLike, image: Any, *, transfer: str = "srgb") -> None:
+def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapping[str, Any] | None = None) -> None:
     """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
 
     Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8 bits of the values clipped to 0..1;
@@ -66,10 +66,13 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb") -> None:
       image: the radiance.
       transfer: the bytes of a .png: "srgb", which viewers and `load_image` expect; "linear", 255 times the value, as in
         GDAL's shaded maps. The other formats always hold the values as they are.
+      aovs: what `render` gives beside the image, by name, each (h, w) or (h, w, c): layers of an .exr, in float32. Their
+        channels are those of compositing programs: depth.Z, normal.X, normal.Y, normal.Z, uv.U, uv.V, else name.V, or
+        name.0, name.1 and so on.
 
     Raises:
       FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of floats, or `transfer`
-        is another.
+        is another, or there are `aovs` of another size, or without .exr.
     """
     path = require_writable(path)
     if transfer not in _TRANSFERS:
@@ -81,8 +84,28 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb") -> None:
         raise FileError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
         raise FileError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
+    if aovs and path.suffix.lower() != ".exr":
+        raise ArgumentError("save_image", "aovs", f"are layers of an .exr, {path} is none")
+    layers = _layers(aovs or {}, pixels.shape[:2])
     with replacing(path) as temporary:
-        _WRITERS[path.suffix.lower()](temporary, pixels, _TRANSFERS[transfer])
+        if layers:
+            write_exr(temporary, _planes(pixels) | layers)
+        else:
+            _WRITERS[path.suffix.lower()](temporary, pixels, _TRANSFERS[transfer])
+
+
+def _layers(aovs: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """The channels of an .exr for images of this shape beside the picture."""
+    found = {}
+    for name, values in aovs.items():
+        values = np.asarray(values)
+        if values.ndim not in (2, 3) or values.shape[:2] != shape:
+            raise ArgumentError("save_image", f"aovs[{name!r}]", f"must have the image's size, {shape}, it has {values.shape}")
+        values = values.reshape(*shape, -1)
+        letters = {"depth": "Z", "normal": "XYZ", "uv": "UV"}.get(name, "V" if values.shape[2] == 1 else "")
+        for c in range(values.shape[2]):
+            found[f"{name}.{letters[c] if len(letters) == values.shape[2] else c}"] = values[:, :, c]
+    return found
 
 
 def require_writable(path: PathLike) -> Path:
@@ -246,7 +269,11 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
 
 
 def _write_exr(path: Path, pixels: np.ndarray, _: Any) -> None:
-    write_exr(path, {"Y": pixels} if pixels.ndim == 2 else {name: pixels[:, :, c] for c, name in enumerate("RGB")})
+    write_exr(path, _planes(pixels))
+
+
+def _planes(pixels: np.ndarray) -> dict[str, np.ndarray]:
+    return {"Y": pixels} if pixels.ndim == 2 else {name: pixels[:, :, c] for c, name in enumerate("RGB")}
 
 
 def write_exr(path: Path, planes: Mapping[str, np.ndarray]) -> None:
