@@ -43,6 +43,54 @@ def test_a_map_keeps_place_and_system(tmp_path, utm, values):
         assert written.dtype == values.dtype
 
 
+@pytest.mark.parametrize(
+    ("name", "driver"),
+    [("x.img", "HFA"), ("x.bil", "EHdr"), ("x.flt", "EHdr"), ("x.grd", "GSBG"), ("x.vrt", "VRT"), ("x.nc", "netCDF")],
+)
+def test_other_rasters_of_gdal(tmp_path, utm, name, driver):
+    rasterio_shutil = pytest.importorskip("rasterio.shutil")
+    with rasterio.Env() as gdal:
+        if driver not in gdal.drivers():
+            pytest.skip(f"this GDAL has no {driver}")
+    rasterio_shutil.copy(tmp_path / "utm.tif", tmp_path / name, driver=driver)
+    found = load_heights(tmp_path / name)
+    np.testing.assert_array_equal(found.heights, utm.heights)
+    np.testing.assert_allclose(found.in_file, utm.in_file)
+    with pytest.raises(ValueError, match=rf"{name}\.tif: it is cut off, damaged or of another kind"):  # its ending decides
+        load_heights((tmp_path / name).rename(tmp_path / f"{name}.tif"))
+
+
+@pytest.mark.parametrize("transform", [(30, 0, 5e5, 0, 20, 4e6), (-30, 0, 5e5, 0, -20, 4e6), (-30, 0, 5e5, 0, 20, 4e6)])
+def test_rasters_may_start_in_any_corner(tmp_path, transform):
+    terrain = load_heights(write(tmp_path / "x.tif", VALUES, transform))
+    with rasterio.open(tmp_path / "x.tif") as dataset:
+        for iy, ix in np.ndindex(3, 4):
+            x, y = dataset.xy(2 - iy if transform[4] < 0 else iy, 3 - ix if transform[0] < 0 else ix)
+            assert (terrain.x0 + ix * terrain.dx, terrain.y0 + iy * terrain.dy) == (x, y)
+            assert terrain.heights[iy, ix] == next(dataset.sample([(x, y)]))[0]
+
+
+def test_masks_are_holes(tmp_path):
+    with rasterio.open(write(tmp_path / "x.tif", VALUES, (30, 0, 5e5, 0, -20, 4e6)), "r+") as dataset:
+        dataset.write_mask(VALUES != 4)
+    np.testing.assert_array_equal(load_heights(tmp_path / "x.tif").nodata, VALUES[::-1] == 4)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_ground_control_points_are_refused(tmp_path, capfd):
+    points = [rasterio.control.GroundControlPoint(*numbers) for numbers in ((0, 0, 1, 2), (0, 9, 3, 4), (9, 0, 5, 6))]
+    profile = {"driver": "GTiff", "height": 3, "width": 4, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(tmp_path / "x.tif", "w", **profile) as dataset:
+        dataset.gcps = points, dataset.crs
+        dataset.write(VALUES, 1)
+    with pytest.raises(ValueError, match=r"x\.tif: it must be placed by a geotransform, it has ground control points"):
+        load_heights(tmp_path / "x.tif")
+    (tmp_path / "x.tif").write_bytes((tmp_path / "x.tif").read_bytes()[:300])
+    with pytest.raises(ValueError, match=r"x\.tif: it is cut off, damaged or of another kind"):
+        load_heights(tmp_path / "x.tif")
+    assert capfd.readouterr() == ("", "")  # GDAL prints nothing itself
+
+
 def test_a_part_of_a_terrain_in_degrees_lies_in_its_place(tmp_path):
     path = write(tmp_path / "a.tif", VALUES, (0.01, 0, -85, 0, -0.02, 37), crs="EPSG:4326")
     whole = load_heights(path)
