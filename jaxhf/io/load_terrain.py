@@ -15,7 +15,7 @@ import numpy as np
 from ..core.extras import import_extra
 from .errors import FileError
 from .files import PathLike, by_ending, read_npy, reading, require_file
-from .georeference import WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
+from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
 from .grids import read_asc, read_hgt, read_mujoco
 from .images import read_grey
 from .rasters import DRIVERS, read_raster
@@ -142,7 +142,7 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
         heights = heights_of(array("elevation")[::-1], nodata)
         south = min(number("ymin"), number("ymax"))  # matplotlib's file has them swapped
         dx, dy = number("dx"), number("dy")
-        crs, place = coordinate_system(WGS84_DEGREES), Georeference(WGS84_DEGREES)
+        crs, place = CoordinateSystem(degrees=True, globe=WGS84), Georeference(WGS84_DEGREES)
         return Terrain(heights, dx, dy, number("xmin") + dx / 2, south + dy / 2, crs, place)
 
 

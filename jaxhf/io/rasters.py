@@ -34,8 +34,8 @@ DRIVERS = {
 
 
 @contextlib.contextmanager
-def _opened(path: Path, doing: str = "reading") -> Iterator[Any]:
-    rasterio = import_extra("rasterio", f"{doing} {path.suffix.lower()} needs", "geo")
+def _opened(path: Path) -> Iterator[Any]:
+    rasterio = import_extra("rasterio", f"reading {path.suffix.lower()} needs", "geo")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)

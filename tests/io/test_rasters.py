@@ -119,6 +119,12 @@ def test_conversion_to_and_from_npz_keeps_system_and_nodata(tmp_path, crs):
     assert (a.dx, a.dy, a.x0, a.y0, a.crs, a.georeference) == (b.dx, b.dy, b.x0, b.y0, b.crs, b.georeference)
 
 
+def test_other_coordinates_keep_the_place(tmp_path, utm):
+    moved = load_heights(tmp_path / "utm.tif", dx=3.0, x0=0.0, y0=-7.0)
+    assert (moved.dx, moved.dy, moved.x0, moved.y0) == (3, 20, 0, -7)
+    assert moved.in_file == utm.in_file == (30, 20, 500015, 3999950)
+
+
 def test_a_picture_has_a_world_file(tmp_path, utm):
     save_raster(tmp_path / "map.png", VALUES.astype(np.uint8), utm)
     assert (tmp_path / "map.pgw").read_text().split() == ["30.0", "0.0", "0.0", "-20.0", "500015.0", "3999990.0"]
