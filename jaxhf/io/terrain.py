@@ -70,7 +70,7 @@ class Terrain:
           ValueError: `array` is no DataArray, or has other dimensions, or no coordinates, or they are not evenly spaced.
         """
         owner = "Terrain.from_xarray"
-        if not all(hasattr(array, name) for name in ("dims", "coords", "values", "attrs")):
+        if not all(hasattr(array, name) for name in ("dims", "coords", "values", "attrs")) or callable(array.values):
             raise ArgumentError(owner, "array", f"must be an xarray.DataArray, it is a {type(array).__name__}")
         values = np.asarray(array.values)
         names = [str(name) for name, size in zip(array.dims, values.shape, strict=True) if size > 1]

@@ -63,6 +63,7 @@ def test_longitude_and_latitude_are_degrees():
     ("array", "message"),
     [
         (SOUTH_FIRST, "array must be an xarray.DataArray, it is a ndarray"),
+        (xarray.Dataset({"z": ("x", X)}), "array must be an xarray.DataArray, it is a Dataset"),
         (xarray.DataArray(SOUTH_FIRST), r"must have dimensions y and x, or lat and lon, it has \('dim_0', 'dim_1'\)"),
         (xarray.DataArray(np.zeros((2, 2, 2)), dims=("band", "y", "x")), "must have dimensions y and x"),
         (xarray.DataArray(SOUTH_FIRST, dims=("y", "x")), "must have coordinates along y"),
