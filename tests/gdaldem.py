@@ -32,8 +32,8 @@ def gdaldem(
     heights[::-1].tofile(folder / "in.bin")
     (folder / "ramp.txt").write_text(ramp)
     command = ["gdaldem", mode, "in.bin", *(["ramp.txt"] if ramp else []), "out.bin", "-q", "-of", "ENVI", *map(str, options)]
-    for old in folder.glob("out.*"):
-        old.unlink()
+    for old in (*folder.glob("out.*"), *folder.glob("*.aux.xml")):  # GDAL keeps statistics in the latter
+        old.unlink(missing_ok=True)
     subprocess.run(command, check=True, cwd=folder, capture_output=True, timeout=60)
     dtype = np.float32 if mode in ("slope", "aspect") else np.uint8
     found = np.fromfile(folder / "out.bin", dtype).reshape(-1, *heights.shape)[:, ::-1]

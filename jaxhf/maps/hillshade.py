@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..core.errors import ArgumentError
+from .choices import ALGORITHMS, VARIANTS
 from .shadows import lit
 from .surface import Heights, require_one_of, require_positive, surface
-from .windows import ALGORITHMS, Window, differences, over_windows, spans
+from .windows import Window, differences, over_windows, spans
 
 _SHADOW = 1  # the darkest byte that is not nodata
 
@@ -55,7 +56,7 @@ def hillshade(
     """
     owner = "hillshade"
     require_one_of(owner, "algorithm", algorithm, ALGORITHMS)
-    require_one_of(owner, "variant", variant, tuple(_FORMULAE))
+    require_one_of(owner, "variant", variant, VARIANTS)
     require_light(owner, azimuth, altitude)
     require_positive(owner, "z_factor", z_factor)
     ground = surface(owner, heights, dx, dy, scale)
@@ -171,7 +172,9 @@ def _igor(
     return formula
 
 
-_FORMULAE = {"regular": _regular, "combined": _combined, "multidirectional": _multidirectional, "igor": _igor}
+_FORMULAE: dict[str, Callable[..., Callable[[Window], _Values]]] = dict(
+    zip(VARIANTS, (_regular, _combined, _multidirectional, _igor), strict=True)
+)
 
 
 def _slopes(window: Window, dx: float, dy: float, algorithm: str) -> tuple[_Values, _Values]:

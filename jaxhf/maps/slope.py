@@ -3,8 +3,9 @@
 import numpy as np
 from jaxtyping import Float32
 
+from .choices import ALGORITHMS
 from .surface import Heights, require_one_of, surface
-from .windows import ALGORITHMS, Window, differences, over_windows, spans
+from .windows import Window, differences, over_windows, spans
 
 NODATA = -9999.0
 

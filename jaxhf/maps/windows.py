@@ -9,8 +9,6 @@ from jaxtyping import Float32
 
 from ..core.machine import usable_cores
 
-ALGORITHMS = ("horn", "zevenbergen-thorne")
-
 # Nine views of the same shape: north-west, north, north-east, west, centre, east, south-west, south, south-east.
 Window = tuple[Float32[np.ndarray, "k m"], ...]
 

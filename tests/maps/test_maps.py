@@ -159,3 +159,69 @@ def test_light_beyond_the_zenith():
     with pytest.warns(UserWarning, match="opposite the azimuth, 60.0 high"):
         found = jaxhf.hillshade(rough(9, 9), azimuth=20.0, altitude=120.0)
     np.testing.assert_array_equal(found, jaxhf.hillshade(rough(9, 9), azimuth=200.0, altitude=60.0))
+
+
+RAMPS = {
+    "colours by name and number": "# low\n-60 0 0 128\n-20,0:255 0 7\n/ middle\n0\tOrange\n45.5 grey 100\n",
+    "shares of the range": "0% blue\n33.3% 10 200 30 128\n50% orange 77\n100% white\n",
+    "jumps": "-40 red\n0 green\n0 blue\n20 yellow\n20 1 2 3\n20 indigo\n60 white\n",
+}
+
+
+@needed
+@pytest.mark.parametrize("text", RAMPS.values(), ids=RAMPS)
+def test_tints_are_those_of_gdal(tmp_path, grid, text):
+    (ours, *_), _, theirs, nodata = grid
+    for entries, options in (("interpolate", ()), ("nearest", ("-nearest_color_entry",))):
+        ramp = text + ("nv 9 8 7 6\n" if nodata["nodata"] else "")
+        expected = gdaldem(tmp_path, "color-relief", *theirs, "-alpha", *options, **nodata, ramp=ramp)
+        found = jaxhf.color_relief(ours, tmp_path / "ramp.txt", entries=entries, alpha=True)
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(jaxhf.color_relief(ours, tmp_path / "ramp.txt", entries=entries), expected[..., :3])
+
+
+def test_tints_by_hand(tmp_path):
+    """`exact` as GDAL documents it (3.6 finds only the lowest entry), `default`, and holes without a colour of their own."""
+    heights = np.array([[0.0, 5.0, 10.0], [12.0, np.nan, -3.0]])
+    (tmp_path / "ramp.txt").write_text("0 black\n10 200 100 0\n")
+    shares = jaxhf.color_relief(heights, tmp_path / "ramp.txt", alpha=True)
+    np.testing.assert_array_equal(shares[0], [[0, 0, 0, 255], [100, 50, 0, 255], [200, 100, 0, 255]])
+    np.testing.assert_array_equal(shares[1], [[200, 100, 0, 255], [0, 0, 0, 0], [0, 0, 0, 255]])
+    (tmp_path / "ramp.txt").write_text("default 1 2 3\n10 200 100 0\n")
+    exact = jaxhf.color_relief(heights, tmp_path / "ramp.txt", entries="exact")
+    np.testing.assert_array_equal(exact == [1, 2, 3], np.repeat((heights != 10)[..., None], 3, -1))
+    own = jaxhf.color_relief(heights - 5).astype(int)
+    assert (own[0, 0, 2] > own[0, 0, 0], own[0, 2, 2] < own[0, 2, 0]) == (True, True)  # blue below 0, none of it on mountains
+    colormaps = pytest.importorskip("matplotlib").colormaps
+    mapped = jaxhf.color_relief(heights, "viridis")
+    np.testing.assert_array_equal(mapped[1, 2], np.multiply(colormaps["viridis"](0)[:3], 255).astype(int))
+
+
+def test_shading_darkens_and_lightens_tints():
+    """Level ground keeps its tint; slopes to the light are lighter, those away from it darker, and holes stay as they are."""
+    x = np.arange(20) + np.zeros((12, 1))
+    heights = np.abs(x - 9.0) + 20.0
+    heights[:, 14:] = 25.0
+    heights[5, 17] = np.nan
+    tint, shaded = jaxhf.color_relief(heights).astype(int), jaxhf.relief(heights, azimuth=270.0).astype(int)
+    np.testing.assert_array_equal(shaded[:, 18], tint[:, 18])
+    assert (shaded[:, 2:8] < tint[:, 2:8]).all()  # falls to the east
+    assert (shaded[:, 11:13] > tint[:, 11:13]).any()
+    assert not shaded[5, 17].any()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 red\n10 crimson\n", "ramp.txt:2: there is no colour 'crimson'; "),
+        ("0 red\n10 1 2\n", "ramp.txt:2: a height must be followed by red, green and blue, or by a colour's name"),
+        ("0 red\nten 1 2 3\n", "ramp.txt:2: there must be a height, a percentage, nv or default, there is 'ten'"),
+        ("0 red\n10 1 2 300\n", "ramp.txt:2: a colour's parts must lie between 0 and 255, one is 300"),
+        ("120% red\n", "ramp.txt:1: a percentage must lie between 0 and 100, it is 120%"),
+        ("# nothing\nnv red\n", "ramp.txt: a colour file must hold a height and its colour, it holds none"),
+    ],
+)
+def test_colour_files_are_refused(tmp_path, text, message):
+    (tmp_path / "ramp.txt").write_text(text)
+    with pytest.raises(jaxhf.SceneError, match=re.escape(message)):
+        jaxhf.color_relief(np.eye(3), tmp_path / "ramp.txt")
