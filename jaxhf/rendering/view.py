@@ -2,12 +2,14 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
+from ..core.settings import Settings
 from ..scene.camera import Perspective
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Sky
@@ -15,11 +17,12 @@ from ..scene.material import Matte
 from ..scene.scene import Object, Scene
 from ..scene.skirt import Skirt
 from ..scene.texture import ImageTexture
-from .render import Prepared, render
+from .render import Prepared, prepare, render
 
 _SUN, _SKY = 0.8, 0.3  # radiance of white ground that faces the sun, and what the whole sky adds
 _ABOVE, _BELOW = (0.60, 0.72, 0.86), (0.95, 0.95, 0.93)  # the background's highest and lowest row
 _HAZE = (0.78, 0.84, 0.90)
+_SHALLOW, _DEEP = (0.16, 0.38, 0.46), (0.02, 0.09, 0.20)
 _WALLS = (0.16, 0.14, 0.125)
 
 
@@ -45,17 +48,54 @@ class Look:
             raise ArgumentError("view", "haze", f"must be at least 0 and below 1, it is {self.haze}")
 
 
+def exaggeration(heights: Float[np.ndarray, "ny nx"], dx: float, dy: float) -> float:
+    """A factor for heights, 1, 2 or 5 times a power of ten, with which a terrain looks neither flat nor like a wall.
+
+    Its relief, without a hundredth at either end, is then 0.06 of the shorter side at least and 0.6 at most; 1 where it is so
+    without.
+    """
+    known = heights[np.isfinite(heights)]
+    low, high = np.percentile(known, (1, 99))
+    ny, nx = heights.shape
+    share = float(high - low) / min((nx - 1) * dx, (ny - 1) * dy)
+    if share <= 0 or 0.06 <= share <= 0.6:
+        return 1.0
+    wanted = (0.06 if share < 0.06 else 0.2) / share
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= wanted * (1 - 1e-9))
+
+
+def with_water(
+    heights: Float[np.ndarray, "ny nx"], colours: Float[np.ndarray, "h w 3"], level: float
+) -> tuple[Float[np.ndarray, "ny nx"], Float[np.ndarray, "h w 3"]]:
+    """Heights with a level sheet of water where they lie below it, and colours that darken with its depth.
+
+    Args:
+      heights: of a terrain.
+      colours: linear, one for each vertex, or those of a picture that spans the terrain.
+      level: of the water.
+    """
+    under = np.maximum(level - heights, 0)
+    deep = under / max(float(np.nanmax(under)), np.finfo(float).tiny)
+    rows = np.round(np.linspace(0, len(heights) - 1, len(colours))).astype(int)
+    columns = np.round(np.linspace(0, heights.shape[1] - 1, colours.shape[1])).astype(int)
+    deep = np.sqrt(np.nan_to_num(deep))[np.ix_(rows, columns)][..., None]
+    sea = (1 - deep) * np.array(_SHALLOW) + deep * np.array(_DEEP)
+    return np.fmax(heights, np.where(np.isnan(heights), np.nan, level)).astype(heights.dtype), np.where(deep > 0, sea, colours)
+
+
 def block(field: Heightfield, colours: Any, camera: Perspective, look: Look, base: float | None) -> Scene:
     """A terrain with walls and a floor, under the sun and a sky.
 
     Args:
       field: the terrain.
-      colours: linear, 0 to 1: one (3,), of each vertex (ny, nx, 3), or an `ImageTexture` over all of it.
+      colours: linear, 0 to 1: one (3,), of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
       camera: that is to see it.
       look: the sun.
       base: the level of the floor; None: neither walls nor a floor.
     """
-    albedo = colours if isinstance(colours, ImageTexture) or np.ndim(colours) < 3 else ImageTexture(colours, at_vertices=True)
+    at_vertices = np.shape(colours)[:-1] == field.heights.shape
+    albedo = ImageTexture(colours, at_vertices=at_vertices) if np.ndim(colours) == 3 else colours
     objects = [Object(field, Matte(albedo))]
     if base is not None:
         objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))
@@ -66,19 +106,30 @@ def _lights(look: Look) -> list[Any]:
     return [Directional.from_angles(look.azimuth, look.altitude, math.pi * _SUN), Sky(_SKY)]
 
 
-def photograph(scene: Prepared, camera: Perspective, look: Look) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance of a prepared `block`, with haze before a background.
+def photograph(
+    scene: Scene | Prepared, camera: Perspective, look: Look, progress: Callable[[], Any] | None = None
+) -> Float[np.ndarray, "h w 3"]:
+    """Linear radiance of a `block`, with haze before a background.
 
     Each of a pixel's samples gets haze by its own distance, so it is a picture of its own, from a camera that looks past the
     pixel's centre.
+
+    Args:
+      scene: the block, which may be prepared.
+      camera: that sees it.
+      look: the haze and the samples.
+      progress: called after each sample.
     """
     side = math.isqrt(look.samples)
+    scene = scene if isinstance(scene, Prepared) else prepare(scene, Settings(samples=1))
     size = _length(scene.scene.objects[0].shape)
     total = np.zeros((camera.height, camera.width, 3))
     for k in range(side * side):
         dx, dy = ((k % side + 0.5) / side - 0.5, (k // side + 0.5) / side - 0.5)
         image, aovs = render(scene.with_camera(_moved(camera, dx, dy)), aovs=("depth",))
         total += _in_haze(np.asarray(image, np.float64), np.asarray(aovs["depth"], np.float64), size, look.haze)
+        if progress is not None:
+            progress()
     return (total / side**2).astype(np.float32)
 
 

@@ -1,0 +1,193 @@
+"""`jaxhf view`: a terrain as a solid block, from a place that shows all of it."""
+
+import argparse
+import dataclasses
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..core.errors import UserError
+from . import arguments, interruption
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..io.terrain import Terrain
+    from ..scene.camera import Perspective
+    from ..scene.heightfield import Heightfield
+
+_PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
+
+
+def add(commands: Any) -> None:
+    about = "Show a terrain as a solid block in colours, from a place that shows all of it. A .gif or .mp4 goes round it."
+    command = commands.add_parser("view", help="show a terrain: a picture, or a film that goes round it", description=about)
+    command.add_argument("terrain", metavar="IN", help="heights, in any format that can be read")
+    command.add_argument("-o", "--output", metavar="OUT", help=".png, .exr, .npy, .pfm; a film: .gif, .mp4 [IN's name, .png]")
+    size = command.add_argument_group("picture")
+    size.add_argument("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]")
+    size.add_argument("--preset", choices=_PRESETS, default="balanced", help="1, 9 or 64 samples a pixel [balanced]")
+    size.add_argument("--frames", type=int, default=72, metavar="N", help="of a film, 24 a second [72]")
+    camera = command.add_argument_group("camera")
+    camera.add_argument(
+        "--from", dest="camera_azimuth", type=float, metavar="DEGREES",
+        help="where the camera stands, clockwise from north [110 before the sun]",
+    )  # fmt: skip
+    camera.add_argument(
+        "--above", dest="camera_altitude", type=float, default=35.0, metavar="DEGREES", help="above the horizon [35]"
+    )
+    camera.add_argument("--fov", type=float, default=30.0, metavar="DEGREES", help="angle of view [30]")
+    light = command.add_argument_group("light")
+    light.add_argument("--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the sun, clockwise from north [315]")
+    light.add_argument("--altitude", type=float, default=35.0, metavar="DEGREES", help="of the sun, above the horizon [35]")
+    light.add_argument("--sun-from", type=_angles, metavar="AZ,ALT", help="a film of a moving sun: where it begins")
+    light.add_argument("--sun-to", type=_angles, metavar="AZ,ALT", help="and where it ends")
+    light.add_argument("--haze", type=float, default=0.15, metavar="SHARE", help="of light lost along the terrain [0.15]")
+    ground = command.add_argument_group("terrain")
+    ground.add_argument(
+        "--exaggeration", type=float, metavar="X", help="heights are multiplied by it [1 to 20, by how flat the terrain is]"
+    )
+    tint = ground.add_mutually_exclusive_group()
+    tint.add_argument(
+        "--ramp", metavar="FILE|NAME", help="colours by height: a gdaldem colour file, or a matplotlib colour map"
+    )
+    tint.add_argument(
+        "--drape", metavar="IMAGE", help="a picture laid over it: a GeoTIFF where it lies, others from corner to corner"
+    )
+    ground.add_argument("--water", type=float, metavar="LEVEL", help="below it is water")
+    ground.add_argument("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet")
+    arguments.add_raster(command)
+    arguments.add_machine(command)
+    command.set_defaults(run=run)
+
+
+def _angles(text: str) -> tuple[float, float]:
+    azimuth, altitude = text.split(",")
+    return float(azimuth), float(altitude)
+
+
+def run(options: argparse.Namespace) -> None:
+    from ..io.films import FILMS, require_writable_film
+    from ..io.images import require_writable
+    from ..io.load_terrain import load_heights
+
+    output = Path(options.output or Path(options.terrain).with_suffix(".png").name)
+    film = output.suffix.lower() in FILMS
+    if (options.sun_from is None) != (options.sun_to is None):
+        raise UserError("view: --sun-from and --sun-to belong together, one is missing")
+    if options.sun_from is not None and not film:
+        raise UserError(f"view: a moving sun makes a film, {output} is none; write {' or '.join(FILMS)}")
+    if options.frames < 2:
+        raise UserError(f"view: --frames must be 2 or more, it is {options.frames}")
+    if output.resolve() == Path(options.terrain).resolve():
+        raise UserError(f"view: {output} is the terrain itself; name another file by -o")
+    (require_writable_film if film else require_writable)(output)
+    size = _size(options.size)
+    begin = time.perf_counter()
+    terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+    if terrain.nodata.all():
+        raise UserError(f"view: {options.terrain} holds no height")
+    stage = _Stage(options, terrain, size)
+    arguments.set_up_jax(options)
+    said = stage.film(output, options) if film else stage.picture(output)
+    print(f"{output}: {said}, heights x {stage.exaggeration:g}, {time.perf_counter() - begin:.1f} s")
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(word) for word in text.lower().split("x"))
+    except ValueError:
+        raise UserError(f"view: --size must be two numbers of pixels, as 1280x800, it is {text!r}") from None
+    if min(width, height) < 1:
+        raise UserError(f"view: --size must be positive, it is {text}")
+    return width, height
+
+
+class _Stage:
+    """A terrain made ready to be shown: exaggerated, coloured, with a floor."""
+
+    def __init__(self, options: argparse.Namespace, terrain: "Terrain", size: tuple[int, int]):
+        import numpy as np
+
+        from ..rendering.view import Look, exaggeration, with_water
+
+        self.options, self.size, self.terrain = options, size, terrain
+        self.exaggeration = options.exaggeration or exaggeration(terrain.heights, terrain.dx, terrain.dy)
+        self.colours = self._colours()
+        z = terrain.heights.astype(options.precision)
+        if options.water is not None:
+            z, self.colours = with_water(z, self.colours, options.water)
+        self.heights = z * z.dtype.type(self.exaggeration)
+        low, high = np.nanmin(self.heights), np.nanmax(self.heights)
+        reach = max((n - 1) * d for n, d in zip(z.shape, (terrain.dy, terrain.dx), strict=True))
+        self.base = float(low - max(0.25 * (high - low), 0.02 * reach)) if options.skirt else None
+        self.look = Look(options.azimuth, options.altitude, options.haze, _PRESETS[options.preset])
+
+    def _colours(self) -> "np.ndarray":
+        import numpy as np
+
+        from ..io.drape import load_drape
+        from ..io.images import linear_from_srgb
+        from ..maps.relief import color_relief
+
+        if self.options.drape is not None:
+            return load_drape(self.options.drape, self.terrain)
+        return linear_from_srgb(color_relief(self.terrain, self.options.ramp).astype(np.float64) / 255)
+
+    def _field(self) -> "Heightfield":
+        from ..scene.heightfield import Heightfield
+
+        return Heightfield(self.heights, self.terrain.dx, self.terrain.dy)
+
+    def _camera(self, field: "Heightfield", azimuth: float) -> "Perspective":
+        from ..scene.camera import Perspective
+
+        width, height = self.size
+        altitude, fov = self.options.camera_altitude, self.options.fov
+        return Perspective.framing(field, azimuth, altitude, fov, width=width, height=height, base=self.base)
+
+    @property
+    def _azimuth(self) -> float:
+        given = self.options.camera_azimuth
+        return self.look.azimuth - 110 if given is None else given
+
+    def picture(self, output: Path) -> str:
+        from ..io.images import save_image
+        from ..rendering.view import block, photograph
+        from .progress import bar
+
+        field = self._field()
+        camera = self._camera(field, self._azimuth)
+        with bar(total=self.look.samples, unit=" samples", delay=0.5) as shown:
+            image = photograph(block(field, self.colours, camera, self.look, self.base), camera, self.look, shown.update)
+        interruption.raise_from_now_on()
+        save_image(output, image)
+        return f"{self.size[0]} x {self.size[1]} pixels"
+
+    def film(self, output: Path, options: argparse.Namespace) -> str:
+        import numpy as np
+
+        from ..io.films import writing_film
+        from ..io.images import srgb_from_linear
+        from ..rendering.render import prepare
+        from ..rendering.view import block, photograph
+        from .progress import bar
+
+        field = self._field()
+        turns = [self._azimuth + 360 * k / options.frames for k in range(options.frames)]
+        suns = [self.look] * options.frames
+        if options.sun_from is not None:
+            turns = [self._azimuth] * options.frames
+            path = np.linspace(options.sun_from, options.sun_to, options.frames)
+            suns = [dataclasses.replace(self.look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
+        ready, lit = None, None
+        with writing_film(output, 24) as add, bar(total=options.frames, unit=" frames") as shown:
+            for turn, look in zip(turns, suns, strict=True):
+                camera = self._camera(field, turn)
+                if ready is None or look != lit:
+                    ready, lit = prepare(block(field, self.colours, camera, look, self.base)), look
+                image = photograph(ready, camera, look)
+                add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
+                shown.update()
+            interruption.raise_from_now_on()
+        return f"{options.frames} frames of {self.size[0]} x {self.size[1]} pixels"

@@ -1,0 +1,73 @@
+"""Pictures to be laid over a terrain."""
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ..core.extras import import_extra
+from .errors import FileError
+from .files import PathLike, reading, require_file, require_pixels
+from .images import linear_from_srgb, load_image
+from .terrain import Terrain
+
+_MOST = 4096  # texels along a side
+
+
+def load_drape(path: PathLike, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
+    """The texels of an `ImageTexture` that shows a picture on a terrain: linear colours, row 0 in the south.
+
+    A GeoTIFF is laid where it lies, which must be in the terrain's reference system; it is black where it does not cover the
+    terrain. Any other picture goes from corner to corner, its top in the north.
+
+    Raises:
+      FileNotFoundError, ValueError: as `load_image`; or a GeoTIFF that is not of bytes, in another system, or elsewhere.
+    """
+    path = require_file(path)
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        image = np.asarray(load_image(path))
+        return np.ascontiguousarray(
+            np.broadcast_to(image[..., None] if image.ndim == 2 else image, (*image.shape[:2], 3))[::-1]
+        )
+    with reading(path):
+        return _placed(path, terrain)
+
+
+def _placed(path: Path, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
+    rasterio = import_extra("rasterio", "reading .tif needs", "geo")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        with rasterio.open(path.absolute(), driver="GTiff") as dataset:
+            require_pixels(dataset.height, dataset.width)
+            if dataset.count not in (1, 3, 4) or set(dataset.dtypes) != {"uint8"}:
+                raise FileError(f"it must have 1, 3 or 4 bands of bytes, it has {dataset.count} of {dataset.dtypes[0]}")
+            _require_same_system(dataset, terrain, rasterio)
+            dx, dy, x0, y0 = terrain.in_file
+            ny, nx = terrain.heights.shape
+            west, south, east, north = x0, y0, x0 + (nx - 1) * dx, y0 + (ny - 1) * dy
+            if dataset.transform.is_identity:
+                west, south, east, north = 0, dataset.height, dataset.width, 0
+            window = rasterio.windows.from_bounds(west, south, east, north, dataset.transform)
+            covers = window.col_off + window.width >= 0 and window.col_off <= dataset.width
+            if not (covers and window.row_off + window.height >= 0 and window.row_off <= dataset.height):
+                raise FileError(
+                    f"it must cover the terrain; it spans {tuple(dataset.bounds)}, that {(west, south, east, north)}"
+                )
+            shape = tuple(min(_MOST, max(2, math.ceil(side))) for side in (window.height, window.width))
+            bands = dataset.read(
+                indexes=[1, 2, 3] if dataset.count > 1 else [1, 1, 1], window=window, out_shape=(3, *shape), boundless=True,
+                fill_value=0, resampling=rasterio.enums.Resampling.bilinear,
+            )  # fmt: skip
+    return linear_from_srgb(np.moveaxis(bands, 0, -1)[::-1] / 255)
+
+
+def _require_same_system(dataset: Any, terrain: Terrain, rasterio: Any) -> None:
+    known = terrain.georeference
+    if dataset.crs is None or known is None or not known.wkt:
+        return
+    if rasterio.crs.CRS.from_wkt(known.wkt) != dataset.crs:
+        given = dataset.crs.to_string()
+        raise FileError(f"it must be in the terrain's reference system, {known.name}; it is in {given} (gdalwarp changes it)")

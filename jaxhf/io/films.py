@@ -1,0 +1,61 @@
+"""Films: .gif and .mp4."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+from jaxtyping import UInt8
+
+from ..core.extras import import_extra
+from .files import PathLike, by_ending, reading, replacing, require_folder
+
+Add = Callable[[UInt8[np.ndarray, "h w 3"]], None]
+
+FILMS = (".gif", ".mp4")
+
+
+def require_writable_film(path: PathLike) -> Path:
+    """Checks that `writing_film` can write to `path`.
+
+    Raises:
+      ValueError: the ending is neither .gif nor .mp4, PyAV is missing for the latter, or `path` is a folder.
+      FileNotFoundError: the folder does not exist.
+      PermissionError: the folder cannot be written to.
+    """
+    path = Path(path)
+    by_ending(dict.fromkeys(FILMS), path, "write a film with")
+    require_folder(path, "a film")
+    if path.suffix.lower() == ".mp4":
+        with reading(path):
+            import_extra("av", "writing .mp4 needs", "video")
+    return path
+
+
+@contextlib.contextmanager
+def writing_film(path: PathLike, rate: int) -> Iterator[Add]:
+    """Yields a function that takes one sRGB picture after the other, of one size; the file appears whole or not at all.
+
+    Args:
+      path: .gif, which repeats for ever, or .mp4 (H.264; a last column or row is left out where their number is odd).
+      rate: pictures a second.
+    """
+    path = require_writable_film(path)
+    ending = path.suffix.lower()
+    with replacing(path) as temporary:
+        if ending == ".gif":
+            frames: list[Any] = []
+            yield frames.append
+            # By name, not by the file's own ending, which is that of a temporary one.
+            with temporary.open("wb") as file:
+                imageio.imwrite(file, frames, plugin="pillow", extension=".gif", duration=1000 / rate, loop=0)
+            return
+        with temporary.open("wb") as file, imageio.imopen(file, "w", plugin="pyav", extension=".mp4") as film:
+            film.init_video_stream("libx264", fps=rate)
+
+            def add(frame: np.ndarray) -> None:
+                film.write_frame(frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2])
+
+            yield add
