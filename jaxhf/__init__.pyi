@@ -7,6 +7,7 @@ from .fitting.history import Step as Step, Stop as Stop
 from .io.errors import SceneError as SceneError
 from .io.images import load_image as load_image, save_image as save_image
 from .io.load_terrain import jacksboro as jacksboro, load_heights as load_heights
+from .io.meshes import save_mesh as save_mesh
 from .io.save_terrain import save_heights as save_heights
 from .io.scenes import load_scene as load_scene
 from .io.terrain import Terrain as Terrain

@@ -8,6 +8,8 @@ from typing import get_args
 from ..core.errors import UserError
 from ..core.settings import Settings
 
+TERRAIN = ".tif and others that GDAL reads, .npz, .npy, .asc, .hgt, .png (grey), .exr, .pfm or .hfield (MuJoCo)"
+
 
 def add_settings(command: argparse.ArgumentParser, names: Collection[str], **defaults: str) -> None:
     """Adds an option for each of these fields of `Settings`, with the help that its metadata holds.

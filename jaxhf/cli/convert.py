@@ -4,27 +4,38 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from ..core.errors import UserError
 from . import arguments, interruption
 
 
 def add(commands: Any) -> None:
-    about = "Write a terrain in another format. From GeoTIFF to GeoTIFF it keeps its place on the map."
+    about = "Write a terrain in another format, with its place on the map, or as a mesh of triangles."
     command = commands.add_parser("convert", help="write a terrain in another format", description=about)
-    command.add_argument("terrain", metavar="IN", help="heights: .npy, .npz, .png (16 bits) or .tif")
-    command.add_argument("output", metavar="OUT", help=".npy, .npz or .tif")
+    command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
+    command.add_argument("output", metavar="OUT", help=".tif, .npz, .npy, .asc, .png or .exr; a mesh: .glb, .obj or .ply")
+    command.add_argument("--base", type=float, metavar="Z", help="close a mesh by walls down to this height [open]")
     arguments.add_raster(command)
     command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> None:
     from ..io.load_terrain import load_heights
-    from ..io.save_terrain import require_writable_heights, save_heights
+    from ..io.meshes import MESHES, require_writable_mesh, save_mesh
+    from ..io.save_terrain import HEIGHTS, require_writable_heights, save_heights
     from .describe import heightfield_line
 
-    require_writable_heights(options.output)
+    ending = Path(options.output).suffix.lower()
+    if ending not in MESHES:
+        require_writable_heights(options.output, HEIGHTS + MESHES)
+        if options.base is not None:
+            raise UserError(f"--base is for meshes ({', '.join(MESHES)}), {options.output} is none")
+    else:
+        require_writable_mesh(options.output)
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
-    rasters = {Path(path).suffix.lower() for path in (options.terrain, options.output)} <= {".tif", ".tiff"}
     interruption.raise_from_now_on()
-    save_heights(options.output, terrain, options.terrain if rasters else None)
-    alone = " (.npy holds the heights alone)" if Path(options.output).suffix.lower() == ".npy" else ""
+    if ending in MESHES:
+        save_mesh(options.output, terrain, base=options.base)
+    else:
+        save_heights(options.output, terrain)
+    alone = f" ({ending} holds the heights alone)" if ending in (".npy", ".exr") else ""
     print(f"{options.output}: {heightfield_line(terrain)}{alone}")

@@ -1,4 +1,4 @@
-"""A scene in words, as `jaxhf info` and `convert` print it."""
+"""A scene or a terrain in words, as `jaxhf info` and `convert` print it."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,35 @@ def scene_lines(scene: "Scene") -> Iterator[str]:
     for k, light in enumerate(scene.lights):
         values = ", ".join(f"{name} {_numbers(value)}" for name, value in vars(light).items())
         yield f"light {k}: {type(light).__name__}, {values}"
+
+
+def terrain_lines(path: str, terrain: "Terrain") -> Iterator[str]:
+    """Size, spacing, place, reference system and range of a terrain in its file's own coordinates."""
+    from ..io.georeference import Georeference, coordinate_system
+
+    ny, nx = terrain.heights.shape
+    yield f"{path}: {ny} rows, {nx} columns of {terrain.heights.dtype}"
+    place = terrain.georeference or Georeference()
+    crs = coordinate_system(place.wkt) if place.wkt else terrain.crs
+    dx, dy, x0, y0 = terrain.in_file
+    if crs is None and (dx, dy, x0, y0) == (1, 1, 0, 0):
+        yield "cells: not in the file, taken as 1 x 1"
+    else:
+        metres = ""
+        if crs is not None and crs.degrees and crs.globe is not None:
+            local = terrain.in_metres()
+            metres = f", in the middle {local.dx:.6g} x {local.dy:.6g} metres"
+        yield f"cells: {dx:.9g} x {dy:.9g}{place.unit and ' '}{place.unit}{metres}"
+        x, y = ("longitude", "latitude") if crs is not None and crs.degrees else ("x", "y")
+        yield f"place: {x} {x0:.10g} to {x0 + (nx - 1) * dx:.10g}, {y} {y0:.10g} to {y0 + (ny - 1) * dy:.10g}"
+    code = f" (EPSG:{crs.code})" if crs is not None and crs.code else ""
+    yield f"system: {place.name or 'not known'}{code}"
+    holes = int(np.count_nonzero(np.isnan(terrain.heights)))
+    share = f", {holes} holes ({holes / terrain.heights.size:.3g} of all)" if holes else ", no holes"
+    stored = f", stored as {place.nodata:.10g}" if holes and place.nodata is not None else ""
+    lowest, highest = np.fmin.reduce(terrain.heights, axis=None), np.fmax.reduce(terrain.heights, axis=None)
+    span = "none" if holes == terrain.heights.size else f"{lowest:.7g} to {highest:.7g}"
+    yield f"heights: {span}{share}{stored}"
 
 
 def heightfield_line(field: "Heightfield | Terrain") -> str:

@@ -3,8 +3,10 @@
 import argparse
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..core.errors import UserError
 from ..core.settings import Settings
 from . import arguments, interruption
 
@@ -18,6 +20,10 @@ def add(commands: Any) -> None:
     command.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="the picture: .png (sRGB), .exr, .npy or .pfm (linear)"
     )
+    command.add_argument(
+        "--aovs", type=lambda names: tuple(names.split(",")), default=(), metavar="NAMES",
+        help="what rays met besides, as layers of an .exr: depth,normal,uv,object,cell,shadow,status,steps,exhausted [none]",
+    )  # fmt: skip
     arguments.add_size(command)
     arguments.add_settings(command, Settings.__dataclass_fields__.keys() - {"edge_samples"})  # nothing is differentiated
     arguments.add_machine(command)
@@ -25,15 +31,18 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    draw(options, lambda: _load(options))
+    if options.aovs and Path(options.output).suffix.lower() != ".exr":
+        raise UserError(f"--aovs are layers of an .exr, {options.output} is none")
+    draw(options, lambda: _load(options), options.aovs)
 
 
-def draw(options: argparse.Namespace, load: "Callable[[], Scene]", **saving: Any) -> None:
+def draw(options: argparse.Namespace, load: "Callable[[], Scene]", aovs: tuple[str, ...] = (), **saving: Any) -> None:
     """Renders a scene, saves the picture and prints what it took.
 
     Args:
       options: output, the machine's and those of `Settings`.
       load: makes the scene, when JAX is set up.
+      aovs: names out of `AOVS`, that are saved with the picture.
       saving: for `save_image`.
     """
     from ..io.images import require_writable
@@ -41,8 +50,8 @@ def draw(options: argparse.Namespace, load: "Callable[[], Scene]", **saving: Any
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)
-    image, report = _timed_render(load(), settings, options.devices)
-    finish(options.output, image, report, **saving)
+    image, found, report = _timed_render(load(), settings, options.devices, aovs)
+    finish(options.output, image, report, aovs=found, **saving)
 
 
 def finish(path: str, image: Any, report: str, **saving: Any) -> None:
@@ -76,8 +85,10 @@ def _load(options: argparse.Namespace) -> "Scene":
     return resized(scene, width, height or max(1, round(width * old.height / old.width)))
 
 
-def _timed_render(scene: "Scene", settings: Settings, devices: int | None) -> tuple[Any, str]:
-    """The picture and what it took; `devices` None: as many as there are, if they pay."""
+def _timed_render(
+    scene: "Scene", settings: Settings, devices: int | None, aovs: tuple[str, ...]
+) -> tuple[Any, dict[str, Any], str]:
+    """The picture, its `aovs` and what they took; `devices` None: as many as there are, if they pay."""
     import jax
     import numpy as np
 
@@ -99,13 +110,14 @@ def _timed_render(scene: "Scene", settings: Settings, devices: int | None) -> tu
             shown.total = total
             shown.update(done - shown.n)
 
-        image, aovs = render(scene, settings, aovs=("exhausted",), progress=advance, mesh=mesh)
+        image, found = render(scene, settings, aovs=tuple(dict.fromkeys(("exhausted", *aovs))), progress=advance, mesh=mesh)
     elapsed = time.perf_counter() - begin
     seconds = max(elapsed - compiling.seconds, 1e-9)
     height, width = image.shape[:2]
     device = f"{mesh.size} x {jax.devices()[0].device_kind}"
-    exhausted = int(np.sum(aovs["exhausted"]))
-    return image, report_line(width, height, samples, seconds, compiling.seconds, device, exhausted)
+    exhausted = int(np.sum(found["exhausted"]))
+    asked = {name: found[name] for name in aovs}
+    return image, asked, report_line(width, height, samples, seconds, compiling.seconds, device, exhausted)
 
 
 class _CompileTime:

@@ -34,7 +34,8 @@ def resolve_inside(root: Path, folder: Path, name: str) -> Path:
       name: as written.
 
     Raises:
-      FileError: `name` leads out of `root`, by "..", by an absolute path or by a link; or it holds a null character.
+      FileError: `name` leads out of `root`, by "..", by an absolute path or by a link; or it is a .vrt, whose sources may lie
+        anywhere, or holds a null character.
       FileNotFoundError: no file is there.
     """
     if "\0" in name:
@@ -43,6 +44,8 @@ def resolve_inside(root: Path, folder: Path, name: str) -> Path:
     path = (folder / name).resolve()
     if not path.is_relative_to(root):
         raise FileError(f"{name!r} lies outside the scene's folder {str(root)!r}")
+    if path.suffix.lower() == ".vrt":
+        raise FileError(f"{name!r} names other files, which a scene cannot open (gdal_translate makes a .tif of it)")
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {name!r} in {str(folder)!r}")
     return path

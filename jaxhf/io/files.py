@@ -69,11 +69,15 @@ def require_folder(path: Path, what: str) -> None:
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, beside: Mapping[Path, str] | None = None) -> Iterator[Path]:
     """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong.
 
     The new content is on the disk before it gets the name, and the name when this ends: a power failure leaves the old file
     or the new one, not an empty one (Pillai et al., All file systems are not created equal, 2014).
+
+    Args:
+      path: the file.
+      beside: small text files that go with it, and their contents, which are written before any file takes its place.
     """
     path = path.resolve()  # what a link points to is replaced, not the link
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
@@ -81,9 +85,18 @@ def replacing(path: Path) -> Iterator[Path]:
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
+        with contextlib.ExitStack() as others:
+            for other, text in (beside or {}).items():
+                others.enter_context(replacing(other)).write_text(text, encoding="utf-8")
         os.replace(temporary, path)
         with contextlib.suppress(OSError):  # Windows opens no folders, some network file systems synchronise none
             _synchronise_folder(path.parent)
+    except OSError as error:
+        if error.errno is None:
+            raise
+        named = type(error)(f"{path}: cannot be written: {error.strerror}")
+        named.errno = error.errno
+        raise named from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -129,8 +142,16 @@ def require_pixels(height: int, width: int) -> None:
         raise FileError(f"it must hold at most {MAX_PIXELS} pixels, it declares {width} x {height}")
 
 
-def read_npy(file: Any, size: int) -> np.ndarray:
-    """The array of an open .npy file, or member of an archive, of `size` bytes; ValueError where it is not of real numbers.
+def write_npy(path: Path, array: np.ndarray) -> None:
+    """As np.save, but a full disk is the system's own error, which names itself, and not "8 requested and 7 written"."""
+    array = np.ascontiguousarray(array)
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
+        file.write(array.data)
+
+
+def read_npy(file: Any, size: int, kinds: str = "fiub") -> np.ndarray:
+    """The array of an open .npy file, or member of an archive, of `size` bytes; ValueError where it is not of these `kinds`.
 
     np.load trusts the header and asks for all the memory that it names, so its size is compared with the file's first.
     """
@@ -139,7 +160,7 @@ def read_npy(file: Any, size: int) -> np.ndarray:
     if header is None:
         raise ValueError(f"its .npy version must be 1.0 or 2.0, it is {version}")
     shape, _, dtype = header(file)
-    if dtype.kind not in "fiub":
+    if dtype.kind not in kinds:
         raise ValueError(f"its array must hold real numbers, it holds {dtype}")
     require_pixels(*(*shape, 1, 1)[:2])
     declared, present = math.prod(shape) * dtype.itemsize, size - file.tell()

@@ -5,9 +5,10 @@ length and against `MAX_PIXELS` before anything is decoded.
 """
 
 import contextlib
+import errno
 import re
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from PIL import Image
 from ..core.errors import ArgumentError
 from ..core.extras import import_extra
 from .errors import FileError
-from .files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_folder, require_pixels
+from .files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_folder, require_pixels, write_npy
 from .png import require_whole
 
 
@@ -53,7 +54,7 @@ def _load(path: PathLike, decode: Callable[[np.ndarray], np.ndarray]) -> np.ndar
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
-def save_image(path: PathLike, image: Any, *, transfer: str = "srgb") -> None:
+def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapping[str, Any] | None = None) -> None:
     """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
 
     Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8 bits of the values clipped to 0..1;
@@ -65,10 +66,13 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb") -> None:
       image: the radiance.
       transfer: the bytes of a .png: "srgb", which viewers and `load_image` expect; "linear", 255 times the value, as in
         GDAL's shaded maps. The other formats always hold the values as they are.
+      aovs: what `render` gives beside the image, by name, each (h, w) or (h, w, c): layers of an .exr, in float32. Their
+        channels are those of compositing programs: depth.Z, normal.X, normal.Y, normal.Z, uv.U, uv.V, else name.V, or
+        name.0, name.1 and so on.
 
     Raises:
       FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of floats, or `transfer`
-        is another.
+        is another, or there are `aovs` of another size, or without .exr.
     """
     path = require_writable(path)
     if transfer not in _TRANSFERS:
@@ -80,8 +84,28 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb") -> None:
         raise FileError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
         raise FileError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
+    if aovs and path.suffix.lower() != ".exr":
+        raise ArgumentError("save_image", "aovs", f"are layers of an .exr, {path} is none")
+    layers = _layers(aovs or {}, pixels.shape[:2])
     with replacing(path) as temporary:
-        _WRITERS[path.suffix.lower()](temporary, pixels, _TRANSFERS[transfer])
+        if layers:
+            write_exr(temporary, _planes(pixels) | layers)
+        else:
+            _WRITERS[path.suffix.lower()](temporary, pixels, _TRANSFERS[transfer])
+
+
+def _layers(aovs: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """The channels of an .exr for images of this shape beside the picture."""
+    found = {}
+    for name, values in aovs.items():
+        values = np.asarray(values)
+        if values.ndim not in (2, 3) or values.shape[:2] != shape:
+            raise ArgumentError("save_image", f"aovs[{name!r}]", f"must have the image's size, {shape}, it has {values.shape}")
+        values = values.reshape(*shape, -1)
+        letters = {"depth": "Z", "normal": "XYZ", "uv": "UV"}.get(name, "V" if values.shape[2] == 1 else "")
+        for c in range(values.shape[2]):
+            found[f"{name}.{letters[c] if len(letters) == values.shape[2] else c}"] = values[:, :, c]
+    return found
 
 
 def require_writable(path: PathLike) -> Path:
@@ -125,6 +149,28 @@ def read_png(path: Path) -> np.ndarray:
     return _decoded(data)
 
 
+def read_grey(path: Path) -> np.ndarray:
+    """What a picture of one channel stores, .png, .exr or .pfm: shape (h, w), in the numbers of the file."""
+    ending = path.suffix.lower()
+    if ending == ".exr":
+        channels = _exr_channels(path)
+        if len(channels) > 1:
+            raise FileError(f"heights must be one channel, it has {', '.join(channels)}")
+        return next(iter(channels.values()))
+    if ending == ".pfm":
+        pixels = _read_pfm(path)
+        if pixels.ndim > 2:
+            raise FileError("heights must be one channel, it has red, green and blue")
+        return pixels
+    data = path.read_bytes()
+    require_whole(data)
+    depth, colour = data[24:26]
+    if colour != 0 or depth < 8:
+        kinds = {0: "grey", 2: "red, green and blue", 3: "a palette", 4: "grey with opacity", 6: "colours with opacity"}
+        raise FileError(f"heights must be grey of 8 or 16 bits, it has {kinds[colour]} of {depth} bits")
+    return _decoded(data)
+
+
 def _read_jpeg(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     data = path.read_bytes()
     if not data.startswith(b"\xff\xd8\xff"):
@@ -152,20 +198,25 @@ def _any_size() -> Iterator[None]:
             Image.MAX_IMAGE_PIXELS = limit
 
 
-def _read_exr(path: Path) -> np.ndarray:
+def _exr_channels(path: Path) -> dict[str, np.ndarray]:
+    """The channels of an .exr by their names, float32."""
     exr = import_extra("OpenEXR", "reading .exr needs", "exr")
     try:
         with exr.File(str(path), separate_channels=True, header_only=True) as file:
             (x0, y0), (x1, y1) = file.header()["dataWindow"]
         require_pixels(int(y1) - int(y0) + 1, int(x1) - int(x0) + 1)
         with exr.File(str(path), separate_channels=True) as file:
-            channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+            return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
     except RuntimeError as error:
         raise FileError("it is not an OpenEXR file, or damaged") from error
     except ValueError as error:
         if "part index" not in str(error):
             raise
         raise FileError("it is cut off or damaged: pixels are missing") from error
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    channels = _exr_channels(path)
     names = next((names for names in ("RGB", "Y") if set(names) <= set(channels)), None)
     if names is None:
         raise FileError(f"its channels must be R, G, B or Y, they are {', '.join(channels)}")
@@ -208,16 +259,38 @@ def _read_npy(path: Path) -> np.ndarray:
 
 def _write_png(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> None:
     clipped = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
+    write_png(path, (encode(clipped) * 255 + 0.5).astype(np.uint8))
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Bytes of shape (h, w), (h, w, 3) or (h, w, 4), or uint16 of shape (h, w), as they are, top row first."""
     with path.open("wb") as file:
-        imageio.imwrite(file, (encode(clipped) * 255 + 0.5).astype(np.uint8), plugin="pillow", extension=".png")
+        imageio.imwrite(file, np.ascontiguousarray(pixels), plugin="pillow", extension=".png")
 
 
 def _write_exr(path: Path, pixels: np.ndarray, _: Any) -> None:
+    write_exr(path, _planes(pixels))
+
+
+def _planes(pixels: np.ndarray) -> dict[str, np.ndarray]:
+    return {"Y": pixels} if pixels.ndim == 2 else {name: pixels[:, :, c] for c, name in enumerate("RGB")}
+
+
+def write_exr(path: Path, planes: Mapping[str, np.ndarray]) -> None:
+    """Channels of shape (h, w) by their names, top row first, in float32.
+
+    Raises:
+      OSError: what is found in the file is something else: OpenEXR does not say when a disk is full.
+    """
     exr = import_extra("OpenEXR", "writing .exr needs", "exr")
-    planes = {"Y": pixels} if pixels.ndim == 2 else {name: pixels[:, :, c] for c, name in enumerate("RGB")}
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
-    with exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, channels) as file:
-        file.write(str(path))
+    options, found = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {}
+    with contextlib.suppress(FileError, OSError, RuntimeError):
+        with exr.File(options, dict(channels)) as file:
+            file.write(str(path))
+        found = _exr_channels(path)
+    if not all(name in found and np.array_equal(found[name], plane, equal_nan=True) for name, plane in channels.items()):
+        raise OSError(errno.ENOSPC, "OpenEXR left it incomplete, the disk is probably full")
 
 
 def _write_pfm(path: Path, pixels: np.ndarray, _: Any) -> None:
@@ -227,8 +300,7 @@ def _write_pfm(path: Path, pixels: np.ndarray, _: Any) -> None:
 
 
 def _write_npy(path: Path, pixels: np.ndarray, _: Any) -> None:
-    with path.open("wb") as file:  # np.save appends .npy to a name without it
-        np.save(file, pixels)
+    write_npy(path, pixels)
 
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {

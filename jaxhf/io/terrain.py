@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,7 +10,14 @@ from numpy.typing import DTypeLike
 
 from ..core.errors import ArgumentError
 from .errors import FileError
-from .georeference import WGS84, CoordinateSystem, metres_per_degree
+from .georeference import (
+    WGS84,
+    WGS84_DEGREES,
+    CoordinateSystem,
+    Georeference,
+    coordinate_system,
+    metres_per_degree,
+)
 
 if TYPE_CHECKING:
     from ..scene.heightfield import Heightfield
@@ -25,6 +32,8 @@ class Terrain:
       dx, dy: cell size, in the unit of x and y.
       x0, y0: where vertex (0, 0), the one in the south-west, stands.
       crs: the reference system of x and y; None: the four numbers above are not known, but assumed.
+      georeference: how x and y become the coordinates of the file that the heights are from; None: it has none. It goes with
+        the heights into GeoTIFF and .npz files, also those of a part of the grid, if x0 and y0 say which.
     """
 
     heights: Float[np.ndarray, "ny nx"]
@@ -33,6 +42,7 @@ class Terrain:
     x0: float = 0.0
     y0: float = 0.0
     crs: CoordinateSystem | None = None
+    georeference: Georeference | None = None
 
     def __post_init__(self):
         if self.heights.ndim != 2 or min(self.heights.shape) < 2:
@@ -43,10 +53,60 @@ class Terrain:
                 rule = "positive and finite" if name in ("dx", "dy") else "finite"
                 raise ArgumentError("", name, f"must be {rule}, it is {value}")
 
+    @classmethod
+    def from_xarray(cls, array: Any, nodata: float | None = None) -> "Terrain":
+        """The terrain in a `DataArray` of xarray, or of rioxarray with its reference system.
+
+        Its dimensions are y and x, northing and easting, or lat and lon, in any order and either direction, besides those of
+        length 1, with evenly spaced coordinates. The reference system and the value of holes are those of its `rio` accessor,
+        else of CF's `spatial_ref` coordinate and of `_FillValue`; lat and lon without a system are WGS84. Degrees become metres
+        as in `load_heights`.
+
+        Args:
+          array: read by its `dims`, `coords`, `values` and `attrs`; xarray is not needed.
+          nodata: a value that means no height; overrules the array's.
+
+        Raises:
+          ValueError: `array` is no DataArray, or has other dimensions, or no coordinates, or they are not evenly spaced.
+        """
+        owner = "Terrain.from_xarray"
+        if not all(hasattr(array, name) for name in ("dims", "coords", "values", "attrs")) or callable(array.values):
+            raise ArgumentError(owner, "array", f"must be an xarray.DataArray, it is a {type(array).__name__}")
+        values = np.asarray(array.values)
+        names = [str(name) for name, size in zip(array.dims, values.shape, strict=True) if size > 1]
+        axes = [axis for words in _AXES for axis in range(len(names)) if names[axis].lower() in words]
+        if len(names) != 2 or len(axes) != 2:
+            raise ArgumentError(owner, "array", f"must have dimensions y and x, or lat and lon, it has {tuple(array.dims)}")
+        values = values.squeeze().transpose(axes)
+        (y0, dy), (x0, dx) = (_even(owner, array, names[axis]) for axis in axes)
+        values = values[:: 1 if dy > 0 else -1, :: 1 if dx > 0 else -1]
+        x0, y0 = min(x0, x0 + (values.shape[1] - 1) * dx), min(y0, y0 + (values.shape[0] - 1) * dy)
+        rio, attrs, reference = getattr(array, "rio", None), array.attrs, array.coords.get("spatial_ref")
+        found = getattr(rio, "crs", None)
+        wkt = "" if reference is None else str(reference.attrs.get("crs_wkt", ""))
+        wkt = found.to_wkt() if found else wkt
+        if not wkt and names[axes[0]].lower() in _AXES[0][2:]:
+            wkt = WGS84_DEGREES
+        own = getattr(rio, "nodata", None)
+        own = attrs.get("_FillValue") if own is None else own
+        nodata = nodata if nodata is not None or own is None else float(own)
+        heights = heights_of(values, nodata, float(attrs.get("scale_factor", 1)), float(attrs.get("add_offset", 0)))
+        crs = coordinate_system(wkt) if wkt else CoordinateSystem()
+        return cls(heights, abs(dx), abs(dy), x0, y0, crs, Georeference(wkt, nodata=nodata)).in_metres()
+
     @property
     def nodata(self) -> Bool[np.ndarray, "ny nx"]:
         """Where there is no height: bool, shape (ny, nx)."""
         return np.isnan(self.heights)
+
+    @property
+    def in_file(self) -> tuple[float, float, float, float]:
+        """Its dx, dy, x0 and y0 in the coordinates of its file, which may be degrees."""
+        place = self.georeference or Georeference()
+        (scale_x, scale_y), (offset_x, offset_y) = place.scale, place.offset
+        found = scale_x * self.dx, scale_y * self.dy, offset_x + scale_x * self.x0, offset_y + scale_y * self.y0
+        dx, dy, x0, y0 = map(float, found)
+        return dx, dy, x0, y0
 
     def heightfield(self, dtype: DTypeLike | None = None) -> "Heightfield":
         """The surface, to be rendered.
@@ -78,7 +138,30 @@ class Terrain:
             crs, grid = CoordinateSystem(), {"dx": self.dx * along_x, "dy": self.dy * along_y, "x0": 0.0, "y0": 0.0}
         if grid.keys() <= given.keys():
             crs = crs or CoordinateSystem()
-        return dataclasses.replace(self, **{name: float(value) for name, value in {**grid, **given}.items()}, crs=crs)
+        grid, place = {name: float(value) for name, value in {**grid, **given}.items()}, self.georeference
+        if place is not None and min(grid["dx"], grid["dy"]) > 0:
+            dx, dy, x0, y0 = self.in_file
+            scale = dx / grid["dx"], dy / grid["dy"]
+            place = place._replace(scale=scale, offset=(x0 - scale[0] * grid["x0"], y0 - scale[1] * grid["y0"]))
+        return dataclasses.replace(self, **grid, crs=crs, georeference=place)
+
+
+_AXES = ("y", "northing", "lat", "latitude"), ("x", "easting", "lon", "longitude")
+
+
+def _even(owner: str, array: Any, name: str) -> tuple[float, float]:
+    """The first coordinate along a dimension, and the step."""
+    if name not in array.coords:
+        raise ArgumentError(owner, "array", f"must have coordinates along {name}")
+    stored = np.asarray(array.coords[name].values)
+    values = stored.astype(np.float64)
+    step = (values[-1] - values[0]) / (len(values) - 1)
+    rounding = 4 * np.finfo(stored.dtype if stored.dtype.kind == "f" else np.float64).eps * np.abs(values).max()
+    steps = np.diff(values)
+    if not np.abs(steps - step).max() <= max(1e-3 * abs(step), rounding):
+        rule = f"must have evenly spaced coordinates along {name}, their steps go from {steps.min()} to {steps.max()}"
+        raise ArgumentError(owner, "array", rule)
+    return float(values[0]), float(step)
 
 
 def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, offset: float = 0.0) -> Float[np.ndarray, "ny nx"]:

@@ -91,6 +91,27 @@ def test_exr_channels_stay_in_order(tmp_path):
         assert {name: channel.pixels[0, 0] for name, channel in file.channels().items()} == {"R": 1, "G": 2, "B": 3}
 
 
+def test_aovs_are_layers_of_an_exr(tmp_path, image):
+    exr = pytest.importorskip("OpenEXR")
+    depth, cell, status = np.full((5, 7), np.inf), np.arange(70).reshape(5, 7, 2), jnp.ones((5, 7), int)
+    aovs = {"depth": depth, "normal": image + 1, "uv": image[:, :, :2], "cell": cell, "status": status}
+    save_image(tmp_path / "x.exr", image, aovs=aovs)
+    np.testing.assert_array_equal(load_image(tmp_path / "x.exr"), image)
+    with exr.File(str(tmp_path / "x.exr"), separate_channels=True) as file:
+        found = {name: channel.pixels for name, channel in file.channels().items()}
+    layers = {"depth.Z": depth, "cell.0": cell[:, :, 0], "cell.1": cell[:, :, 1], "status.V": np.ones((5, 7))}
+    layers |= {f"normal.{letter}": image[:, :, c] + 1 for c, letter in enumerate("XYZ")}
+    layers |= {f"uv.{letter}": image[:, :, c] for c, letter in enumerate("UV")}
+    assert found.keys() == {"R", "G", "B"} | layers.keys()
+    for name, values in layers.items():
+        np.testing.assert_array_equal(found[name], values)
+    with pytest.raises(ValueError, match=r"save_image: aovs are layers of an \.exr"):
+        save_image(tmp_path / "x.png", image, aovs=aovs)
+    with pytest.raises(ValueError, match=r"save_image: aovs\['cell'\] must have the image's size, \(5, 7\), it has \(5, 2\)"):
+        save_image(tmp_path / "y.exr", image, aovs={"cell": cell[:, 0]})
+    assert [path.name for path in tmp_path.iterdir()] == ["x.exr"]
+
+
 @pytest.mark.parametrize(("order", "scale"), [("<", b"-1.0"), (">", b"1.0"), (">", b"2.5e0")])
 def test_pfm_by_hand(tmp_path, order, scale):
     """Two rows of one pixel; the file starts at the bottom."""

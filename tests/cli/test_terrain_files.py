@@ -1,0 +1,82 @@
+"""`jaxhf info` and `convert` on terrain files."""
+
+import numpy as np
+import pytest
+
+from jaxhf import Terrain, save_heights
+from jaxhf.cli.main import main
+from jaxhf.io.georeference import WGS84_DEGREES, Georeference, coordinate_system
+
+DEGREES = Georeference(WGS84_DEGREES, nodata=-9999.0)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    heights = np.array([[1, 2.5, np.nan], [4, 5, 6], [7, 8, 9]], np.float32)
+    terrain = Terrain(heights, 0.01, 0.01, 10.0, 44.99, coordinate_system(WGS84_DEGREES), DEGREES).in_metres()
+    save_heights(tmp_path / "degrees.npz", terrain)
+    save_heights(tmp_path / "metres.asc", Terrain(heights[1:], 30.0, 20.0, 5e5, 4e6))
+    np.save(tmp_path / "bare.npy", np.full((2, 2), np.nan))
+    return tmp_path
+
+
+def test_info_describes_terrain(folder, capsys):
+    for name, lines in (
+        (
+            "degrees.npz",
+            [
+                "3 rows, 3 columns of float32",
+                "cells: 0.01 x 0.01 degree, in the middle 788.468 x 1111.32 metres",
+                "place: longitude 10 to 10.02, latitude 44.99 to 45.01",
+                "system: WGS 84 (EPSG:4326)",
+                "heights: 1 to 9, 1 holes (0.111 of all), stored as -9999",
+            ],
+        ),
+        (
+            "metres.asc",
+            [
+                "2 rows, 3 columns of float32",
+                "cells: 30 x 20",
+                "place: x 500000 to 500060, y 4000000 to 4000020",
+                "system: not known",
+                "heights: 4 to 9, no holes",
+            ],
+        ),
+        (
+            "bare.npy",
+            [
+                "2 rows, 2 columns of float64",
+                "cells: not in the file, taken as 1 x 1",
+                "system: not known",
+                "heights: none, 4 holes (1 of all)",
+            ],
+        ),
+    ):
+        assert main(["info", str(folder / name)]) == 0
+        assert capsys.readouterr().out == f"{folder / name}: " + "\n".join(lines) + "\n"
+
+
+def test_info_refuses(folder, capsys):
+    (folder / "x.asc").write_text("ncols 3")
+    for name, message in (
+        ("x.asc", "x.asc: it is not an ESRI ASCII grid"),
+        ("none.tif", "none.tif: there is no such file"),
+        ("x.tfi", "cannot describe the ending '.tfi'; did you mean '.tif'?"),
+    ):
+        assert main(["info", str(folder / name)]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_convert_to_a_mesh(folder, capsys):
+    trimesh = pytest.importorskip("trimesh")
+    assert main(["convert", str(folder / "metres.asc"), str(folder / "x.glb"), "--base", "0"]) == 0
+    assert capsys.readouterr().out.startswith(f"{folder}/x.glb: Heightfield, 2 x 3 heights")
+    assert trimesh.load(folder / "x.glb", force="mesh", process=False).is_watertight
+    for output, message in (
+        ("y.glb", "base must lie below all heights, the lowest is 4, it is 5"),
+        ("y.npz", "--base is for meshes (.glb, .obj, .ply)"),
+        ("y.gbl", "cannot write heights with the ending '.gbl'; did you mean '.glb'?"),
+    ):
+        assert main(["convert", str(folder / "metres.asc"), str(folder / output), "--base", "5"]) == 2
+        assert message in capsys.readouterr().err
+        assert not (folder / output).exists()

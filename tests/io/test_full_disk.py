@@ -1,0 +1,91 @@
+"""Writers on a full disk, and killed at any moment: the old file stays, or the whole new one is there."""
+
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("resource")  # not on Windows
+pytest.importorskip("rasterio")
+pytest.importorskip("OpenEXR")
+pytest.importorskip("trimesh")
+
+WRITERS = """
+import os, pathlib, resource, signal, sys, time
+import numpy as np
+from jaxhf import Terrain, save_heights, save_image
+from jaxhf.io.checkpoint import save_checkpoint
+from jaxhf.io.files import save_text
+from jaxhf.io.meshes import save_mesh
+from jaxhf.io.rasters import save_raster
+
+folder = pathlib.Path(sys.argv[1])
+rng = np.random.default_rng(0)
+terrain, image = Terrain(rng.uniform(0, 60000, (100, 90)).astype("f4")), rng.random((100, 90, 3)).astype("f4")
+writers = {
+    **{f"heights{e}": lambda path: save_heights(path, terrain) for e in (".npy", ".npz", ".tif", ".asc", ".png", ".exr")},
+    **{f"image{e}": lambda path: save_image(path, image) for e in (".npy", ".png", ".exr", ".pfm")},
+    **{f"map{e}": lambda path: save_raster(path, terrain.heights.astype("u2"), terrain) for e in (".npy", ".png", ".tif")},
+    **{f"mesh{e}": lambda path: save_mesh(path, terrain) for e in (".ply", ".obj", ".glb")},
+    "fit.checkpoint": lambda path: save_checkpoint(path, {}, [terrain.heights]),
+    "page.html": lambda path: save_text(path, "heights " * 9999),
+}
+"""
+# No file may be longer than a share of what the writer needs.
+FULL = (
+    WRITERS
+    + """
+for name, write in writers.items():
+    path = folder / name
+    write(path)
+    old, size = path.read_bytes(), path.stat().st_size
+    for share in (0, 0.01, 0.5, 0.9, 0.999):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (int(size * share), resource.RLIM_INFINITY))
+        try:
+            write(path)
+        except OSError as error:
+            said = str(error)
+        else:
+            said = "nothing"
+        resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        if str(path) not in said or "cannot be written" not in said:
+            print(name, share, "said", said)
+        if path.read_bytes() != old or [p.name for p in folder.iterdir() if p.name.startswith(".")]:
+            print(name, share, "left a mess")
+"""
+)
+
+
+# Killed while it writes one version after the other.
+KILLED = (
+    WRITERS
+    + """
+versions = {}
+for factor in (1, 0.5):
+    terrain.heights[:] *= factor
+    image *= factor
+    for name, write in writers.items():
+        write(folder / name)
+        versions.setdefault(name, []).append((folder / name).read_bytes())
+for k in range(8):
+    if not (child := os.fork()):
+        while True:
+            for factor in (2, 0.5):
+                terrain.heights[:] *= factor
+                image *= factor
+                for name, write in writers.items():
+                    write(folder / name)
+    time.sleep(0.02 + 0.04 * k)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    for name, contents in versions.items():
+        if (folder / name).read_bytes() not in contents:
+            print(name, "is neither the old nor the new one")
+"""
+)
+
+
+@pytest.mark.parametrize("script", [FULL, KILLED], ids=["full", "killed"])
+def test_the_old_file_stays_or_the_whole_new_one_is_there(tmp_path, script):
+    run = subprocess.run([sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True)
+    assert (run.stdout, run.stderr, run.returncode) == ("", "", 0)

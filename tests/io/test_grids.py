@@ -1,0 +1,174 @@
+"""Formats of grids that need no library of GDAL's, against GDAL and MuJoCo."""
+
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxhf import Terrain, load_heights, save_heights, save_image
+from jaxhf.io.georeference import CoordinateSystem, Georeference, coordinate_system
+from jaxhf.io.load_terrain import read_terrain
+
+UTM = 'LOCAL_CS["a grid of the county",UNIT["metre",1]]'
+HEIGHTS = np.array([[1, 2.5, np.nan], [4, 5, 6]], np.float32)
+
+
+def placed(terrain):
+    return terrain.dx, terrain.dy, terrain.x0, terrain.y0
+
+
+ASC = "NCOLS 3\nnrows 2\n{place}NODATA_value -9\n4 5 6\n1 2.5\n-9\n"  # lines do not count
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ("xllcorner 100\nyllcorner 200\ncellsize 10\n", (10, 10, 105, 205)),
+        ("xllcenter 100\nyllcenter 200\ncellsize 10\n", (10, 10, 100, 200)),
+        ("xllcorner 100\nyllcorner 200\ndx 10\ndy 20\n", (10, 20, 105, 210)),
+    ],
+)
+def test_ascii_grid(tmp_path, place, expected):
+    (tmp_path / "x.asc").write_text(ASC.format(place=place))
+    terrain = load_heights(tmp_path / "x.asc")
+    np.testing.assert_array_equal(terrain.heights, HEIGHTS)
+    assert placed(terrain) == expected
+    assert np.isnan(load_heights(tmp_path / "x.asc", nodata=4.0).heights[1, 0])
+
+
+def test_a_height_may_be_what_usually_means_none(tmp_path):
+    heights = np.array([[-9999, np.nan], [3, 7]], np.float32)
+    save_heights(tmp_path / "x.asc", Terrain(heights))
+    np.testing.assert_array_equal(load_heights(tmp_path / "x.asc").heights, heights)
+
+
+@pytest.mark.parametrize("name", ["x.asc", "x.tif", "x.png"])
+def test_gdal_sees_what_is_written(tmp_path, name):
+    rasterio = pytest.importorskip("rasterio")
+    heights = np.array([[1, 2, 3], [4, 5, 6]], np.float32) if name == "x.png" else HEIGHTS
+    save_heights(tmp_path / name, Terrain(heights, 30.0, 20.5, 500000.25, 4.1e6, CoordinateSystem(), Georeference(UTM)))
+    with rasterio.open(tmp_path / name) as dataset:
+        np.testing.assert_allclose(dataset.transform[:6], (30, 0, 499985.25, 0, -20.5, 4.1e6 + 1.5 * 20.5), rtol=1e-14)
+        found = dataset.read(1, masked=True).astype(np.float32).filled(np.nan)
+        np.testing.assert_array_equal(found[::-1], heights)
+        if name != "x.png":
+            assert dataset.crs.to_wkt().startswith('LOCAL_CS["a grid of the county"')
+    again = load_heights(tmp_path / name)
+    np.testing.assert_array_equal(again.heights, heights)
+    np.testing.assert_allclose(placed(again), (30, 20.5, 500000.25, 4.1e6), rtol=1e-14)
+    assert again.georeference is not None
+    assert again.georeference.name == "a grid of the county"
+
+
+def test_srtm_tile(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    stored = np.add.outer(np.arange(1201), np.arange(1201)).astype(">i2")
+    stored[0, 0] = -32768
+    stored.tofile(tmp_path / "S12E130.hgt")
+    terrain = read_terrain(tmp_path / "S12E130.hgt")
+    np.testing.assert_array_equal(terrain.heights[-1, :3], [np.nan, 1, 2])
+    with rasterio.open(tmp_path / "S12E130.hgt") as dataset:  # its driver SRTMHGT
+        a, _, c, _, e, f, *_ = dataset.transform
+        np.testing.assert_allclose(placed(terrain), (a, -e, c + a / 2, f + 1200.5 * e), rtol=1e-12)
+        np.testing.assert_array_equal(dataset.read(1)[1:], terrain.heights[::-1][1:])
+        assert dataset.crs.to_epsg() == coordinate_system(dataset.crs.to_wkt()).code == 4326
+    assert 90 < load_heights(tmp_path / "S12E130.hgt").dx < 92
+
+
+def test_mujoco_height_field(tmp_path):
+    """MuJoCo reads the same file, but for its scale to 0..1."""
+    mujoco = pytest.importorskip("mujoco")
+    heights = np.array([[0, 2, 3], [4, 5, 10]], np.float32)
+    path = tmp_path / "x.hfield"
+    path.write_bytes(np.array([2, 3], "<i4").tobytes() + heights.astype("<f4").tobytes())
+    np.testing.assert_array_equal(load_heights(path).heights, heights)
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><asset><hfield name="h" file="{path}" size="1 1 1 1"/></asset>'
+        '<worldbody><geom type="hfield" hfield="h"/></worldbody></mujoco>'
+    )
+    np.testing.assert_allclose(model.hfield_data.reshape(2, 3), heights / 10)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    hit = np.zeros(1, np.int32)
+    t = mujoco.mj_ray(model, data, np.array([0.99, -0.99, 5.0]), np.array([0, 0, -1.0]), None, 1, -1, hit, None)
+    assert abs(5 - t - 0.3) < 0.02  # the south-eastern vertex, of height 3
+
+
+@pytest.mark.parametrize("ending", [".pfm", ".exr"])
+def test_float_pictures_hold_heights(tmp_path, ending):
+    if ending == ".exr":
+        pytest.importorskip("OpenEXR")
+    save_image(tmp_path / f"x{ending}", HEIGHTS[::-1])
+    np.testing.assert_array_equal(load_heights(tmp_path / f"x{ending}").heights, HEIGHTS)
+    if ending == ".exr":
+        save_heights(tmp_path / "y.exr", Terrain(HEIGHTS))
+        np.testing.assert_array_equal(load_heights(tmp_path / "y.exr").heights, HEIGHTS)
+    save_image(tmp_path / f"rgb{ending}", np.zeros((2, 3, 3)))
+    with pytest.raises(ValueError, match=r"rgb\.\w+: heights must be one channel, it has (B, G, R|red, green and blue)"):
+        load_heights(tmp_path / f"rgb{ending}")
+
+
+def test_grey_bytes_hold_heights(tmp_path):
+    Image.fromarray(np.array([[4, 5, 255], [1, 2, 3]], np.uint8)).save(tmp_path / "x.png")
+    np.testing.assert_array_equal(load_heights(tmp_path / "x.png").heights, [[1, 2, 3], [4, 5, 255]])
+
+
+BAD_FILES = [
+    ("empty.asc", b"", "it must begin with ncols, nrows and cellsize"),
+    ("cut.asc", b"ncols 3\nnrows 2\ncellsize 1\n1 2 3 4", "3 x 2 heights take 6 numbers, it holds 4"),
+    ("comma.asc", b"ncols 2\nnrows 2\ncellsize 1\n1,5 2 3 4", "not all of its heights are numbers"),
+    ("word.asc", b"ncols many\n", "its ncols must be a number, it is 'many'"),
+    ("bomb.asc", b"ncols 99999\nnrows 99999\ncellsize 1\n", "it declares 99999 x 99999"),
+    ("flat.asc", b"ncols 2\nnrows 2\ncellsize 0\n1 2 3 4", "dx must be positive and finite, it is 0.0"),
+    ("tile.hgt", b"12", "its name must begin with its south-western corner"),
+    ("N01E002.hgt", b"12", "its size is 2 bytes"),
+    ("bomb.hfield", np.array([99999, 99999], "<i4").tobytes(), "it declares 99999 x 99999"),
+    ("cut.bin", np.array([2, 2, 0], "<i4").tobytes(), "2 x 2 heights take 16 bytes, it holds 4"),
+    ("short.bin", b"123", "it must begin with the numbers of rows and columns"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "message"), BAD_FILES, ids=[name for name, _, _ in BAD_FILES])
+def test_what_is_no_grid_is_refused_by_name(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=re.escape(message)) as error:
+        load_heights(tmp_path / name)
+    assert str(tmp_path / name) in str(error.value)
+
+
+def test_a_world_file_must_be_one(tmp_path):
+    Image.fromarray(np.zeros((2, 2), np.uint8)).save(tmp_path / "x.png")
+    for text, message in (("1\n2\n", "must hold six numbers"), ("1 0 0 1 0 0", "must put the north up")):
+        (tmp_path / "x.pgw").write_text(text)
+        with pytest.raises(ValueError, match=rf"x\.png: x\.pgw beside it {message}"):
+            load_heights(tmp_path / "x.png")
+
+
+def test_what_a_format_cannot_hold_is_refused(tmp_path):
+    for name, heights, message in (
+        ("x.png", HEIGHTS, "x.png: a .png holds whole heights of 0 to 65535 everywhere, this terrain has holes"),
+        ("x.png", np.array([[-1.0, 2], [3, 70000]]), "goes from -1 to 70000"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            save_heights(tmp_path / name, Terrain(heights))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("wkt", "expected"),
+    [
+        # ISO 19162, as PROJ writes it.
+        ('GEOGCRS["x",DATUM["d",ELLIPSOID["s",1737400,0,LENGTHUNIT["metre",1]]],PRIMEM["p",0],CS[ellipsoidal,2],'
+         'AXIS["lat",north],AXIS["lon",east],ANGLEUNIT["degree",0.0174532925199433],ID["EPSG",12345]]',
+         (True, (1737400, 0), 12345)),
+        ('PROJCRS["x",BASEGEOGCRS["b",DATUM["d",ELLIPSOID["s",1,0]],ID["EPSG",4326]],CS[Cartesian,2],'
+         'LENGTHUNIT["metre",1],ID["EPSG",32616]]', (False, None, 32616)),
+        ('COMPD_CS["both",GEOGCS["g",DATUM["d",SPHEROID["s",6378137,298]],UNIT["Degree",0.0174532925199433],'
+         'AUTHORITY["EPSG","4326"]],VERT_CS["v",UNIT["metre",1],AUTHORITY["EPSG","5773"]]]',
+         (True, (6378137, 1 / 298), 4326)),
+        ('PROJCS["x",GEOGCS["g",AUTHORITY["EPSG","4326"]],UNIT["metre",1]]', (False, None, None)),
+    ],
+)  # fmt: skip
+def test_well_known_text(wkt, expected):
+    assert coordinate_system(wkt) == expected

@@ -1,0 +1,147 @@
+"""Maps lie where their terrain does, as GDAL and GIS programs see it."""
+
+import numpy as np
+import pytest
+
+from jaxhf import Terrain, load_heights, save_heights
+from jaxhf.io.rasters import save_raster
+
+rasterio = pytest.importorskip("rasterio")
+
+VALUES = np.arange(12, dtype=np.float32).reshape(3, 4)
+
+
+@pytest.fixture
+def utm(tmp_path):
+    return load_heights(write(tmp_path / "utm.tif", VALUES, (30, 0, 5e5, 0, -20, 4e6), crs="EPSG:32616", nodata=7))
+
+
+def write(path, values, transform, **profile):
+    profile = {"driver": "GTiff", "transform": rasterio.Affine(*transform), **profile}
+    with rasterio.open(path, "w", height=3, width=4, count=1, dtype=values.dtype, **profile) as dataset:
+        dataset.write(values, 1)
+    return path
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        VALUES,
+        VALUES.astype(np.float64),
+        VALUES.astype(np.uint8),
+        np.arange(36, dtype=np.uint8).reshape(3, 4, 3),
+        np.arange(48, dtype=np.uint8).reshape(3, 4, 4),
+    ],
+    ids=lambda values: f"{values.dtype}{values.shape}",
+)
+def test_a_map_keeps_place_and_system(tmp_path, utm, values):
+    save_raster(tmp_path / "map.tif", values, utm, nodata=3.0)
+    with rasterio.open(tmp_path / "map.tif") as found, rasterio.open(tmp_path / "utm.tif") as source:
+        assert (found.transform, found.crs, found.nodata) == (source.transform, source.crs, 3)
+        written = np.moveaxis(found.read(), 0, -1)
+        np.testing.assert_array_equal(written, values[::-1].reshape(written.shape))
+        assert written.dtype == values.dtype
+
+
+@pytest.mark.parametrize(
+    ("name", "driver"),
+    [("x.img", "HFA"), ("x.bil", "EHdr"), ("x.flt", "EHdr"), ("x.grd", "GSBG"), ("x.vrt", "VRT"), ("x.nc", "netCDF")],
+)
+def test_other_rasters_of_gdal(tmp_path, utm, name, driver):
+    rasterio_shutil = pytest.importorskip("rasterio.shutil")
+    with rasterio.Env() as gdal:
+        if driver not in gdal.drivers():
+            pytest.skip(f"this GDAL has no {driver}")
+    rasterio_shutil.copy(tmp_path / "utm.tif", tmp_path / name, driver=driver)
+    found = load_heights(tmp_path / name)
+    np.testing.assert_array_equal(found.heights, utm.heights)
+    np.testing.assert_allclose(found.in_file, utm.in_file)
+    with pytest.raises(ValueError, match=rf"{name}\.tif: it is cut off, damaged or of another kind"):  # its ending decides
+        load_heights((tmp_path / name).rename(tmp_path / f"{name}.tif"))
+
+
+@pytest.mark.parametrize("transform", [(30, 0, 5e5, 0, 20, 4e6), (-30, 0, 5e5, 0, -20, 4e6), (-30, 0, 5e5, 0, 20, 4e6)])
+def test_rasters_may_start_in_any_corner(tmp_path, transform):
+    terrain = load_heights(write(tmp_path / "x.tif", VALUES, transform))
+    with rasterio.open(tmp_path / "x.tif") as dataset:
+        for iy, ix in np.ndindex(3, 4):
+            x, y = dataset.xy(2 - iy if transform[4] < 0 else iy, 3 - ix if transform[0] < 0 else ix)
+            assert (terrain.x0 + ix * terrain.dx, terrain.y0 + iy * terrain.dy) == (x, y)
+            assert terrain.heights[iy, ix] == next(dataset.sample([(x, y)]))[0]
+
+
+def test_masks_are_holes(tmp_path):
+    with rasterio.open(write(tmp_path / "x.tif", VALUES, (30, 0, 5e5, 0, -20, 4e6)), "r+") as dataset:
+        dataset.write_mask(VALUES != 4)
+    np.testing.assert_array_equal(load_heights(tmp_path / "x.tif").nodata, VALUES[::-1] == 4)
+
+
+@pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+def test_ground_control_points_are_refused(tmp_path, capfd):
+    points = [rasterio.control.GroundControlPoint(*numbers) for numbers in ((0, 0, 1, 2), (0, 9, 3, 4), (9, 0, 5, 6))]
+    profile = {"driver": "GTiff", "height": 3, "width": 4, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+    with rasterio.open(tmp_path / "x.tif", "w", **profile) as dataset:
+        dataset.gcps = points, dataset.crs
+        dataset.write(VALUES, 1)
+    with pytest.raises(ValueError, match=r"x\.tif: it must be placed by a geotransform, it has ground control points"):
+        load_heights(tmp_path / "x.tif")
+    (tmp_path / "x.tif").write_bytes((tmp_path / "x.tif").read_bytes()[:300])
+    with pytest.raises(ValueError, match=r"x\.tif: it is cut off, damaged or of another kind"):
+        load_heights(tmp_path / "x.tif")
+    assert capfd.readouterr() == ("", "")  # GDAL prints nothing itself
+
+
+def test_a_part_of_a_terrain_in_degrees_lies_in_its_place(tmp_path):
+    path = write(tmp_path / "a.tif", VALUES, (0.01, 0, -85, 0, -0.02, 37), crs="EPSG:4326")
+    whole = load_heights(path)
+    part = Terrain(
+        whole.heights[1:, 1:], whole.dx, whole.dy, whole.x0 + whole.dx, whole.y0 + whole.dy, whole.crs, whole.georeference
+    )
+    assert part.dx > 800  # metres
+    save_raster(tmp_path / "part.tif", part.heights, part)
+    with rasterio.open(tmp_path / "part.tif") as found:
+        assert found.crs.to_epsg() == 4326
+        np.testing.assert_allclose(found.transform[:6], (0.01, 0, -84.99, 0, -0.02, 37), rtol=1e-14)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32616", "EPSG:4326", "+proj=longlat +R=1737400"])
+def test_conversion_to_and_from_npz_keeps_system_and_nodata(tmp_path, crs):
+    values = np.where(VALUES == 5, np.float32(-9999), VALUES + np.float32(0.1))
+    write(tmp_path / "a.tif", values, (0.1, 0, -85, 0, -0.2, 37), crs=crs, nodata=-9999, tiled=False)
+    for before, after in (("a.tif", "b.npz"), ("b.npz", "c.tif")):
+        save_heights(tmp_path / after, load_heights(tmp_path / before))
+    with rasterio.open(tmp_path / "a.tif") as first, rasterio.open(tmp_path / "c.tif") as last:
+        assert (first.crs, first.nodata, first.tags()) == (last.crs, last.nodata, last.tags())
+        np.testing.assert_allclose(first.transform[:6], last.transform[:6], rtol=1e-14)
+        np.testing.assert_array_equal(first.read(), last.read())
+    a, b = (load_heights(tmp_path / name) for name in ("a.tif", "b.npz"))
+    np.testing.assert_array_equal(a.heights, b.heights)
+    assert (a.dx, a.dy, a.x0, a.y0, a.crs, a.georeference) == (b.dx, b.dy, b.x0, b.y0, b.crs, b.georeference)
+
+
+def test_other_coordinates_keep_the_place(tmp_path, utm):
+    moved = load_heights(tmp_path / "utm.tif", dx=3.0, x0=0.0, y0=-7.0)
+    assert (moved.dx, moved.dy, moved.x0, moved.y0) == (3, 20, 0, -7)
+    assert moved.in_file == utm.in_file == (30, 20, 500015, 3999950)
+
+
+def test_a_picture_has_a_world_file(tmp_path, utm):
+    save_raster(tmp_path / "map.png", VALUES.astype(np.uint8), utm)
+    assert (tmp_path / "map.pgw").read_text().split() == ["30.0", "0.0", "0.0", "-20.0", "500015.0", "3999990.0"]
+    with rasterio.open(tmp_path / "map.png") as found, rasterio.open(tmp_path / "utm.tif") as source:
+        assert found.transform == source.transform
+        np.testing.assert_array_equal(found.read(1), VALUES[::-1])
+    save_raster(tmp_path / "map.npy", VALUES, utm)
+    np.testing.assert_array_equal(np.load(tmp_path / "map.npy"), VALUES)
+
+
+def test_what_is_no_map_is_refused(tmp_path, utm):
+    for name, values, message in (
+        ("x.tif", VALUES[1:], r"values must have the terrain's shape, \(3, 4\), theirs is \(2, 4\)"),
+        ("x.tif", np.zeros((3, 4, 3)), r"theirs is \(3, 4, 3\)"),
+        ("x.png", VALUES, r"values must be of uint8, uint16 for \.png, they are float32"),
+        ("x.jpg", VALUES, r"cannot write a map with the ending '\.jpg'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            save_raster(tmp_path / name, values, utm)
+    assert [path.name for path in tmp_path.iterdir()] == ["utm.tif"]
