@@ -1,14 +1,15 @@
 """A formula over the 3 x 3 heights round each vertex, with GDAL's rules for borders and holes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float32
 
 from ..core.machine import usable_cores
 
+Job = TypeVar("Job")
 # Nine views of the same shape: north-west, north, north-east, west, centre, east, south-west, south, south-east.
 Window = tuple[Float32[np.ndarray, "k m"], ...]
 
@@ -48,10 +49,14 @@ def over_windows(
             values = formula(window)
         np.copyto(out, values, where=~np.logical_or.reduce(missing))
 
-    jobs = list(_with_edges(z, result) if compute_edges else _inside(z, result[1:-1, 1:-1]))
-    with ThreadPoolExecutor(min(usable_cores(), len(jobs) or 1)) as threads:
-        list(threads.map(fill, jobs))
+    shared(fill, _with_edges(z, result) if compute_edges else _inside(z, result[1:-1, 1:-1]))
     return result
+
+
+def shared(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
+    """Does the jobs, a thread a core: NumPy lets others work meanwhile."""
+    with ThreadPoolExecutor(usable_cores()) as threads:
+        list(threads.map(work, jobs))
 
 
 def _inside(z: np.ndarray, result: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
