@@ -45,10 +45,7 @@ def lit(
     along, beside = (x, y) if columns else (y, x)
     if along == 0:
         return np.ones(heights.shape, bool)
-    across = abs(beside / along)
-    if across < 1e-12:  # the cosine of 90 degrees is not quite 0, with which rays would leave the grid from its border
-        across = 0.0
-    light = _Light(across, math.sin(altitude) / abs(along), along * beside < 0)
+    light = _Light(abs(beside / along), math.sin(altitude) / abs(along), along * beside < 0)
 
     def turned(grid: np.ndarray) -> np.ndarray:  # its own inverse, but for the transposition
         return grid[:: -1 if along < 0 else 1, :: -1 if beside < 0 else 1]
@@ -186,7 +183,7 @@ def _crossing(
     edges.append((1.0, far + 1, far + 2, end - 1) if end >= 1 else (1.0, far, far + 1, end))
     blocked = np.zeros(at.shape, bool)
     for time, one, other, part in edges:
-        at_vertex = part < _OFF or part > 1 - _OFF  # beside which there may be no height
+        at_vertex = part < _OFF or part > 1 - _OFF  # beside which there may be no height, as at the border
         ground = z[one if part < 0.5 else other] if at_vertex else z[one] * (1 - part) + z[other] * part
         blocked |= ground > height + (step + time) * rise
     return blocked

@@ -31,7 +31,7 @@ def with_holes(heights):
 
 
 GRIDS = {
-    "square cells": (rough(60, 60).astype(np.float32), 12.0, 12.0),
+    "square cells": ((3000 + rough(60, 60) / 24).astype(np.float32), 0.5, 0.5),  # where rounding to float32 shows
     "oblong cells, double": (rough(50, 71), 10.0, 14.3),
     "degrees": (rough(40, 50, 2).astype(np.float32), 1 / 3600, 1 / 3600),
     "holes, square cells": (with_holes(rough(45, 61)).astype(np.float32), 9.0, 9.0),
@@ -108,6 +108,10 @@ def test_planes_by_hand(algorithm, east, north):
         cosine = np.array([-east, -north, 1]) @ light / np.sqrt(east**2 + north**2 + 1)
         shade = jaxhf.hillshade(terrain, azimuth=30.0, altitude=60.0, **both)[place]
         np.testing.assert_array_equal(shade, int(1.5 + 254 * max(cosine, 0)))
+    if algorithm == "zevenbergen-thorne":  # so little west of north that it rounds to 360 degrees, which are 0
+        steep = -(2.0**22) * y[:3, :3] + x[:3, :3]
+        assert jaxhf.aspect(steep, algorithm=algorithm)[1, 1] == 0
+        assert jaxhf.aspect(steep.T, algorithm=algorithm, trigonometric=True)[1, 1] == 0
     square = Terrain(30.0 * east * x + 30.0 * north * y, 30.0, 30.0)
     faces = np.degrees(np.arctan2(-east, -north)) % 360 if east or north else -9999
     np.testing.assert_allclose(jaxhf.aspect(square, algorithm=algorithm)[inside], faces, rtol=1e-6)
