@@ -11,6 +11,9 @@ from .io.meshes import save_mesh as save_mesh
 from .io.save_terrain import save_heights as save_heights
 from .io.scenes import load_scene as load_scene
 from .io.terrain import Terrain as Terrain
+from .maps.hillshade import hillshade as hillshade
+from .maps.relief import color_relief as color_relief, relief as relief
+from .maps.slope import aspect as aspect, slope as slope
 from .rendering.aovs import AOVS as AOVS
 from .rendering.cast import cast as cast
 from .rendering.render import Prepared as Prepared, prepare as prepare, render as render

@@ -69,7 +69,7 @@ def test_help_does_not_import_jax():
     script = """
 import contextlib, sys
 from jaxhf.cli.main import main
-for command in ([], ["render"], ["hillshade"], ["fit"], ["tradeoff"], ["convert"], ["info"]):
+for command in ([], ["render"], ["hillshade"], ["relief"], ["fit"], ["tradeoff"], ["convert"], ["info"]):
     with contextlib.suppress(SystemExit):
         main([*command, "--help"])
 print({"jax", "numpy", "tqdm"} & sys.modules.keys())

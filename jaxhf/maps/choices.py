@@ -1,0 +1,5 @@
+"""Names that options of maps may have; apart, as `jaxhf --help` lists them and does without NumPy."""
+
+ALGORITHMS = ("horn", "zevenbergen-thorne")
+VARIANTS = ("regular", "combined", "multidirectional", "igor")
+ENTRIES = ("interpolate", "nearest", "exact")

@@ -1,0 +1,225 @@
+"""Colour ramps: a colour for each height, from a colour file as gdaldem reads it, from matplotlib, or our own."""
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from ..core.extras import import_extra
+from ..io.errors import SceneError, nearest
+from ..io.files import PathLike, reading, require_file
+from .choices import ENTRIES
+
+Colour = tuple[int, int, int, int]
+
+# GRASS's names, which gdaldem knows, with its colours.
+_NAMED = {
+    "white": (255, 255, 255),
+    "black": (0, 0, 0),
+    "red": (255, 0, 0),
+    "green": (0, 255, 0),
+    "blue": (0, 0, 255),
+    "yellow": (255, 255, 0),
+    "magenta": (255, 0, 255),
+    "cyan": (0, 255, 255),
+    "aqua": (0, 191, 191),
+    "grey": (191, 191, 191),
+    "gray": (191, 191, 191),
+    "orange": (255, 127, 0),
+    "brown": (191, 127, 63),
+    "purple": (127, 0, 255),
+    "violet": (127, 0, 255),
+    "indigo": (0, 127, 255),
+}
+
+# Land from the lowest height to the highest, in shares of 1: green lowlands, yellow hills, brown mountains, pale heights.
+_LAND = (
+    (0.0, (104, 152, 112)),
+    (0.15, (152, 184, 128)),
+    (0.3, (200, 208, 150)),
+    (0.45, (232, 220, 166)),
+    (0.6, (214, 184, 132)),
+    (0.75, (178, 140, 104)),
+    (0.9, (190, 172, 160)),
+    (1.0, (246, 244, 242)),
+)
+# Sea, from the deepest (-1) to the shore (0).
+_SEA = ((-1.0, (58, 98, 140)), (-0.4, (98, 146, 180)), (-0.1, (146, 188, 206)), (0.0, (178, 210, 220)))
+
+_NOTHING: Colour = (0, 0, 0, 0)
+
+
+class Ramp(NamedTuple):
+    """Heights in rising order with their colours.
+
+    Attributes:
+      heights: shape (n,).
+      colours: shape (n, 4): red, green, blue and opacity, 0 to 255.
+      nodata: the colour where there is no height.
+      default: the colour of heights without an entry, where only entries count.
+    """
+
+    heights: Float[np.ndarray, " n"]
+    colours: UInt8[np.ndarray, "n 4"]
+    nodata: Colour = _NOTHING
+    default: Colour = _NOTHING
+
+
+def ramp_of(entries: Iterable[tuple[float, tuple[int, ...]]], nodata: Colour = _NOTHING, default: Colour = _NOTHING) -> Ramp:
+    """Sorts entries. Where several have one height, colours jump: as gdaldem does, they are moved apart by its rounding."""
+    ordered = sorted(entries, key=lambda entry: entry[0])
+    heights = np.array([height for height, _ in ordered], np.float64)
+    colours = np.array([(*colour, 255)[:4] for _, colour in ordered], np.uint8)
+    values, first, count = np.unique(heights, return_index=True, return_counts=True)
+    for run in np.flatnonzero(count[:-1] > 1):
+        here, after, many = values[run], values[run + 1], count[run]
+        below = here - values[run - 1] if run else 0.0
+        total, rounding = below + after - here if run else after - here, abs(here) * np.finfo(float).eps
+        if total > many * rounding:
+            heights[first[run] : first[run] + many] += rounding * (0.5 - many * below / total + np.arange(many))
+    return Ramp(heights, colours, nodata, default)
+
+
+def hypsometric(low: float, high: float) -> Ramp:
+    """Our own: blue below 0, and from green lowlands to pale heights above it; over the range of the heights."""
+    if low >= 0 or high <= 0:  # all land, or a basin of which nobody knows whether it is sea
+        return ramp_of((low + share * (high - low), colour) for share, colour in _LAND)
+    shore = np.nextafter(0.0, -1.0)
+    sea = [(-share * low if share else shore, colour) for share, colour in _SEA]
+    return ramp_of([*sea, *((share * high, colour) for share, colour in _LAND)])
+
+
+def matplotlib_ramp(name: str, low: float, high: float) -> Ramp:
+    """A colour map of matplotlib's, from the lowest height to the highest.
+
+    Raises:
+      UserError: matplotlib is not installed, or has no such colour map.
+    """
+    matplotlib = import_extra("matplotlib", f"the colour ramp {name!r} needs", "plot")
+    if name not in matplotlib.colormaps:
+        raise SceneError(
+            name,
+            None,
+            f"there is no such file, nor a matplotlib colour map of this name; {nearest(name, matplotlib.colormaps)}",
+        )
+    table = matplotlib.colormaps[name](np.linspace(0, 1, 256), bytes=True)
+    return Ramp(np.linspace(low, high, 256), table)
+
+
+def read_ramp(path: PathLike, low: float, high: float) -> Ramp:
+    """A colour file of gdaldem's: lines of a height and red, green, blue (and opacity), or a colour's name.
+
+    Numbers are separated by spaces, tabs, commas or colons; lines that begin with # or / are comments. For the height may
+    stand a percentage (of the range `low` to `high`), `nv` (where there is no height) or `default` (no entry fits; GRASS).
+
+    Raises:
+      FileNotFoundError: no file is there.
+      SceneError: a line is none of these, with its number; or there is no entry.
+    """
+    path = require_file(path)
+    with reading(path):
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    entries: list[tuple[float, Colour]] = []
+    special: dict[str, Colour] = {}
+    for number, line in enumerate(lines, 1):
+        words = line.translate(_SEPARATORS).split()
+        if not words or words[0][0] in "#/":
+            continue
+        try:
+            colour = _colour(words[1:])
+            if words[0].lower() in ("nv", "default"):
+                special[words[0].lower()] = colour
+            else:
+                entries.append((_height(words[0], low, high), colour))
+        except ValueError as error:
+            raise SceneError(path, number, str(error)) from error
+    if not entries:
+        raise SceneError(path, None, "a colour file must hold a height and its colour, it holds none")
+    default = special.get("default", _NOTHING)
+    return ramp_of(entries, special.get("nv", default), default)
+
+
+_SEPARATORS = str.maketrans(",\t:", "   ")
+
+
+def _height(word: str, low: float, high: float) -> float:
+    value = _number(word.removesuffix("%"), "a height, a percentage, nv or default")
+    if not word.endswith("%"):
+        return value
+    if not 0 <= value <= 100:
+        raise ValueError(f"a percentage must lie between 0 and 100, it is {word}")
+    return low + value / 100 * (high - low)
+
+
+def _colour(words: list[str]) -> Colour:
+    if words and words[0][0].isalpha():
+        if words[0].lower() not in _NAMED:
+            raise ValueError(f"there is no colour {words[0]!r}; {nearest(words[0].lower(), _NAMED)}")
+        parts = [*_NAMED[words[0].lower()], *(_byte(word) for word in words[1:2])]
+    elif len(words) >= 3:
+        parts = [_byte(word) for word in words[:4]]
+    else:
+        raise ValueError("a height must be followed by red, green and blue, or by a colour's name")
+    red, green, blue, opacity = (*parts, 255)[:4]
+    return red, green, blue, opacity
+
+
+def _byte(word: str) -> int:
+    value = _number(word, "a number from 0 to 255")
+    if not 0 <= value <= 255:
+        raise ValueError(f"a colour's parts must lie between 0 and 255, one is {word}")
+    return int(value)
+
+
+def _number(word: str, wanted: str) -> float:
+    try:
+        value = float(word)
+    except ValueError:
+        raise ValueError(f"there must be {wanted}, there is {word!r}") from None
+    if not np.isfinite(value):
+        raise ValueError(f"numbers must be finite, one is {word}")
+    return value
+
+
+def _interpolated(ramp: Ramp, z: np.ndarray, above: np.ndarray) -> np.ndarray:
+    """0.45 in place of one half rounds as gdaldem does."""
+    before = np.maximum(above - 1, 0)
+    gap = ramp.heights[above] - ramp.heights[before]
+    share = np.where(gap > 0, (z - ramp.heights[before]) / np.where(gap > 0, gap, 1), 1)[..., None]
+    first, last = ramp.colours[before].astype(float), ramp.colours[above].astype(float)
+    return 0.45 + first + np.clip(share, 0, 1) * (last - first)
+
+
+def _nearest(ramp: Ramp, z: np.ndarray, above: np.ndarray) -> np.ndarray:
+    before = np.maximum(above - 1, 0)
+    return ramp.colours[np.where(z - ramp.heights[before] < ramp.heights[above] - z, before, above)]
+
+
+def _exact(ramp: Ramp, z: np.ndarray, above: np.ndarray) -> np.ndarray:
+    return np.where((ramp.heights[above] == z)[..., None], ramp.colours[above], np.array(ramp.default, np.uint8))
+
+
+_COLOURS: dict[str, Callable[[Ramp, np.ndarray, np.ndarray], np.ndarray]] = dict(
+    zip(ENTRIES, (_interpolated, _nearest, _exact), strict=True)
+)
+
+
+def coloured(ramp: Ramp, z: Float[np.ndarray, "k m"], entries: str) -> UInt8[np.ndarray, "k m 4"]:
+    """The colours of heights."""
+    holes = np.isnan(z)
+    z = np.where(holes, ramp.heights[0], z)
+    above = np.minimum(np.searchsorted(ramp.heights, z), len(ramp.heights) - 1)
+    colours = _COLOURS[entries](ramp, z, above).astype(np.uint8)
+    colours[holes] = ramp.nodata
+    return colours
+
+
+def as_ramp(ramp: str | PathLike | None, low: float, high: float) -> Ramp:
+    """The ramp that a file, a name or None (our own) means, for heights in this range."""
+    if ramp is None:
+        return hypsometric(low, high)
+    if isinstance(ramp, str) and not Path(ramp).exists() and not any(mark in ramp for mark in "./\\"):
+        return matplotlib_ramp(ramp, low, high)
+    return read_ramp(ramp, low, high)

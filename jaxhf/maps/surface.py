@@ -1,0 +1,85 @@
+"""What the functions of this folder are given: heights as an array or a `Terrain`, with their spacing."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from ..core.errors import ArgumentError
+from ..io.terrain import Terrain, fitted
+
+Heights = ArrayLike | Terrain
+
+
+class Surface(NamedTuple):
+    """Heights with their spacing, checked.
+
+    Attributes:
+      heights: shape (ny, nx), nan where there is none; row 0 in the south.
+      dx, dy: the spacing, times `scale` if heights are to be compared with it.
+      scale: vertical units in a horizontal one.
+    """
+
+    heights: Float[np.ndarray, "ny nx"]
+    dx: float
+    dy: float
+    scale: float
+
+    @property
+    def nodata(self) -> Bool[np.ndarray, "ny nx"]:
+        return np.isnan(self.heights)
+
+    def north_first(self) -> Float[np.ndarray, "ny nx"]:
+        """The heights in float32, in which GDAL reads all but short integers, and in the order of its rows."""
+        return fitted(self.heights, np.float32)[::-1]
+
+
+def surface(
+    owner: str, heights: Heights, dx: float | None = None, dy: float | None = None, scale: float | None = None
+) -> Surface:
+    """Checks what a function of this folder got.
+
+    Args:
+      owner: that function, for messages.
+      heights: an array of shape (ny, nx), row 0 in the south, or a terrain.
+      dx, dy: the spacing; None: a terrain's own, for an array 1.
+      scale: vertical units in a horizontal one; None: 1, but a terrain in degrees is measured in metres at its middle latitude.
+
+    Raises:
+      ArgumentError: heights are not a grid of numbers, none is finite, or a number is not positive.
+    """
+    grid = {name: value for name, value in (("dx", dx), ("dy", dy)) if value is not None}
+    for name, value in (*grid.items(), ("scale", 1.0 if scale is None else scale)):
+        require_positive(owner, name, value)
+    if isinstance(heights, Terrain):
+        terrain = heights.in_metres(**grid) if scale is None else heights
+        grid = {"dx": terrain.dx, "dy": terrain.dy, **grid}
+        heights = terrain.heights
+    values = _numbers(owner, heights)
+    return Surface(values, grid.get("dx", 1.0), grid.get("dy", 1.0), 1.0 if scale is None else scale)
+
+
+def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:
+    values = np.asarray(heights)
+    if values.dtype.kind not in "fiu":
+        raise ArgumentError(owner, "heights", f"must be real numbers, their dtype is {values.dtype}")
+    if values.ndim != 2 or min(values.shape) < 2:
+        raise ArgumentError(owner, "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {values.shape}")
+    if values.dtype not in (np.float32, np.float64):
+        values = values.astype(np.float32 if values.dtype.itemsize <= 2 else np.float64)
+    finite = np.isfinite(values)
+    if not finite.any():
+        raise ArgumentError(owner, "heights", "must hold a finite one, all of them are nan or infinite")
+    return values if finite.all() else np.where(finite, values, np.nan)
+
+
+def require_positive(owner: str, name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise ArgumentError(owner, name, f"must be positive and finite, it is {value}")
+
+
+def require_one_of(owner: str, name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise ArgumentError(owner, name, f"must be one of {', '.join(known)}; it is {value!r}")

@@ -1,0 +1,231 @@
+"""Hillshades, slopes and aspects: against gdaldem, and planes by hand."""
+
+import itertools
+import re
+
+import numpy as np
+import pytest
+from gdaldem import gdaldem, needed
+
+import jaxhf
+from jaxhf import Terrain
+
+HOLE = -9999.0
+
+
+def rough(ny, nx, seed=0):
+    """Hills with slopes of all steepnesses, and a flat."""
+    noise = np.random.default_rng(seed).normal(size=(ny, nx))
+    y, x = np.mgrid[:ny, :nx]
+    heights = 80 * np.sin(x / 7) * np.cos(y / 5) + 4 * noise
+    heights[5:12, 3:15] = 10.0
+    return heights
+
+
+def with_holes(heights):
+    heights = heights.copy()
+    heights[np.random.default_rng(1).uniform(size=heights.shape) < 0.01] = HOLE
+    heights[20:25, 10:18] = HOLE
+    heights[0, 3] = heights[-1, -1] = heights[7, 0] = HOLE
+    return heights
+
+
+GRIDS = {
+    "square cells": ((3000 + rough(60, 60) / 24).astype(np.float32), 0.5, 0.5),  # where rounding to float32 shows
+    "oblong cells, double": (rough(50, 71), 10.0, 14.3),
+    "degrees": (rough(40, 50, 2).astype(np.float32), 1 / 3600, 1 / 3600),
+    "holes, square cells": (with_holes(rough(45, 61)).astype(np.float32), 9.0, 9.0),
+    "integers, holes": (with_holes(rough(50, 55)).astype(np.int16), 10.0, 12.0),
+}
+ALGORITHMS = {"horn": (), "zevenbergen-thorne": ("-alg", "ZevenbergenThorne")}
+
+
+@pytest.fixture(params=GRIDS)
+def grid(request):
+    """Heights for jaxhf and for GDAL, dx, dy, and GDAL's options."""
+    heights, dx, dy = GRIDS[request.param]
+    holes = "holes" in request.param
+    ours = (
+        np.where(heights == HOLE, np.nan, heights.astype(float if heights.dtype == float else np.float32)) if holes else heights
+    )
+    scale = {"scale": 111120.0} if request.param == "degrees" else {}
+    return (ours, dx, dy), scale, (heights, dx, dy), {"nodata": HOLE if holes else None}
+
+
+def edges(on):
+    return ("-compute_edges",) if on else ()
+
+
+@needed
+@pytest.mark.parametrize("variant", ["regular", "combined", "multidirectional", "igor"])
+def test_hillshades_are_those_of_gdal(tmp_path, grid, variant):
+    ours, scale, theirs, nodata = grid
+    for algorithm, on in itertools.product(ALGORITHMS, (False, True)):
+        options = [*(() if variant == "regular" else (f"-{variant}",)), *ALGORITHMS[algorithm], *edges(on), "-z", 1.5]
+        options += [] if variant == "multidirectional" else ["-az", 300]
+        options += [] if variant == "igor" else ["-alt", 37]
+        expected = gdaldem(tmp_path, "hillshade", *theirs, *options, *(("-s", 111120) if scale else ()), **nodata)
+        light = {"azimuth": 300.0, "altitude": 37.0, "z_factor": 1.5}
+        found = jaxhf.hillshade(*ours, **light, algorithm=algorithm, variant=variant, compute_edges=on, **scale)
+        assert len(np.unique(expected)) > 50
+        # GDAL's reciprocal roots are the processor's: at a rounding tie one byte in 10^5 may be another on another processor.
+        apart = np.abs(found.astype(int) - expected)
+        assert apart.max() <= 1, (algorithm, on)
+        assert (apart > 0).sum() <= 1, (algorithm, on)
+
+
+@needed
+def test_slopes_and_aspects_are_those_of_gdal(tmp_path, grid):
+    ours, scale, theirs, nodata = grid
+    for (algorithm, on), flag in zip(itertools.product(ALGORITHMS, (False, True)), (False, True, True, False), strict=True):
+        options = [*ALGORITHMS[algorithm], *edges(on)]
+        same = {"algorithm": algorithm, "compute_edges": on}
+        percent = [*(["-p"] if flag else []), *(("-s", 111120) if scale else ())]
+        expected = gdaldem(tmp_path, "slope", *theirs, *options, *percent, **nodata)
+        np.testing.assert_array_max_ulp(jaxhf.slope(*ours, percent=flag, **same, **scale), expected, 1)  # of the C library
+        options += ["-trigonometric"] if flag else []
+        options += ["-zero_for_flat"] if algorithm == "horn" else []
+        expected = gdaldem(tmp_path, "aspect", *theirs, *options, **nodata)
+        found = jaxhf.aspect(ours[0], trigonometric=flag, zero_for_flat=algorithm == "horn", **same)
+        np.testing.assert_array_max_ulp(found, expected, 1)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize(("east", "north"), [(0.5, 0.0), (0.0, -0.7), (-0.3, 0.4), (0.0, 0.0), (-2.0, 1.5)])
+def test_planes_by_hand(algorithm, east, north):
+    """Also at the border: a plane goes on in a straight line, but not at the corners, which repeat the border."""
+    y, x = np.mgrid[:6, :9]
+    terrain = Terrain(30.0 * east * x + 60.0 * north * y, 30.0, 60.0)
+    inside = np.s_[1:-1, 1:-1]
+    for on, place in ((False, inside), (True, np.s_[:, 1:-1]), (True, np.s_[1:-1])):
+        both = {"algorithm": algorithm, "compute_edges": on}
+        steep = np.degrees(np.arctan(np.hypot(east, north)))
+        np.testing.assert_allclose(jaxhf.slope(terrain, **both)[place], steep, rtol=1e-6)
+        percent = jaxhf.slope(terrain, scale=2.0, percent=True, **both)[place]
+        np.testing.assert_allclose(percent, 50 * np.hypot(east, north), rtol=1e-6)
+        azimuth, altitude = np.deg2rad([30, 60])
+        light = np.array([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
+        cosine = np.array([-east, -north, 1]) @ light / np.sqrt(east**2 + north**2 + 1)
+        shade = jaxhf.hillshade(terrain, azimuth=30.0, altitude=60.0, **both)[place]
+        np.testing.assert_array_equal(shade, int(1.5 + 254 * max(cosine, 0)))
+    if algorithm == "zevenbergen-thorne":  # so little west of north that it rounds to 360 degrees, which are 0
+        steep = -(2.0**22) * y[:3, :3] + x[:3, :3]
+        assert jaxhf.aspect(steep, algorithm=algorithm)[1, 1] == 0
+        assert jaxhf.aspect(steep.T, algorithm=algorithm, trigonometric=True)[1, 1] == 0
+    square = Terrain(30.0 * east * x + 30.0 * north * y, 30.0, 30.0)
+    faces = np.degrees(np.arctan2(-east, -north)) % 360 if east or north else -9999
+    np.testing.assert_allclose(jaxhf.aspect(square, algorithm=algorithm)[inside], faces, rtol=1e-6)
+    assert jaxhf.hillshade(terrain).dtype == np.uint8
+    assert set(jaxhf.hillshade(terrain)[0]) == {0}
+    assert set(jaxhf.slope(terrain)[:, -1]) == {-9999}
+
+
+def test_degrees_become_metres_unless_a_scale_is_given():
+    from jaxhf.io.georeference import WGS84, CoordinateSystem, metres_per_degree
+
+    heights = rough(30, 40)
+    degrees = Terrain(heights, 1 / 3600, 1 / 3600, 7.0, 46.0, CoordinateSystem(degrees=True, globe=WGS84))
+    along_x, along_y = metres_per_degree(46.0 + 14.5 / 3600)
+    assert (27.5e3 < along_x / 2.8 < 27.8e3, 111.1e3 < along_y < 111.2e3) == (True, True)
+    expected = jaxhf.hillshade(heights, along_x / 3600, along_y / 3600)
+    np.testing.assert_array_equal(jaxhf.hillshade(degrees), expected)
+    given = jaxhf.slope(degrees, scale=111120.0)
+    np.testing.assert_array_equal(given, jaxhf.slope(heights, 1 / 3600, 1 / 3600, scale=111120.0))
+
+
+@pytest.mark.parametrize(
+    ("heights", "options", "message"),
+    [
+        (np.ones((3, 3)), {"altitude": 0.0}, "hillshade: altitude must be above 0 and at most 90 degrees, it is 0.0"),
+        (np.ones((3, 3)), {"azimuth": np.nan}, "hillshade: azimuth must be finite, it is nan"),
+        (np.ones((3, 3)), {"z_factor": -1.0}, "hillshade: z_factor must be positive and finite, it is -1.0"),
+        (np.ones((3, 3)), {"scale": 0.0}, "hillshade: scale must be positive and finite, it is 0.0"),
+        (np.ones((3, 3)), {"dx": np.inf}, "hillshade: dx must be positive and finite, it is inf"),
+        (
+            np.ones((3, 3)),
+            {"variant": "soft"},
+            "variant must be one of regular, combined, multidirectional, igor; it is 'soft'",
+        ),
+        (np.ones((3, 3)), {"algorithm": "Horn"}, "algorithm must be one of horn, zevenbergen-thorne; it is 'Horn'"),
+        (np.ones((3, 3), complex), {}, "heights must be real numbers, their dtype is complex128"),
+        (np.ones((3, 3), bool), {}, "heights must be real numbers, their dtype is bool"),
+        (np.ones((3, 3, 3)), {}, "heights must have shape (ny, nx) of at least 2x2, theirs is (3, 3, 3)"),
+        (np.full((3, 3), np.nan), {}, "heights must hold a finite one, all of them are nan or infinite"),
+        (np.full((3, 3), 1e300), {}, "heights must fit into float32"),
+    ],
+)
+def test_refuses(heights, options, message):
+    with pytest.raises(jaxhf.ArgumentError, match=re.escape(message)):
+        jaxhf.hillshade(heights, **options)
+
+
+def test_light_beyond_the_zenith():
+    with pytest.warns(UserWarning, match="opposite the azimuth, 60.0 high"):
+        found = jaxhf.hillshade(rough(9, 9), azimuth=20.0, altitude=120.0)
+    np.testing.assert_array_equal(found, jaxhf.hillshade(rough(9, 9), azimuth=200.0, altitude=60.0))
+
+
+RAMPS = {
+    "colours by name and number": "# low\n-60 0 0 128\n-20,0:255 0 7\n/ middle\n0\tOrange\n45.5 grey 100\n",
+    "shares of the range": "0% blue\n33.3% 10 200 30 128\n50% orange 77\n100% white\n",
+    "jumps": "-40 red\n0 green\n0 blue\n20 yellow\n20 1 2 3\n20 indigo\n60 white\n",
+}
+
+
+@needed
+@pytest.mark.parametrize("text", RAMPS.values(), ids=RAMPS)
+def test_tints_are_those_of_gdal(tmp_path, grid, text):
+    (ours, *_), _, theirs, nodata = grid
+    for entries, options in (("interpolate", ()), ("nearest", ("-nearest_color_entry",))):
+        ramp = text + ("nv 9 8 7 6\n" if nodata["nodata"] else "")
+        expected = gdaldem(tmp_path, "color-relief", *theirs, "-alpha", *options, **nodata, ramp=ramp)
+        found = jaxhf.color_relief(ours, tmp_path / "ramp.txt", entries=entries, alpha=True)
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(jaxhf.color_relief(ours, tmp_path / "ramp.txt", entries=entries), expected[..., :3])
+
+
+def test_tints_by_hand(tmp_path):
+    """`exact` as GDAL documents it (3.6 finds only the lowest entry), `default`, and holes without a colour of their own."""
+    heights = np.array([[0.0, 5.0, 10.0], [12.0, np.nan, -3.0]])
+    (tmp_path / "ramp.txt").write_text("0 black\n10 200 100 0\n")
+    shares = jaxhf.color_relief(heights, tmp_path / "ramp.txt", alpha=True)
+    np.testing.assert_array_equal(shares[0], [[0, 0, 0, 255], [100, 50, 0, 255], [200, 100, 0, 255]])
+    np.testing.assert_array_equal(shares[1], [[200, 100, 0, 255], [0, 0, 0, 0], [0, 0, 0, 255]])
+    (tmp_path / "ramp.txt").write_text("default 1 2 3\n10 200 100 0\n")
+    exact = jaxhf.color_relief(heights, tmp_path / "ramp.txt", entries="exact")
+    np.testing.assert_array_equal(exact == [1, 2, 3], np.repeat((heights != 10)[..., None], 3, -1))
+    own = jaxhf.color_relief(heights - 5).astype(int)
+    assert (own[0, 0, 2] > own[0, 0, 0], own[0, 2, 2] < own[0, 2, 0]) == (True, True)  # blue below 0, none of it on mountains
+    colormaps = pytest.importorskip("matplotlib").colormaps
+    mapped = jaxhf.color_relief(heights, "viridis")
+    np.testing.assert_array_equal(mapped[1, 2], np.multiply(colormaps["viridis"](0)[:3], 255).astype(int))
+
+
+def test_shading_darkens_and_lightens_tints():
+    """Level ground keeps its tint; slopes to the light are lighter, those away from it darker; holes stay as they are."""
+    x = np.arange(20) + np.zeros((12, 1))
+    heights = np.abs(x - 9.0) + 20.0
+    heights[:, 14:] = 25.0
+    heights[5, 17] = np.nan
+    tint, shaded = jaxhf.color_relief(heights).astype(int), jaxhf.relief(heights, azimuth=270.0, altitude=25.0).astype(int)
+    np.testing.assert_array_equal(shaded[:, 18], tint[:, 18])
+    assert (shaded[:, 2:8] < tint[:, 2:8]).all()  # falls to the east
+    assert (shaded[:, 11:13] > tint[:, 11:13]).any()
+    assert not shaded[5, 17].any()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 red\n10 crimson\n", "ramp.txt:2: there is no colour 'crimson'; "),
+        ("0 red\n10 1 2\n", "ramp.txt:2: a height must be followed by red, green and blue, or by a colour's name"),
+        ("0 red\nten 1 2 3\n", "ramp.txt:2: there must be a height, a percentage, nv or default, there is 'ten'"),
+        ("0 red\n10 1 2 300\n", "ramp.txt:2: a colour's parts must lie between 0 and 255, one is 300"),
+        ("120% red\n", "ramp.txt:1: a percentage must lie between 0 and 100, it is 120%"),
+        ("# nothing\nnv red\n", "ramp.txt: a colour file must hold a height and its colour, it holds none"),
+    ],
+)
+def test_colour_files_are_refused(tmp_path, text, message):
+    (tmp_path / "ramp.txt").write_text(text)
+    with pytest.raises(jaxhf.SceneError, match=re.escape(message)):
+        jaxhf.color_relief(np.eye(3), tmp_path / "ramp.txt")

@@ -1,0 +1,102 @@
+"""Cast shadows: a wall by hand, rays of `jaxhf.cast`, and every crossing of every ray."""
+
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf import Terrain
+from jaxhf.maps.shadows import lit
+
+DIRECTIONS = [(0, 20), (45, 5), (60, 35), (90, 20), (135, 45), (200, 10), (225, 20), (270, 70), (301.7, 3), (315, 45)]
+
+
+def share_of_surface(z, x, y):
+    """Heights at points of the grid, in cells, on the triangles; a corner without a weight need not be there."""
+    ix, iy = (np.clip(np.floor(p).astype(int), 0, n - 2) for p, n in ((x, z.shape[1]), (y, z.shape[0])))
+    u, v = x - ix, y - iy
+    corners = z[iy, ix], np.where(v > u, z[iy + 1, ix], z[iy, ix + 1]), z[iy + 1, ix + 1]
+    weights = 1 - np.maximum(u, v), np.abs(u - v), np.minimum(u, v)
+    return sum(np.where(w < 1e-12, 0, w * corner) for w, corner in zip(weights, corners, strict=True))
+
+
+def highest_above_rays(z, dx, dy, azimuth, altitude):
+    """By how much the surface rises above the ray from each vertex, at most, over all lines that the ray may cross."""
+    (ny, nx), (azimuth, altitude) = z.shape, np.deg2rad([azimuth, altitude])
+    light = np.sin(azimuth) * np.cos(altitude) / dx, np.cos(azimuth) * np.cos(altitude) / dy, np.sin(altitude)
+    y, x = np.mgrid[:ny, :nx].astype(float)
+    most = np.full(z.shape, -np.inf)
+    for along_x, along_y in ((1, 0), (0, 1), (1, -1)):
+        rate = along_x * light[0] + along_y * light[1]
+        for line in range(-ny, nx + ny) if abs(rate) > 1e-15 else ():
+            t = (line - along_x * x - along_y * y) / rate
+            px, py = x + t * light[0], y + t * light[1]
+            on = (
+                (t > 1e-9)
+                & (np.abs(px - (nx - 1) / 2) < nx / 2 - 0.5 + 1e-9)
+                & (np.abs(py - (ny - 1) / 2) < ny / 2 - 0.5 + 1e-9)
+            )
+            surface = share_of_surface(z, np.clip(px[on], 0, nx - 1), np.clip(py[on], 0, ny - 1))
+            most[on] = np.fmax(most[on], surface - z[on] - t[on] * light[2])
+    return most
+
+
+@pytest.mark.parametrize("kind", ["hills", "noise", "holes"])
+@pytest.mark.parametrize("shape", [(24, 24), (13, 31), (31, 13)])
+def test_shadows_are_those_of_every_crossing(kind, shape):
+    random = np.random.default_rng(5)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    z = random.uniform(0, 30, shape) if kind != "hills" else 15 * np.sin(y / 4) + 18 * np.cos(x / 5)
+    if kind == "holes":
+        z[random.uniform(size=shape) < 0.1] = np.nan
+    seen = []
+    for azimuth, altitude in DIRECTIONS:
+        for dx, dy in ((1.0, 1.0), (3.0, 5.0)):
+            found, above = lit(z, dx, dy, float(azimuth), float(altitude)), highest_above_rays(z, dx, dy, azimuth, altitude)
+            sure = np.isfinite(z) & (np.abs(above) > 1e-9)
+            np.testing.assert_array_equal(found[sure], (above < 0)[sure], str((azimuth, altitude, dx)))
+            seen.append(found[sure].mean())
+    assert 0.05 < min(seen) < 0.5 < max(seen)
+
+
+def test_a_wall_casts_a_shadow_of_its_height_over_the_tangent():
+    heights = np.zeros((9, 80))
+    heights[:, 60] = 10.0
+    for altitude in (15, 30, 50):
+        length = 10 / np.tan(np.deg2rad(altitude))
+        dark = ~lit(heights, 0.5, 2.0, 90.0, float(altitude))
+        distance = 0.5 * (60 - np.arange(80))
+        np.testing.assert_array_equal(dark, np.broadcast_to((distance > 0) & (distance < length), dark.shape))
+    shaded = jaxhf.hillshade(heights, 0.5, 2.0, azimuth=90.0, altitude=30.0, compute_edges=True, shadows=True)
+    plain = jaxhf.hillshade(heights, 0.5, 2.0, azimuth=90.0, altitude=30.0, compute_edges=True)
+    dark = ~lit(heights, 0.5, 2.0, 90.0, 30.0)
+    np.testing.assert_array_equal(shaded, np.where(dark, 1, plain))
+    assert plain[0, 40] == int(1.5 + 254 * np.sin(np.deg2rad(30)))
+    taller = jaxhf.hillshade(heights, 1.0, 4.0, azimuth=90.0, altitude=30.0, z_factor=2.0, compute_edges=True, shadows=True)
+    np.testing.assert_array_equal(taller, shaded)
+
+
+def test_shadows_are_those_of_rays():
+    """Where a ray of `cast` from a vertex, begun a little above it, says clearly; shaded bytes are then 1, and holes 0."""
+    y, x = np.mgrid[:20, :27]
+    terrain = Terrain(40 * np.sin(y / 3) * np.cos(x / 4) + np.random.default_rng(2).uniform(0, 9, x.shape), 10.0, 12.0)
+    azimuth, altitude = np.deg2rad([250, 25])
+    towards = np.array([np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)])
+    start = np.stack([10.0 * x, 12.0 * y, terrain.heights], axis=-1)
+    blocked = [
+        np.asarray(jaxhf.cast(terrain.heightfield(), start + np.array([0, 0, lift]), towards).status == jaxhf.Status.HIT)
+        for lift in (1e-3, 0.2)
+    ]
+    clear = blocked[0] == blocked[1]
+    assert clear.mean() > 0.9
+    assert 0.2 < blocked[0].mean() < 0.8
+    found = lit(terrain.heights, 10.0, 12.0, 250.0, 25.0)
+    np.testing.assert_array_equal(found[clear], ~blocked[0][clear])
+    for variant in ("regular", "combined", "multidirectional", "igor"):
+        light = {"azimuth": 250.0, "altitude": 25.0, "variant": variant}
+        shaded, plain = jaxhf.hillshade(terrain, **light, shadows=True), jaxhf.hillshade(terrain, **light)
+        np.testing.assert_array_equal(shaded, np.where(found | (plain == 0), plain, 1))
+
+
+def test_level_ground_and_an_overhead_sun_are_lit():
+    assert lit(np.zeros((5, 7)), 1.0, 1.0, 33.0, 0.1).all()
+    assert lit(np.random.default_rng(0).uniform(0, 9, (5, 7)), 1.0, 1.0, 0.0, 90.0).all()
