@@ -21,12 +21,12 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     from ..io.load_terrain import load_heights
     from ..io.meshes import MESHES, require_writable_mesh, save_mesh
-    from ..io.save_terrain import require_writable_heights, save_heights
+    from ..io.save_terrain import HEIGHTS, require_writable_heights, save_heights
     from .describe import heightfield_line
 
     ending = Path(options.output).suffix.lower()
     if ending not in MESHES:
-        require_writable_heights(options.output, MESHES)
+        require_writable_heights(options.output, HEIGHTS + MESHES)
         if options.base is not None:
             raise UserError(f"--base is for meshes ({', '.join(MESHES)}), {options.output} is none")
     else:

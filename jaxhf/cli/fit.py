@@ -51,7 +51,7 @@ class Outputs:
         from ..io.save_terrain import require_writable_heights
 
         for path in (self.heights, self.std):
-            require_writable_heights(path)
+            require_writable_heights(path, (".npy", ".npz", ".tif", ".tiff"))  # which hold any heights, and holes
         if self.report is not None:
             require_writable_text(self.report, ".html")
             import_extra("matplotlib", "a report needs", "plot")

@@ -57,8 +57,8 @@ def write_asc(path: Path, terrain: Terrain) -> None:
     cell = f"cellsize {dx!r}" if dx == dy else f"dx {dx!r}\ndy {dy!r}"
     place = terrain.georeference and terrain.georeference.nodata
     nodata = -9999.0 if place is None or not np.isfinite(place) else place
-    if np.any(terrain.heights == nodata):
-        raise FileError(f"its holes are written as {nodata:.10g}, which is one of its heights")
+    if np.any(terrain.heights == terrain.heights.dtype.type(nodata)):
+        nodata = np.nan  # which GDAL writes too
     header = (
         f"ncols {nx}\nnrows {ny}\nxllcorner {x0 - dx / 2!r}\nyllcorner {y0 - dy / 2!r}\n{cell}\nNODATA_value {nodata:.10g}\n"
     )

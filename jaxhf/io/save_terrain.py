@@ -71,12 +71,12 @@ def _terrain(path: Path, given: Any) -> Terrain:
     return Terrain(heights)
 
 
-def require_writable_heights(path: PathLike, also: Iterable[str] = ()) -> Path:
+def require_writable_heights(path: PathLike, endings: Iterable[str] | None = None) -> Path:
     """Checks that `save_heights` can write to `path`, so that nobody fits for an hour first.
 
     Args:
       path: the file.
-      also: endings that the caller knows besides, for the message.
+      endings: those that the caller takes; None: all of `save_heights`.
 
     Raises:
       ValueError: the ending is not known, a package for it is missing, or `path` is a folder.
@@ -84,7 +84,7 @@ def require_writable_heights(path: PathLike, also: Iterable[str] = ()) -> Path:
       PermissionError: the folder cannot be written to.
     """
     path = Path(path)
-    by_ending({**_WRITERS, **dict.fromkeys(also)}, path, "write heights with")
+    by_ending(dict.fromkeys(HEIGHTS if endings is None else endings), path, "write heights with")
     require_folder(path, "heights")
     require_extras(path)
     return path
@@ -133,3 +133,4 @@ _WRITERS: dict[str, Callable[[Path, Terrain], None]] = {
     ".tif": _write_tiff,
     ".tiff": _write_tiff,
 }
+HEIGHTS = tuple(_WRITERS)

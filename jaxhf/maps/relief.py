@@ -1,5 +1,7 @@
 """Relief in colours: tints by height, as `gdaldem color-relief` gives them, and tints shaded."""
 
+import warnings
+
 import numpy as np
 from jaxtyping import UInt8
 
@@ -9,9 +11,6 @@ from .hillshade import hillshade
 from .ramp import as_ramp, coloured
 from .surface import Heights, require_one_of, surface
 from .windows import shared
-
-# Level ground keeps its tint: GDAL's byte for it under the default light.
-_LEVEL = 1 + 254 * np.sqrt(0.5)
 
 
 def color_relief(
@@ -68,23 +67,23 @@ def relief(
 ) -> UInt8[np.ndarray, "ny nx bands"]:
     """A tinted map, shaded: `color_relief` made darker or lighter by `hillshade`; shape (ny, nx, 3), or 4 with opacity.
 
-    The tint is kept where the shade is that of level ground under a light 45 degrees high. Darker shades darken it in
-    proportion, down to a third; lighter ones mix it with white.
+    Level ground keeps its tint. Darker shades darken it in proportion, down to a third; lighter ones mix it with up to a
+    quarter of white.
 
     Args, Raises: see `color_relief` and `hillshade`, of which all of the map, also its border, has a value.
     """
     tint = color_relief(heights, ramp, entries=entries, alpha=alpha)
-    shade = hillshade(
-        heights, dx, dy, azimuth=azimuth, altitude=altitude, z_factor=z_factor, scale=scale, algorithm=algorithm,
-        variant=variant, compute_edges=True, shadows=shadows,
-    )  # fmt: skip
+    light = {"azimuth": azimuth, "altitude": altitude, "algorithm": algorithm, "variant": variant}
+    shade = hillshade(heights, dx, dy, **light, z_factor=z_factor, scale=scale, compute_edges=True, shadows=shadows)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the light, which has been said
+        level = float(hillshade(np.zeros((3, 3)), **light)[1, 1])
     there = shade > 0  # what has no height keeps its colour
 
     def blend(rows: slice) -> None:
-        light = shade[rows, :, None] / np.float32(_LEVEL)
-        colours = tint[rows, :, :3].astype(np.float32)
-        dark = colours * (1 / 3 + 2 / 3 * np.minimum(light, 1))
-        mixed = dark + (255 - dark) * 0.6 * np.maximum(light - 1, 0)
+        bright, colours = shade[rows, :, None].astype(np.float32), tint[rows, :, :3].astype(np.float32)
+        dark = colours * (1 / 3 + 2 / 3 * np.minimum(bright / level, 1))
+        mixed = dark + (255 - dark) * np.maximum((bright - level) / (4 * max(255 - level, 1)), 0)
         np.copyto(tint[rows, :, :3], (mixed + 0.5).astype(np.uint8), where=there[rows, :, None])
 
     shared(blend, _blocks(tint.shape))

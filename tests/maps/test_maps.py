@@ -202,12 +202,12 @@ def test_tints_by_hand(tmp_path):
 
 
 def test_shading_darkens_and_lightens_tints():
-    """Level ground keeps its tint; slopes to the light are lighter, those away from it darker, and holes stay as they are."""
+    """Level ground keeps its tint; slopes to the light are lighter, those away from it darker; holes stay as they are."""
     x = np.arange(20) + np.zeros((12, 1))
     heights = np.abs(x - 9.0) + 20.0
     heights[:, 14:] = 25.0
     heights[5, 17] = np.nan
-    tint, shaded = jaxhf.color_relief(heights).astype(int), jaxhf.relief(heights, azimuth=270.0).astype(int)
+    tint, shaded = jaxhf.color_relief(heights).astype(int), jaxhf.relief(heights, azimuth=270.0, altitude=25.0).astype(int)
     np.testing.assert_array_equal(shaded[:, 18], tint[:, 18])
     assert (shaded[:, 2:8] < tint[:, 2:8]).all()  # falls to the east
     assert (shaded[:, 11:13] > tint[:, 11:13]).any()
