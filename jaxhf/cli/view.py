@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -77,6 +78,9 @@ def run(options: argparse.Namespace) -> None:
         raise UserError("view: --sun-from and --sun-to belong together, one is missing")
     if options.sun_from is not None and not film:
         raise UserError(f"view: a moving sun makes a film, {output} is none; write {' or '.join(FILMS)}")
+    for name, value, low in (("exaggeration", options.exaggeration, 0.0), ("water", options.water, -math.inf)):
+        if value is not None and not low < value < math.inf:
+            raise UserError(f"view: --{name} must be {'finite' if low else 'positive and finite'}, it is {value}")
     if options.frames < 2:
         raise UserError(f"view: --frames must be 2 or more, it is {options.frames}")
     if output.resolve() == Path(options.terrain).resolve():
@@ -139,12 +143,12 @@ class _Stage:
 
         return Heightfield(self.heights, self.terrain.dx, self.terrain.dy)
 
-    def _camera(self, field: "Heightfield", azimuth: float) -> "Perspective":
+    def _camera(self, field: "Heightfield", azimuth: float, around: bool = False) -> "Perspective":
         from ..scene.camera import Perspective
 
         width, height = self.size
         altitude, fov = self.options.camera_altitude, self.options.fov
-        return Perspective.framing(field, azimuth, altitude, fov, width=width, height=height, base=self.base)
+        return Perspective.framing(field, azimuth, altitude, fov, width=width, height=height, base=self.base, around=around)
 
     @property
     def _azimuth(self) -> float:
@@ -183,7 +187,7 @@ class _Stage:
         ready, lit = None, None
         with writing_film(output, 24) as add, bar(total=options.frames, unit=" frames") as shown:
             for turn, look in zip(turns, suns, strict=True):
-                camera = self._camera(field, turn)
+                camera = self._camera(field, turn, around=options.sun_from is None)
                 if ready is None or look != lit:
                     ready, lit = prepare(block(field, self.colours, camera, look, self.base)), look
                 image = photograph(ready, camera, look)

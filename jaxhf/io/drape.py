@@ -40,6 +40,7 @@ def _placed(path: Path, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
     rasterio = import_extra("rasterio", "reading .tif needs", "geo")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        warnings.simplefilter("ignore", PendingDeprecationWarning)  # of its windows' own arithmetic
         with rasterio.open(path.absolute(), driver="GTiff") as dataset:
             require_pixels(dataset.height, dataset.width)
             if dataset.count not in (1, 3, 4) or set(dataset.dtypes) != {"uint8"}:

@@ -52,7 +52,7 @@ def writing_film(path: PathLike, rate: int) -> Iterator[Add]:
             with temporary.open("wb") as file:
                 imageio.imwrite(file, frames, plugin="pillow", extension=".gif", duration=1000 / rate, loop=0)
             return
-        with temporary.open("wb") as file, imageio.imopen(file, "w", plugin="pyav", extension=".mp4") as film:
+        with temporary.open("wb") as file, imageio.imopen(file, "w", plugin="pyav", extension=".mp4", container="mp4") as film:
             film.init_video_stream("libx264", fps=rate)
 
             def add(frame: np.ndarray) -> None:

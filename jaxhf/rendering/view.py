@@ -49,7 +49,7 @@ class Look:
 
 
 def exaggeration(heights: Float[np.ndarray, "ny nx"], dx: float, dy: float) -> float:
-    """A factor for heights, 1, 2 or 5 times a power of ten, with which a terrain looks neither flat nor like a wall.
+    """A round factor for heights with which a terrain looks neither flat nor like a wall.
 
     Its relief, without a hundredth at either end, is then 0.06 of the shorter side at least and 0.6 at most; 1 where it is so
     without.
@@ -62,7 +62,7 @@ def exaggeration(heights: Float[np.ndarray, "ny nx"], dx: float, dy: float) -> f
         return 1.0
     wanted = (0.06 if share < 0.06 else 0.2) / share
     power = 10.0 ** math.floor(math.log10(wanted))
-    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= wanted * (1 - 1e-9))
+    return next(step * power for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0) if step * power >= wanted * (1 - 1e-9))
 
 
 def with_water(

@@ -138,6 +138,7 @@ class Perspective(eqx.Module):
         height: int = 512,
         margin: float = 0.05,
         base: float | None = None,
+        around: bool = False,
     ) -> "Perspective":
         """The nearest camera that has all of a heightfield in its picture.
 
@@ -149,11 +150,13 @@ class Perspective(eqx.Module):
           width, height: of the picture, pixels.
           margin: the share of the picture that stays empty at each border at least.
           base: the level of a `Skirt`'s floor, which is to be seen, too; None: there is none.
+          around: for a camera that is to go round the terrain: from every azimuth the distance is the same, and suffices.
 
         Raises:
           ValueError: angles out of range, or a terrain without heights.
         """
-        return cls(framing_pose(field, azimuth, altitude, fov, width, height, margin, base), fov, width=width, height=height)
+        pose = framing_pose(field, azimuth, altitude, fov, width, height, margin, base, around)
+        return cls(pose, fov, width=width, height=height)
 
     def ray(self, x: Scalar, y: Scalar) -> Ray:
         """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""

@@ -10,7 +10,15 @@ from .heightfield import Heightfield
 
 
 def framing_pose(
-    field: Heightfield, azimuth: float, altitude: float, fov: float, width: int, height: int, margin: float, base: float | None
+    field: Heightfield,
+    azimuth: float,
+    altitude: float,
+    fov: float,
+    width: int,
+    height: int,
+    margin: float,
+    base: float | None,
+    around: bool,
 ) -> Float[np.ndarray, "4 4"]:
     """The pose of the nearest pinhole that looks at a heightfield from a direction and has all of it in its picture.
 
@@ -27,6 +35,7 @@ def framing_pose(
         if not holds:
             raise ArgumentError("framing", name, f"must be {rule}, it is {value}")
     points = _outline(field, base)
+    points = _cylinder(points) if around else points
     turn, lift = math.radians(azimuth), math.radians(altitude)
     forward = -np.array([math.sin(turn) * math.cos(lift), math.cos(turn) * math.cos(lift), math.sin(lift)])
     right = np.array([-math.cos(turn), math.sin(turn), 0.0])
@@ -43,6 +52,16 @@ def framing_pose(
     pose = np.eye(4)
     pose[:3] = np.stack([right, up, forward, eye], axis=1)
     return pose
+
+
+def _cylinder(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
+    """The two rims of the upright cylinder round points."""
+    low, high = points.min(0), points.max(0)
+    middle = (low + high)[:2] / 2
+    radius = np.hypot(*(points[:, :2] - middle).T).max()
+    turns = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+    x, y = middle[0] + radius * np.cos(turns), middle[1] + radius * np.sin(turns)
+    return np.concatenate([np.stack([x, y, np.full(72, z)], axis=1) for z in (low[2], high[2])])
 
 
 def _central(across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) -> float:

@@ -42,6 +42,22 @@ def test_a_framing_camera_sees_all_of_a_terrain(azimuth, altitude, fov, width, h
         np.testing.assert_allclose(camera.world_from_camera, looking.world_from_camera, atol=1e-9)
 
 
+def test_a_camera_that_goes_round_keeps_its_distance():
+    x, y = np.meshgrid(100 + 2.0 * np.arange(12), -50 + 1.0 * np.arange(7))
+    points = np.stack([x, y, HEIGHTS], -1).reshape(-1, 3)
+    points = points[np.isfinite(points).all(1)]
+    middle = (points.min(0) + points.max(0)) / 2
+    distances, farthest = [], []
+    for azimuth in range(0, 360, 15):
+        camera = jaxhf.Perspective.framing(FIELD, float(azimuth), 25.0, width=300, height=200, margin=0.0, around=True)
+        film = camera.film_from_world()
+        seen = np.asarray(film.linear, float) @ points.T + np.asarray(film.offset, float)[:, None]
+        farthest.append(max(np.abs(2 * seen[0] / seen[2] / 300 - 1).max(), np.abs(2 * seen[1] / seen[2] / 200 - 1).max()))
+        distances.append(np.linalg.norm(np.asarray(camera.world_from_camera)[:3, 3] - middle))
+    np.testing.assert_allclose(distances, distances[0], rtol=1e-3)
+    assert 0.8 < max(farthest) <= 1
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [({"altitude": 91.0}, "altitude must be from -90 to 90"), ({"fov": 0.0}, "fov must be"),

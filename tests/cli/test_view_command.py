@@ -1,0 +1,135 @@
+"""`jaxhf view`: pictures and films of terrain files."""
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.cli.main import main
+from jaxhf.io.terrain import Terrain
+
+SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
+
+
+@pytest.fixture(autouse=True)
+def jax_is_set_up(monkeypatch):
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
+
+
+@pytest.fixture(scope="module")
+def terrain(tmp_path_factory) -> str:
+    path = tmp_path_factory.mktemp("view") / "in.npz"
+    x, y = np.meshgrid(np.linspace(-1, 1, 17), np.linspace(-1, 1, 13))
+    jaxhf.save_heights(path, Terrain((300 * np.exp(-4 * (x**2 + y**2))).astype(np.float32), 100.0, 100.0))
+    return str(path)
+
+
+def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, capsys):
+    assert main(["view", terrain, "-o", str(tmp_path / "out.png"), *SMALL]) == 0
+    assert "48 x 32 pixels, heights x 1, " in capsys.readouterr().out
+    image = imageio.imread(tmp_path / "out.png").astype(int)
+    background = (image[:, :1] == image).all(-1)
+    rows, columns = np.nonzero(~background)
+    assert abs(rows.min() + rows.max() - 31) <= 4
+    assert abs(columns.min() + columns.max() - 47) <= 4
+    assert columns.max() - columns.min() > 36 or rows.max() - rows.min() > 24
+    assert len(np.unique(image[~background], axis=0)) > 100
+
+
+def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path):
+    turning, sunny = tmp_path / "out.gif", tmp_path / "out.mp4"
+    assert main(["view", terrain, "-o", str(turning), "--frames", "3", *SMALL]) == 0
+    frames = imageio.imread(turning).astype(int)
+    assert frames.shape == (3, 32, 48, 3)
+    sun = ["--sun-from", "90,10", "--sun-to", "270,60"]
+    assert main(["view", terrain, "-o", str(sunny), "--frames", "3", *sun, *SMALL]) == 0
+    lit = imageio.imread(sunny, plugin="pyav").astype(int)
+    assert lit.shape == (3, 32, 48, 3)
+    for film in (frames, lit):
+        assert (np.abs(np.diff(film, axis=0)).max(-1) > 30).mean() > 0.05
+    shape = np.abs(lit - lit[:, :1, :1]).max(-1) > 60  # the terrain stands still
+    assert (shape[0] == shape[2]).mean() > 0.9
+
+
+def test_a_picture_is_draped_from_corner_to_corner(terrain, tmp_path):
+    texels = np.zeros((4, 4, 3), np.uint8)
+    texels[:, :2, 0], texels[:, 2:, 2] = 255, 255  # red in the west
+    imageio.imwrite(tmp_path / "drape.png", texels)
+    command = [
+        "view",
+        terrain,
+        "-o",
+        str(tmp_path / "out.npy"),
+        "--drape",
+        str(tmp_path / "drape.png"),
+        "--from",
+        "180",
+        *SMALL,
+    ]
+    assert main([*command, "--above", "80", "--haze", "0"]) == 0
+    image = np.load(tmp_path / "out.npy")
+    assert (image[10:22, 12:20, 0] > 2 * image[10:22, 12:20, 2]).all()
+    assert (image[10:22, 28:36, 2] > 2 * image[10:22, 28:36, 0]).all()
+
+
+def test_a_geotiff_is_draped_where_it_lies(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    from jaxhf.io.drape import load_drape
+    from jaxhf.io.errors import FileError
+    from jaxhf.io.load_terrain import load_heights
+
+    def write(path, bands, corner, step, system="EPSG:32632"):
+        count, height, width = bands.shape
+        place = rasterio.Affine(step, 0, corner[0], 0, -step, corner[1])
+        profile = {
+            "driver": "GTiff",
+            "count": count,
+            "height": height,
+            "width": width,
+            "dtype": bands.dtype,
+            "transform": place,
+        }
+        with rasterio.open(path, "w", crs=system, **profile) as file:
+            file.write(bands)
+        return path
+
+    heights = np.zeros((1, 11, 11), np.float32)
+    terrain = load_heights(write(tmp_path / "dem.tif", heights, (5e5, 5e6), 10.0))  # vertices from 500005 to 500105
+    colours = np.zeros((3, 40, 40), np.uint8)
+    colours[0], colours[1, :, 20:], colours[2, :20] = 255, 255, 255  # green in the east, blue in the north
+    texels = load_drape(write(tmp_path / "ortho.tif", colours, (499955.0, 5000045.0), 5.0), terrain)
+    np.testing.assert_allclose(texels[..., 0], 1)
+    ny, nx, _ = texels.shape
+    # East of 500055 is green, which is the middle of the terrain, as north of 4999945 is blue.
+    assert (texels[:, : nx // 2 - 1, 1] == 0).all()
+    assert (texels[:, nx // 2 + 1 :, 1] == 1).all()
+    assert (texels[: ny // 2 - 1, :, 2] == 0).all()
+    assert (texels[ny // 2 + 1 :, :, 2] == 1).all()
+    with pytest.raises(FileError, match=r"other\.tif: it must be in the terrain's reference system, .*gdalwarp"):
+        load_drape(write(tmp_path / "other.tif", colours, (5e5, 5e6), 5.0, "EPSG:32633"), terrain)
+    with pytest.raises(FileError, match="it must cover the terrain"):
+        load_drape(write(tmp_path / "far.tif", colours, (7e5, 5e6), 5.0), terrain)
+    with pytest.raises(FileError, match="bands of bytes, it has 1 of float32"):
+        load_drape(tmp_path / "dem.tif", terrain)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--size", "48"], "--size must be two numbers of pixels, as 1280x800, it is '48'"),
+        (["--sun-from", "90,10"], "--sun-from and --sun-to belong together"),
+        (["--sun-from", "90,10", "--sun-to", "90,20"], "a moving sun makes a film"),
+        (["--altitude", "0"], "altitude of the sun must be above 0"),
+        (["--above", "95"], "altitude must be from -90 to 90 degrees"),
+        (["--water", "nan"], "--water must be finite"),
+        (["--exaggeration", "0"], "--exaggeration must be positive and finite"),
+        (["-o", "out.bmp"], "cannot write an image with the ending '.bmp'"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(terrain, tmp_path, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", terrain, "-o", "out.png", *words]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())

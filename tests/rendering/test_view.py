@@ -1,0 +1,45 @@
+"""What a view makes of a terrain before it is rendered, and its haze."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxhf.rendering.view import Look, _in_haze as in_haze, exaggeration, with_water
+
+RAMP = np.linspace(0, 1, 101)[:, None] * np.ones(101)
+
+
+@pytest.mark.parametrize(
+    ("relief", "factor"), [(10.0, 1.0), (5.0, 1.5), (1.0, 7.0), (0.1, 70.0), (60.0, 1.0), (700.0, 0.03), (0.0, 1.0)]
+)
+def test_heights_are_exaggerated_where_they_would_look_flat(relief: float, factor: float):
+    assert exaggeration(RAMP * relief, 1.0, 1.0) == pytest.approx(factor)
+    assert exaggeration(RAMP * relief * 30, 30.0, 30.0) == pytest.approx(factor)
+
+
+def test_water_is_level_and_darkens_with_depth():
+    heights = np.array([[5.0, 3, 1], [np.nan, 2, 9]], np.float32)
+    colours = np.full((2, 3, 3), 0.5)
+    level, tinted = with_water(heights, colours, 3.0)
+    np.testing.assert_array_equal(level, np.array([[5, 3, 3], [np.nan, 3, 9]], np.float32))
+    np.testing.assert_array_equal(tinted[[0, 0, 1], [0, 1, 2]], 0.5)
+    assert (tinted[0, 2] < tinted[1, 1]).all()
+    assert (tinted[1, 1] < 0.5).all()
+
+
+def test_haze_grows_with_distance_before_a_background():
+    image = np.full((4, 3, 3), 0.2)
+    depth = np.array([[np.inf] * 3, [10, 20, 30], [10, 10, 10], [np.inf] * 3])
+    hazy = in_haze(image, depth, 20.0, 0.5)
+    np.testing.assert_allclose(hazy[1, 0], 0.2)  # the nearest point has none
+    np.testing.assert_allclose(hazy[1, 2], 0.5 * 0.2 + 0.5 * np.array((0.78, 0.84, 0.90)))
+    assert (hazy[1, 1] > hazy[1, 0]).all()
+    assert not np.allclose(hazy[0], hazy[3])
+    np.testing.assert_array_equal(in_haze(image, depth, 20.0, 0.0)[1:3], 0.2)
+
+
+@pytest.mark.parametrize(("name", "value"), [("altitude", 0.0), ("altitude", 91.0), ("haze", 1.0), ("haze", -0.1)])
+def test_a_look_that_cannot_be_is_refused(name: str, value: float):
+    with pytest.raises(ValueError, match=f"view: {name} .*it is {value}"):
+        dataclasses.replace(Look(), **{name: value})
