@@ -2,9 +2,11 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxhf
 from jaxhf.rendering.view import Look, _in_haze as in_haze, exaggeration, with_water
 
 RAMP = np.linspace(0, 1, 101)[:, None] * np.ones(101)
@@ -43,3 +45,11 @@ def test_haze_grows_with_distance_before_a_background():
 def test_a_look_that_cannot_be_is_refused(name: str, value: float):
     with pytest.raises(ValueError, match=f"view: {name} .*it is {value}"):
         dataclasses.replace(Look(), **{name: value})
+
+
+def test_a_camera_looks_past_the_centres_of_its_pixels():
+    camera = jaxhf.Perspective.look_at((3, -2, 4), (0, 1, 0), fov=50, width=60, height=40)
+    for dx, dy in ((0.25, -0.375), (-0.5, 0.0)):
+        past = moved(camera, dx, dy)
+        for x, y in ((0.5, 39.5), (17.0, 3.0)):
+            np.testing.assert_allclose(past.ray(*jnp.array([x, y])).d, camera.ray(*jnp.array([x + dx, y + dy])).d, atol=1e-6)
