@@ -19,6 +19,7 @@ from .scene.heightfield import Heightfield as Heightfield
 from .scene.light import Directional as Directional, Point as Point, Sky as Sky
 from .scene.material import Matte as Matte, Mirror as Mirror
 from .scene.scene import Object as Object, Scene as Scene
+from .scene.sun import sun as sun
 from .scene.texture import ImageTexture as ImageTexture
 from .trace.hit import Hit as Hit
 from .trace.normals import vertex_normals as vertex_normals

@@ -10,6 +10,7 @@ import numpy as np
 from ..core.errors import ArgumentError
 from ..core.types import VectorLeaf, float_leaf, require_finite, rgb_leaf
 from .show import fields
+from .sun import sun
 
 
 class Directional(eqx.Module):
@@ -52,6 +53,25 @@ class Directional(eqx.Module):
         a, h = xp.deg2rad(azimuth), xp.deg2rad(altitude)
         towards = xp.stack([xp.sin(a) * xp.cos(h), xp.cos(a) * xp.cos(h), xp.sin(h)])
         return cls(towards, _chosen(irradiance, radiance, 3))
+
+    @classmethod
+    def at(cls, time: Any, latitude: Any, longitude: Any, irradiance: Any = None, *, refraction: bool = False) -> "Directional":
+        """Light from where the sun stands at a time and place; y counts as true north.
+
+        Args:
+          time, latitude, longitude, refraction: one of each, as for `sun`.
+          irradiance: as for the class; it does not depend on the altitude.
+
+        Raises:
+          ValueError: the sun is not above the horizon, or `sun` raises it.
+        """
+        azimuth, altitude = sun(time, latitude, longitude, refraction=refraction)
+        if np.ndim(altitude):
+            raise ArgumentError("Directional", "time", f"and place must be one of each, they make {np.size(altitude)} lights")
+        if not altitude > 0:
+            rule = f"must be one at which the sun is up, its altitude is {altitude:.2f} degrees at {time}"
+            raise ArgumentError("Directional", "time", rule)
+        return cls.from_angles(azimuth, altitude, irradiance)
 
 
 class Point(eqx.Module):
