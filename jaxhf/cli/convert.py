@@ -23,8 +23,7 @@ def run(options: argparse.Namespace) -> None:
 
     require_writable_heights(options.output)
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
-    rasters = {Path(path).suffix.lower() for path in (options.terrain, options.output)} <= {".tif", ".tiff"}
     interruption.raise_from_now_on()
-    save_heights(options.output, terrain, options.terrain if rasters else None)
+    save_heights(options.output, terrain)
     alone = " (.npy holds the heights alone)" if Path(options.output).suffix.lower() == ".npy" else ""
     print(f"{options.output}: {heightfield_line(terrain)}{alone}")

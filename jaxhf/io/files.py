@@ -129,8 +129,16 @@ def require_pixels(height: int, width: int) -> None:
         raise FileError(f"it must hold at most {MAX_PIXELS} pixels, it declares {width} x {height}")
 
 
-def read_npy(file: Any, size: int) -> np.ndarray:
-    """The array of an open .npy file, or member of an archive, of `size` bytes; ValueError where it is not of real numbers.
+def write_npy(path: Path, array: np.ndarray) -> None:
+    """As np.save, but a full disk is the system's own error, which names itself, and not "8 requested and 7 written"."""
+    array = np.ascontiguousarray(array)
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(array))
+        file.write(array.data)
+
+
+def read_npy(file: Any, size: int, kinds: str = "fiub") -> np.ndarray:
+    """The array of an open .npy file, or member of an archive, of `size` bytes; ValueError where it is not of these `kinds`.
 
     np.load trusts the header and asks for all the memory that it names, so its size is compared with the file's first.
     """
@@ -139,7 +147,7 @@ def read_npy(file: Any, size: int) -> np.ndarray:
     if header is None:
         raise ValueError(f"its .npy version must be 1.0 or 2.0, it is {version}")
     shape, _, dtype = header(file)
-    if dtype.kind not in "fiub":
+    if dtype.kind not in kinds:
         raise ValueError(f"its array must hold real numbers, it holds {dtype}")
     require_pixels(*(*shape, 1, 1)[:2])
     declared, present = math.prod(shape) * dtype.itemsize, size - file.tell()

@@ -1,7 +1,10 @@
 """What the coordinates of a terrain file mean: lengths on a map, or degrees on a globe."""
 
 import math
+import re
 from typing import NamedTuple
+
+from .errors import FileError
 
 
 class Ellipsoid(NamedTuple):
@@ -12,6 +15,11 @@ class Ellipsoid(NamedTuple):
 
 
 WGS84 = Ellipsoid(6378137.0, 1 / 298.257223563)
+WGS84_DEGREES = (
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563,AUTHORITY["EPSG","7030"]],'
+    'AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],'
+    'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],AUTHORITY["EPSG","4326"]]'
+)
 
 
 class CoordinateSystem(NamedTuple):
@@ -26,6 +34,55 @@ class CoordinateSystem(NamedTuple):
     degrees: bool = False
     globe: Ellipsoid | None = None
     code: int | None = None
+
+
+class Georeference(NamedTuple):
+    """Where a terrain lies in the coordinates of its file: file = offset + scale * terrain, for x and for y.
+
+    Attributes:
+      wkt: the file's reference system as well-known text (ISO 19162, or GDAL's older form); "": not known.
+      scale, offset: each for x and y.
+      nodata: the stored value that means no height there; None: there is none.
+      point: whether a pixel is said to be a point, PixelIsPoint in GeoTIFF; a height stands at its centre either way.
+    """
+
+    wkt: str = ""
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    nodata: float | None = None
+    point: bool = False
+
+    @property
+    def name(self) -> str:
+        """That of the reference system, "" where it is not known."""
+        found = re.search(r'"([^"]*)"', self.wkt)
+        return found[1] if found else ""
+
+
+_GEOGRAPHIC = r'\s*(?:COMP\w*\["[^"]*",\s*)?(?:GEOGCS|GEOGCRS|GEODCRS|GEOGRAPHICCRS|GEODETICCRS)\b'
+
+
+def coordinate_system(wkt: str) -> CoordinateSystem:
+    """What well-known text says, in either form, of the horizontal coordinates; FileError where its angles are not degrees."""
+    horizontal = re.split(r"VERT_?C\w*\[", wkt)[0].rstrip(", \n]")
+    code = re.search(r'(?:AUTHORITY|\bID)\["EPSG",\s*"?(\d+)"?$', horizontal)
+    number = int(code[1]) if code else None
+    if not re.match(_GEOGRAPHIC, wkt):
+        return CoordinateSystem(code=number)
+    units = re.findall(r'\b(?:ANGLE)?UNIT\["([^"]*)",\s*([-+.\deE]+)', horizontal)
+    if units and not math.isclose(float(units[-1][1]), math.pi / 180, rel_tol=1e-6):
+        raise FileError(f"its coordinates must be in degrees, their unit is {units[-1][0]}")
+    return CoordinateSystem(True, _globe(horizontal), number)
+
+
+def _globe(wkt: str) -> Ellipsoid | None:
+    found = re.search(r'(?:SPHEROID|ELLIPSOID)\["([^"]*)",\s*([-+.\deE]+),\s*([-+.\deE]+)', wkt)
+    if found is None or found[1].startswith("unretrievable"):  # GDAL's word where a GeoTIFF names none
+        return None
+    axis, inverse = float(found[2]), float(found[3])
+    if not (axis > 0 and (inverse == 0 or inverse > 1)):  # 0: a sphere
+        raise FileError(f"its ellipsoid must be flattened by 0 to 1, its axis is {axis} m, its inverse flattening {inverse}")
+    return Ellipsoid(axis, 1 / inverse if inverse else 0.0)
 
 
 def metres_per_degree(latitude: float, globe: Ellipsoid = WGS84) -> tuple[float, float]:

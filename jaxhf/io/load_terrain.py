@@ -8,15 +8,16 @@ import math
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..core.extras import import_extra
 from .errors import FileError
 from .files import PathLike, by_ending, read_npy, reading, require_file
-from .georeference import WGS84, CoordinateSystem
-from .geotiff import read_tiff
+from .georeference import WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
 from .images import read_png
+from .rasters import DRIVERS, read_raster
 from .terrain import Terrain, heights_of
 
 
@@ -36,23 +37,23 @@ def load_heights(
     - .npz: the array `heights`, or the only one, in jaxhf's order, with dx, dy, x0, y0 where the file has them. Or an
       array `elevation` as in matplotlib's `jacksboro_fault_dem.npz`: north row first, bounds and spacing in degrees.
     - .png: 16-bit grey, north row first, spacing 1; a height is the stored whole number.
-    - .tif, .tiff (needs tifffile): one band of numbers, north row first, placed by its GeoTIFF tags. A height stands at
-      its pixel's centre: half a pixel inside the raster's corner where the tags say PixelIsArea. GDAL's scale and
-      offset are applied.
+    - .tif, .tiff and other rasters that GDAL reads (.img, .dt2, .bil, .flt, .dem, .grd, .jp2, .nc, .vrt, .xyz; needs rasterio):
+      one band of numbers, placed by its geotransform. A height stands at its pixel's centre: half a pixel inside the
+      raster's corner. The file's scale and offset are applied.
 
-    Degrees become metres at the mean latitude, with vertex (0, 0) at the origin: on the ellipsoid whose axes the GeoTIFF
-    gives, else on WGS84. nan and inf are holes, as is what the file's GDAL_NODATA tag names.
+    Degrees become metres at the mean latitude, with vertex (0, 0) at the origin: on the ellipsoid that the file's
+    reference system names. nan and inf are holes, as is what the file says means no data.
 
     Args:
       path: the file.
       dx, dy, x0, y0: overrule what the file says.
       z_scale: heights are multiplied by it.
-      nodata: a stored value, before any scale, that means that there is no height; overrules the file's tag.
+      nodata: a stored value, before any scale, that means that there is no height; overrules the file.
 
     Raises:
       FileNotFoundError: no file is there.
       ValueError: the ending is not known, the file is not a whole grid of heights, or its degrees are on a globe of unknown
-        size (not the Earth, and without axes) and dx or dy is not given.
+        size and dx or dy is not given.
     """
     terrain = read_terrain(path, z_scale, nodata)
     given = {"dx": dx, "dy": dy, "x0": x0, "y0": y0}
@@ -104,9 +105,9 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
     with zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
 
-        def array(name: str) -> np.ndarray:
+        def array(name: str, kinds: str = "fiub") -> np.ndarray:
             with archive.open(members[name]) as file:
-                return read_npy(file, members[name].file_size)
+                return read_npy(file, members[name].file_size, kinds)
 
         def number(name: str) -> float:
             value = array(name)
@@ -116,8 +117,16 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
 
         if "heights" in members or len(members) == 1:
             name = "heights" if "heights" in members else next(iter(members))
-            grid = {key: number(key) for key in ("dx", "dy", "x0", "y0") if key in members}
-            return Terrain(heights_of(array(name), nodata), **grid, crs=CoordinateSystem() if len(grid) == 4 else None)
+            grid: dict[str, Any] = {key: number(key) for key in ("dx", "dy", "x0", "y0") if key in members}
+            if len(grid) == 4:
+                grid["crs"] = CoordinateSystem()
+            if "crs" in members:  # as `save_heights` writes it
+                scale, offset = ((float(x), float(y)) for x, y in (array("crs_scale"), array("crs_offset")))
+                nodata_there = number("nodata") if "nodata" in members else None
+                place = Georeference(str(array("crs", "U")), scale, offset, nodata_there, bool(number("point")))
+                plain = place[1:3] == Georeference()[1:3]
+                grid |= {"georeference": place, "crs": coordinate_system(place.wkt) if plain else CoordinateSystem()}
+            return Terrain(heights_of(array(name), nodata), **grid)
         if "elevation" not in members:
             raise FileError(f"it must hold an array 'heights', or only one, it holds {', '.join(sorted(members))}")
         missing = {"dx", "dy", "xmin", "ymin", "ymax"} - members.keys()
@@ -126,8 +135,8 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
         heights = heights_of(array("elevation")[::-1], nodata)
         south = min(number("ymin"), number("ymax"))  # matplotlib's file has them swapped
         dx, dy = number("dx"), number("dy")
-        crs = CoordinateSystem(degrees=True, globe=WGS84)
-        return Terrain(heights, dx, dy, number("xmin") + dx / 2, south + dy / 2, crs)
+        crs, place = coordinate_system(WGS84_DEGREES), Georeference(WGS84_DEGREES)
+        return Terrain(heights, dx, dy, number("xmin") + dx / 2, south + dy / 2, crs, place)
 
 
 def _read_png(path: Path, nodata: float | None, _: bool) -> Terrain:
@@ -141,6 +150,5 @@ _READERS: dict[str, Callable[[Path, float | None, bool], Terrain]] = {
     ".npy": _read_npy,
     ".npz": _read_npz,
     ".png": _read_png,
-    ".tif": read_tiff,
-    ".tiff": read_tiff,
+    **dict.fromkeys(DRIVERS, read_raster),
 }

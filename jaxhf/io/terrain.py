@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike
 
 from ..core.errors import ArgumentError
 from .errors import FileError
-from .georeference import WGS84, CoordinateSystem, metres_per_degree
+from .georeference import WGS84, CoordinateSystem, Georeference, metres_per_degree
 
 if TYPE_CHECKING:
     from ..scene.heightfield import Heightfield
@@ -25,6 +25,8 @@ class Terrain:
       dx, dy: cell size, in the unit of x and y.
       x0, y0: where vertex (0, 0), the one in the south-west, stands.
       crs: the reference system of x and y; None: the four numbers above are not known, but assumed.
+      georeference: how x and y become the coordinates of the file that the heights are from; None: it has none. It goes with
+        the heights into GeoTIFF and .npz files, also those of a part of the grid, if x0 and y0 say which.
     """
 
     heights: Float[np.ndarray, "ny nx"]
@@ -33,6 +35,7 @@ class Terrain:
     x0: float = 0.0
     y0: float = 0.0
     crs: CoordinateSystem | None = None
+    georeference: Georeference | None = None
 
     def __post_init__(self):
         if self.heights.ndim != 2 or min(self.heights.shape) < 2:
@@ -47,6 +50,13 @@ class Terrain:
     def nodata(self) -> Bool[np.ndarray, "ny nx"]:
         """Where there is no height: bool, shape (ny, nx)."""
         return np.isnan(self.heights)
+
+    @property
+    def in_file(self) -> tuple[float, float, float, float]:
+        """Its dx, dy, x0 and y0 in the coordinates of its file, which may be degrees."""
+        place = self.georeference or Georeference()
+        (scale_x, scale_y), (offset_x, offset_y) = place.scale, place.offset
+        return scale_x * self.dx, scale_y * self.dy, offset_x + scale_x * self.x0, offset_y + scale_y * self.y0
 
     def heightfield(self, dtype: DTypeLike | None = None) -> "Heightfield":
         """The surface, to be rendered.
@@ -78,7 +88,12 @@ class Terrain:
             crs, grid = CoordinateSystem(), {"dx": self.dx * along_x, "dy": self.dy * along_y, "x0": 0.0, "y0": 0.0}
         if grid.keys() <= given.keys():
             crs = crs or CoordinateSystem()
-        return dataclasses.replace(self, **{name: float(value) for name, value in {**grid, **given}.items()}, crs=crs)
+        grid, place = {name: float(value) for name, value in {**grid, **given}.items()}, self.georeference
+        if place is not None and min(grid["dx"], grid["dy"]) > 0:
+            dx, dy, x0, y0 = self.in_file
+            scale = dx / grid["dx"], dy / grid["dy"]
+            place = place._replace(scale=scale, offset=(x0 - scale[0] * grid["x0"], y0 - scale[1] * grid["y0"]))
+        return dataclasses.replace(self, **grid, crs=crs, georeference=place)
 
 
 def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, offset: float = 0.0) -> Float[np.ndarray, "ny nx"]:

@@ -150,7 +150,7 @@ def test_hillshade_refuses(tmp_path, capsys, options, message):
 
 
 def test_conversion_keeps_heights_and_place(tmp_path, capsys):
-    pytest.importorskip("tifffile")
+    pytest.importorskip("rasterio")
     terrain = slope(0.5, 0.25)
     terrain.heights[2, 3] = np.nan
     paths = [tmp_path / name for name in ("one.npz", "two.tif", "three.tif", "four.npz")]

@@ -1,0 +1,181 @@
+"""GeoTIFF and the other rasters of GDAL, read and written through rasterio."""
+
+import contextlib
+import math
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import ArgumentError
+from ..core.extras import import_extra
+from .errors import FileError
+from .files import PathLike, by_ending, reading, replacing, require_folder, require_pixels, write_npy
+from .georeference import CoordinateSystem, Georeference, coordinate_system
+from .terrain import Terrain, heights_of
+
+# GDAL's driver by ending: what a file holds does not decide, as some drivers follow addresses on the network.
+DRIVERS = {
+    **dict.fromkeys((".tif", ".tiff"), "GTiff"),
+    **dict.fromkeys((".dt0", ".dt1", ".dt2"), "DTED"),
+    **dict.fromkeys((".bil", ".flt"), "EHdr"),
+    ".dem": "USGSDEM",
+    ".grd": "GSBG",
+    ".img": "HFA",
+    ".jp2": "JP2OpenJPEG",
+    ".nc": "netCDF",
+    ".vrt": "VRT",
+    ".xyz": "XYZ",
+}
+
+
+@contextlib.contextmanager
+def _opened(path: Path, doing: str = "reading") -> Iterator[Any]:
+    rasterio = import_extra("rasterio", f"{doing} {path.suffix.lower()} needs", "geo")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(path.absolute(), driver=DRIVERS[path.suffix.lower()]) as dataset:
+                yield dataset
+    except rasterio.errors.RasterioError as error:
+        raise FileError(f"it is cut off, damaged or of another kind: {error.__cause__ or error}") from error
+
+
+def read_raster(path: Path, nodata: float | None, overrules: bool) -> Terrain:
+    """The heights in a raster, in its own coordinates; `nodata` counts where the file names none, or where it `overrules`."""
+    with _opened(path) as dataset:
+        require_pixels(dataset.height, dataset.width)
+        if dataset.count != 1:
+            raise FileError(f"heights must be one band, it has {dataset.count}")
+        tagged, (scale,), (offset,) = dataset.nodata, dataset.scales, dataset.offsets
+        if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
+            raise FileError(f"its scale and offset must be finite, the scale not zero; they are {scale} and {offset}")
+        used = tagged if nodata is None or (tagged is not None and not overrules) else nodata
+        heights = heights_of(dataset.read(1), used, scale, offset)
+        if any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[0]):
+            heights[dataset.dataset_mask() == 0] = np.nan
+        return _placed(heights, dataset, nodata if used is None else used)
+
+
+def georeference_of(path: Path) -> tuple[Terrain, tuple[int, int]]:
+    """A raster's place, on a terrain of 2 x 2 heights, and its shape (ny, nx)."""
+    with _opened(path) as dataset:
+        shape = dataset.height, dataset.width
+        corner = _placed(np.zeros((2, 2), np.float32), dataset, dataset.nodata)
+        return corner, shape
+
+
+def _placed(heights: np.ndarray, dataset: Any, nodata: float | None) -> Terrain:
+    """The heights, whose rows are in the file's order, where GDAL's geotransform puts the pixels' centres."""
+    a, b, c, d, e, f = dataset.transform[:6]
+    if b or d or not (a and e):
+        raise FileError(f"its pixels must lie along x and y (gdalwarp makes it so), its geotransform is rotated: {b}, {d}")
+    if dataset.gcps[0]:
+        raise FileError("it must be placed by a geotransform, it has ground control points (gdalwarp makes it so)")
+    wkt = "" if dataset.crs is None else dataset.crs.to_wkt()
+    if dataset.transform.is_identity and not wkt:  # of a file without a place
+        return Terrain(heights[::-1])
+    ny, nx = dataset.height, dataset.width
+    heights = heights[:: 1 if e > 0 else -1, :: 1 if a > 0 else -1]
+    x0, y0 = c + (0.5 if a > 0 else nx - 0.5) * a, f + (0.5 if e > 0 else ny - 0.5) * e
+    point = dataset.tags().get("AREA_OR_POINT") == "Point"
+    crs = coordinate_system(wkt) if wkt else CoordinateSystem()
+    return Terrain(heights, abs(a), abs(e), x0, y0, crs, Georeference(wkt, nodata=nodata, point=point))
+
+
+def require_writable_raster(path: PathLike) -> Path:
+    """Checks that `save_raster` can write to `path`.
+
+    Raises:
+      ValueError: the ending is not known, rasterio is missing, or `path` is a folder.
+      FileNotFoundError: the folder does not exist.
+      PermissionError: the folder cannot be written to.
+    """
+    path = Path(path)
+    by_ending(dict.fromkeys((".npy", ".png", ".tif", ".tiff")), path, "write a map with")
+    require_folder(path, "a map")
+    require_rasterio(path)
+    return path
+
+
+def require_rasterio(path: Path) -> None:
+    """FileError where writing this file needs rasterio, and it is missing."""
+    if path.suffix.lower() in (".tif", ".tiff"):
+        with reading(path):
+            import_extra("rasterio", "writing .tif needs", "geo")
+
+
+def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None = None) -> None:
+    """Writes a map of a terrain: a value or a colour at each of its vertices. The file appears whole or not at all.
+
+    .tif is a GeoTIFF in the coordinates of the file that `like` is from, with its reference system; .png has its place in a
+    world file beside it (.pgw), as GIS programs read it; .npy holds the values alone, in the order of `values`.
+
+    Args:
+      path: the file; it begins with the northern row, but for .npy.
+      values: row 0 in the south, as in `Terrain`: uint8 of shape (ny, nx), (ny, nx, 3) or (ny, nx, 4), red, green, blue and
+        opacity; uint16 or, not for .png, float32 or float64 of shape (ny, nx).
+      like: the terrain, which says where the map lies.
+      nodata: the value that means that there is none, for .tif.
+
+    Raises:
+      FileNotFoundError, PermissionError, ValueError: as `require_writable_raster`; or `values` are of another shape or kind.
+    """
+    path = require_writable_raster(path)
+    values = np.asarray(values)
+    ending = path.suffix.lower()
+    kinds = (np.uint8, np.uint16) if ending == ".png" else (np.uint8, np.uint16, np.float32, np.float64)
+    channels = ((), (3,), (4,)) if values.dtype == np.uint8 else ((),)
+    if values.dtype not in kinds:
+        known = ", ".join(np.dtype(kind).name for kind in kinds)
+        raise ArgumentError("save_raster", "values", f"must be of {known} for {ending}, they are {values.dtype}")
+    if values.shape[:2] != like.heights.shape or values.shape[2:] not in channels:
+        raise ArgumentError(
+            "save_raster", "values", f"must have the terrain's shape, {like.heights.shape}, theirs is {values.shape}"
+        )
+    with contextlib.ExitStack() as files:
+        temporary = files.enter_context(replacing(path))
+        if ending == ".npy":
+            write_npy(temporary, values)
+        elif ending == ".png":
+            write_png(temporary, values[::-1])
+            files.enter_context(replacing(path.with_suffix(".pgw"))).write_text(world_file(like), encoding="ascii")
+        else:
+            temporary.write_bytes(geotiff(values, like, nodata))
+
+
+def world_file(terrain: Terrain) -> str:
+    """ESRI's world file: the pixel's width, two rotations, minus its height, and the centre of the north-western pixel."""
+    dx, dy, x0, y0 = terrain.in_file
+    numbers = dx, 0.0, 0.0, -dy, x0, y0 + (len(terrain.heights) - 1) * dy
+    return "".join(f"{number!r}\n" for number in numbers)
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    import imageio.v3 as imageio
+
+    with path.open("wb") as file:
+        imageio.imwrite(file, np.ascontiguousarray(pixels), plugin="pillow", extension=".png")
+
+
+def geotiff(values: np.ndarray, like: Terrain, nodata: float | None) -> memoryview:
+    """The bytes of a GeoTIFF; see `save_raster`. In memory first, as GDAL does not always say that a disk is full."""
+    rasterio = import_extra("rasterio", "writing .tif needs", "geo")
+    dx, dy, x0, y0 = like.in_file
+    place = like.georeference or Georeference(point=True)
+    bands = values[::-1, :, None] if values.ndim == 2 else values[::-1]
+    ny, nx, count = bands.shape
+    profile = {
+        "driver": "GTiff", "width": nx, "height": ny, "count": count, "dtype": values.dtype, "nodata": nodata,
+        "crs": rasterio.crs.CRS.from_wkt(place.wkt) if place.wkt else None,
+        "transform": rasterio.Affine(dx, 0, x0 - dx / 2, 0, -dy, y0 + (ny - 0.5) * dy),
+        "photometric": "rgb" if count > 1 else "minisblack", "interleave": "pixel", "bigtiff": "if_safer",
+    }  # fmt: skip
+    with warnings.catch_warnings(), rasterio.io.MemoryFile() as memory:
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # pixels of 1 x 1 in a corner at 0, 0
+        with memory.open(**profile) as dataset:
+            dataset.update_tags(AREA_OR_POINT="Point" if place.point else "Area")
+            dataset.write(np.moveaxis(bands, -1, 0))
+        return memoryview(memory.read())
