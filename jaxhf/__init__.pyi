@@ -10,6 +10,7 @@ from .io.load_terrain import jacksboro as jacksboro, load_heights as load_height
 from .io.save_terrain import save_heights as save_heights
 from .io.scenes import load_scene as load_scene
 from .io.terrain import Terrain as Terrain
+from .maps.skyview import horizon as horizon, sky_view as sky_view
 from .rendering.aovs import AOVS as AOVS
 from .rendering.cast import cast as cast
 from .rendering.render import Prepared as Prepared, prepare as prepare, render as render

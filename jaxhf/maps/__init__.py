@@ -1,0 +1,1 @@
+"""Maps of terrain: shades, slopes, tints and shadows on arrays, in NumPy."""
