@@ -57,7 +57,7 @@ def test_horizon_is_that_of_every_crossing(dtype, lowest, tolerance):
 
 
 def test_closed_forms():
-    """A plane, a valley and a pit with a flat floor, in degrees; the sky that an inclined plane sees."""
+    """A plane, a valley, a pit with a flat floor, a far wall a little above a near one; the sky that an inclined plane sees."""
     a = np.deg2rad(AZIMUTHS)[:, None, None]
     plane = np.asarray(jaxhf.horizon(0.5 * X - 0.2 * Y, AZIMUTHS))[:, 1:-1, 1:-1]
     slope = 0.5 * np.sin(a) - 0.2 * np.cos(a)
@@ -66,6 +66,8 @@ def test_closed_forms():
     np.testing.assert_allclose(valley, np.rad2deg(np.arctan(0.7 * np.abs(np.sin(a[:, 0, 0])))), atol=1e-9)
     pit = np.asarray(jaxhf.horizon(np.where(np.hypot(X - 36, Y - 20) < 17.5, -12.0, 0.0), AZIMUTHS))[:, 20, 36]
     assert np.all((pit > np.rad2deg(np.arctan(12 / 19))) & (pit < np.rad2deg(np.arctan(12 / 17))))
+    walls = np.asarray(jaxhf.horizon(np.where(X == 20, 6.0, np.where(X == 33, 33 * 0.302, 0.0)), AZIMUTHS))[2, :, 0]
+    np.testing.assert_allclose(walls, np.rad2deg(np.arctan(0.302)), atol=1e-9)
     seen = jaxhf.sky_view(0.5 * X - 0.2 * Y, 32, weighting="slope")[1:-1, 1:-1]
     np.testing.assert_allclose(seen, (1 + 1 / np.sqrt(1.29)) / 2, atol=1e-3)
 
