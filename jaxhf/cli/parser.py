@@ -4,7 +4,7 @@ import argparse
 from typing import NoReturn
 
 from ..core.version import __version__
-from . import convert, fit, hillshade, info, render, tradeoff
+from . import convert, fit, hillshade, horizon, info, render, skyview, tradeoff
 
 
 class _Parser(argparse.ArgumentParser):
@@ -16,6 +16,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jaxhf", description="Renders heightfields, and recovers them from pictures.")
     parser.add_argument("--version", action="version", version=f"jaxhf {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (render, fit, hillshade, convert, info, tradeoff):
+    for command in (render, fit, hillshade, skyview, horizon, convert, info, tradeoff):
         command.add(commands)
     return parser
