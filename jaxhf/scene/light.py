@@ -98,19 +98,24 @@ class Sky(eqx.Module):
 
     A surface tilted by beta against the horizontal sees the share (1 + cos beta) / 2 of the sky, the isotropic sky of
     Liu and Jordan (The interrelationship and characteristic distribution of direct, diffuse and total solar radiation,
-    Solar Energy 4(3), 1960). It is not shadowed by other terrain, which would have to be sampled.
+    Solar Energy 4(3), 1960). Other terrain hides none of it unless `occlusion` is given.
 
     Attributes:
       radiance: one number or (r, g, b).
+      occlusion: in how many azimuths, at even steps, each heightfield hides the sky from its own upper side, see `horizon`: 16
+        are good for some per cent. The visible sky is computed at the vertices and interpolated between them. None: in none.
     """
 
     radiance: VectorLeaf = eqx.field(converter=rgb_leaf)
+    occlusion: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         _require_vector("Sky", "radiance", self.radiance)
+        if self.occlusion is not None and (type(self.occlusion) is not int or self.occlusion < 1):
+            raise ArgumentError("Sky", "occlusion", f"must be a whole number from 1 on, or None, it is {self.occlusion!r}")
 
     def __repr__(self) -> str:
-        return fields(self)
+        return fields(self).replace(", occlusion=None)", ")")
 
 
 Light = Directional | Point | Sky

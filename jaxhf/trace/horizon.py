@@ -19,8 +19,9 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
-from ..core.devices import map_over
+from ..core.devices import local_mesh, map_over
 from ..core.types import Index, Scalar
+from .grid import Grid
 
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
 _TILE = 32  # vertices along its side
@@ -87,6 +88,16 @@ def sky_vector(slopes: Float[jax.Array, "k *at"]) -> Float[jax.Array, "3 *at"]:
             jnp.mean(square, 0),
         ]
     )
+
+
+def visible_sky(grid: Grid, azimuths: int) -> Float[jax.Array, "vertices 3"]:
+    """`sky_vector` at the vertices of a grid, world frame; its z axis must be upright there. Differentiable in the heights."""
+    z, linear = grid.z, grid.world_from_grid.linear
+    level = jnp.asarray(cell_directions(even_azimuths(azimuths), 1.0, 1.0, z.dtype))
+    directions = lax.stop_gradient(level @ grid.grid_from_world.linear[:2, :2].T)
+    flat = jnp.zeros((), z.dtype)
+    seen = over_horizon(sky_vector, local_mesh(1), z * linear[2, 2], directions, flat)
+    return jnp.moveaxis(seen, 0, -1).reshape(-1, 3)
 
 
 def _crossings(shape: tuple[int, int], direction: Float[jax.Array, "2"]) -> _Crossings:

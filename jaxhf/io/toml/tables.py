@@ -101,7 +101,7 @@ LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
         },
     ),
     "point": (_point, {"position": Key(numbers(3)), "intensity": Key(colour)}),
-    "sky": (Sky, {"radiance": Key(colour)}),
+    "sky": (Sky, {"radiance": Key(colour), "occlusion": Key(whole, None)}),
 }
 MATERIALS: dict[str, tuple[Callable[..., Material], Keys]] = {
     "matte": (Matte, {"albedo": Key(or_word(colour, ", or the name of a texture"), 0.7)}),
