@@ -175,7 +175,7 @@ def _searched(
     def one_tile(shared: tuple["_View", Scalar], number: Index) -> tuple[jax.Array, jax.Array | None]:
         view, lowest = shared
         x, y = (number % columns) * _TILE, (number // columns) * _TILE
-        ways = view.crossings, view.bounds, view.begins, view.end, view.first_window
+        ways = jnp.arange(view.end.shape[0], dtype=jnp.int32)
         slopes, found = lax.map(lambda way: _from_tile(view, way, x, y, lowest, numbered), ways)
         return summary(slopes), found
 
@@ -234,15 +234,14 @@ class _View(eqx.Module):
 
 
 def _from_tile(
-    view: _View,
-    way: tuple[_Crossings, jax.Array, jax.Array, Scalar, jax.Array],
-    x: Index,
-    y: Index,
-    lowest: Scalar,
-    numbered: bool,
+    view: _View, way: Index, x: Index, y: Index, lowest: Scalar, numbered: bool
 ) -> tuple[Float[jax.Array, "tile tile"], Int[jax.Array, "tile tile"] | None]:
-    """Slopes in one direction from the vertices of the tile that begins at (x, y), and the entries of what was found."""
-    crossings, bounds, begins, end, first = way
+    """Slopes in one direction from the vertices of the tile that begins at (x, y), and the entries of what was found.
+
+    The crossings of all directions are handed on and looked up one by one: those of one would be copied for each tile.
+    """
+    bounds, begins, end, first = (values[way] for values in (view.bounds, view.begins, view.end, view.first_window))
+    crossings = view.crossings
     stretches = first.shape[0]
 
     def moved(heights: jax.Array, by_x: Index, by_y: Index) -> jax.Array:
@@ -267,9 +266,10 @@ def _from_tile(
         slopes, found = carry
         for k in range(_TOGETHER):
             n = group * _TOGETHER + k
-            low = moved_edges(crossings.kind[n], crossings.x[n], crossings.y[n])
-            high = moved(view.heights, crossings.x2[n], crossings.y2[n])
-            slope = ((low - z) + crossings.share[n] * (high - low)) * crossings.inverse[n]
+            at = way, n
+            low = moved_edges(crossings.kind[at], crossings.x[at], crossings.y[at])
+            high = moved(view.heights, crossings.x2[at], crossings.y2[at])
+            slope = ((low - z) + crossings.share[at] * (high - low)) * crossings.inverse[at]
             steeper = slope > slopes  # never where it is nan
             slopes = jnp.where(steeper, slope, slopes)
             found = None if found is None else jnp.where(steeper, n, found)
