@@ -184,6 +184,12 @@ def test_directional_lights(tmp_path, text, towards):
     np.testing.assert_array_equal(light.irradiance, (np.pi,) * 3)
 
 
+def test_a_sky_that_terrain_hides(tmp_path):
+    (sky,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "sky"\nradiance = 1\nocclusion = 8\n{FIELD}').lights
+    assert isinstance(sky, Sky)
+    assert sky.occlusion == 8
+
+
 def test_the_old_name_of_irradiance(tmp_path):
     with pytest.warns(DeprecationWarning, match=r"scene\.toml:8: lights\[0\]\.radiance is now called irradiance$"):
         (light,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "directional"\nradiance = [1, 2, 3]\n{FIELD}').lights
