@@ -13,6 +13,7 @@ from .io.scenes import load_scene as load_scene
 from .io.terrain import Terrain as Terrain
 from .maps.hillshade import hillshade as hillshade
 from .maps.relief import color_relief as color_relief, relief as relief
+from .maps.skyview import horizon as horizon, sky_view as sky_view
 from .maps.slope import aspect as aspect, slope as slope
 from .rendering.aovs import AOVS as AOVS
 from .rendering.cast import cast as cast
@@ -24,6 +25,7 @@ from .scene.light import Directional as Directional, Point as Point, Sky as Sky
 from .scene.material import Matte as Matte, Mirror as Mirror
 from .scene.scene import Object as Object, Scene as Scene
 from .scene.skirt import Skirt as Skirt
+from .scene.sun import sun as sun
 from .scene.texture import ImageTexture as ImageTexture
 from .trace.hit import Hit as Hit
 from .trace.normals import vertex_normals as vertex_normals

@@ -4,7 +4,7 @@ import argparse
 from typing import NoReturn
 
 from ..core.version import __version__
-from . import aspect, convert, fit, hillshade, info, relief, render, slope, tradeoff, view
+from . import aspect, convert, fit, hillshade, horizon, info, relief, render, skyview, slope, tradeoff, view
 
 
 class _Parser(argparse.ArgumentParser):
@@ -16,6 +16,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser = _Parser(prog="jaxhf", description="Renders heightfields, and recovers them from pictures.")
     parser.add_argument("--version", action="version", version=f"jaxhf {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for command in (view, render, fit, hillshade, slope, aspect, relief, convert, info, tradeoff):
+    for command in (view, render, fit, hillshade, slope, aspect, relief, skyview, horizon, convert, info, tradeoff):
         command.add(commands)
     return parser

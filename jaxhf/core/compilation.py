@@ -46,7 +46,9 @@ def compiler_options() -> dict[str, Any] | None:
     return _OPTIONS
 
 
-def compiled(fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, **options: Any) -> Callable[..., Any]:
+def compiled(
+    fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, newer: bool = False, **options: Any
+) -> Callable[..., Any]:
     """`jit(fun, **options)`, with `compiler_options` where it is called as it is, not as part of another program.
 
     JAX allows them only there; a program round this one may be compiled with them by its own `jax.jit`.
@@ -54,17 +56,22 @@ def compiled(fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, **optio
     Args:
       fun: to be compiled.
       jit: `jax.jit`, or `equinox.filter_jit`.
+      newer: with XLA's newer emitters: passes over tiles of a grid run 3 to 4 times as fast with them.
       options: of `jit`.
     """
+
+    def chosen() -> dict[str, Any] | None:
+        return None if newer else compiler_options()
+
     inside = jit(fun, **options)
 
     @functools.cache
     def alone() -> Callable[..., Any]:
-        return jit(fun, compiler_options=compiler_options(), **options)
+        return jit(fun, compiler_options=chosen(), **options)
 
     @functools.cache
     def kept() -> Kept:
-        return Kept(fun, lambda flat: jit(flat, compiler_options=compiler_options()), options.get("static_argnames", ()))
+        return Kept(fun, lambda flat: jit(flat, compiler_options=chosen()), options.get("static_argnames", ()))
 
     @functools.wraps(fun)
     def call(*args: Any, **kwargs: Any) -> Any:

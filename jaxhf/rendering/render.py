@@ -58,7 +58,8 @@ def prepare(scene: Scene, settings: Settings | None = None, *, mesh: Mesh | None
     The arguments are those of `render`.
     """
     settings, mesh = resolve_settings(settings or Settings(), scene), local_mesh() if mesh is None else mesh
-    return Prepared(scene, mesh, _make_world(on_every_device(localise(scene), mesh), settings=settings))
+    make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
+    return Prepared(scene, mesh, make(on_every_device(localise(scene), mesh), settings=settings))
 
 
 def render(
@@ -97,7 +98,7 @@ def render(
     for name in aovs:
         if name not in AOVS:
             raise ArgumentError("render", "aovs", f"must be among {', '.join(AOVS)}; one is {name!r}")
-    if not isinstance(scene, Prepared) and progress is not None:
+    if not isinstance(scene, Prepared) and (progress is not None or scene.sky_occlusion is not None):
         scene, settings = prepare(scene, settings, mesh=mesh), None
     if isinstance(scene, Prepared):
         if mesh is not None and mesh != scene.mesh:
@@ -182,6 +183,7 @@ def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, 
 _trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh"))
 _trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
 _make_world = compiled(make_world, static_argnames=("settings",))
+_make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
 
 
 def _trace_in_parts(

@@ -10,6 +10,7 @@ import numpy as np
 from ..core.errors import ArgumentError
 from ..core.types import VectorLeaf, float_leaf, require_finite, rgb_leaf
 from .show import fields
+from .sun import sun
 
 
 class Directional(eqx.Module):
@@ -53,6 +54,25 @@ class Directional(eqx.Module):
         towards = xp.stack([xp.sin(a) * xp.cos(h), xp.cos(a) * xp.cos(h), xp.sin(h)])
         return cls(towards, _chosen(irradiance, radiance, 3))
 
+    @classmethod
+    def at(cls, time: Any, latitude: Any, longitude: Any, irradiance: Any = None, *, refraction: bool = False) -> "Directional":
+        """Light from where the sun stands at a time and place; y counts as true north.
+
+        Args:
+          time, latitude, longitude, refraction: one of each, as for `sun`.
+          irradiance: as for the class; it does not depend on the altitude.
+
+        Raises:
+          ValueError: the sun is not above the horizon, or `sun` raises it.
+        """
+        azimuth, altitude = sun(time, latitude, longitude, refraction=refraction)
+        if np.ndim(altitude):
+            raise ArgumentError("Directional", "time", f"and place must be one of each, they make {np.size(altitude)} lights")
+        if not altitude > 0:
+            rule = f"must be one at which the sun is up, its altitude is {altitude:.2f} degrees at {time}"
+            raise ArgumentError("Directional", "time", rule)
+        return cls.from_angles(azimuth, altitude, irradiance)
+
 
 class Point(eqx.Module):
     """A point that shines equally in every direction.
@@ -78,19 +98,24 @@ class Sky(eqx.Module):
 
     A surface tilted by beta against the horizontal sees the share (1 + cos beta) / 2 of the sky, the isotropic sky of
     Liu and Jordan (The interrelationship and characteristic distribution of direct, diffuse and total solar radiation,
-    Solar Energy 4(3), 1960). It is not shadowed by other terrain, which would have to be sampled.
+    Solar Energy 4(3), 1960). Other terrain hides none of it unless `occlusion` is given.
 
     Attributes:
       radiance: one number or (r, g, b).
+      occlusion: in how many azimuths, at even steps, each heightfield hides the sky from its own upper side, see `horizon`: 16
+        are good for some per cent. The visible sky is computed at the vertices and interpolated between them. None: in none.
     """
 
     radiance: VectorLeaf = eqx.field(converter=rgb_leaf)
+    occlusion: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         _require_vector("Sky", "radiance", self.radiance)
+        if self.occlusion is not None and (type(self.occlusion) is not int or self.occlusion < 1):
+            raise ArgumentError("Sky", "occlusion", f"must be a whole number from 1 on, or None, it is {self.occlusion!r}")
 
     def __repr__(self) -> str:
-        return fields(self)
+        return fields(self).replace(", occlusion=None)", ")")
 
 
 Light = Directional | Point | Sky

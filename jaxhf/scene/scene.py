@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from ..core.affine import require_invertible
@@ -79,8 +80,18 @@ class Scene(eqx.Module):
                     raise ArgumentError("Scene", name, f"does not take a {type(value).__name__}")
         if sum(isinstance(light, Sky) for light in self.lights) > 1:
             raise ArgumentError("Scene", "lights", "may hold one Sky, they hold more")
+        if self.sky_occlusion is not None:
+            for number, obj in enumerate(self.objects):
+                if isinstance(obj.shape, Heightfield) and not _upright(obj.world_from_object):
+                    rule = "must keep heights upright under a Sky with occlusion"
+                    raise ArgumentError("Scene", f"objects[{number}].world_from_object", rule)
         if not isinstance(self.samples, int) or self.samples < 1:
             raise ArgumentError("Scene", "samples", f"must be a whole number from 1 on, it is {self.samples!r}")
+
+    @property
+    def sky_occlusion(self) -> int | None:
+        """That of the `Sky` among the lights; None where there is none."""
+        return next((light.occlusion for light in self.lights if isinstance(light, Sky)), None)
 
     @property
     def heightfields(self) -> tuple[Heightfield, ...]:
@@ -112,3 +123,11 @@ class Scene(eqx.Module):
         if new.shape != old.shape:
             raise ArgumentError("with_heights", "heights", f"must keep their shape {old.shape}, theirs is {new.shape}")
         return eqx.tree_at(lambda scene: scene.heightfields[0].heights, self, new)
+
+
+def _upright(world: MatrixLeaf | None) -> bool:
+    """Whether the object's vertical and horizontal directions are the world's; taken for granted of a traced matrix."""
+    if world is None or not isinstance(world, np.ndarray):
+        return True
+    size = 1e-6 * np.abs(world[:3, :3]).max()
+    return bool(world[2, 2] > 0 and max(abs(world[0, 2]), abs(world[1, 2]), abs(world[2, 0]), abs(world[2, 1])) <= size)

@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
@@ -10,7 +10,10 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, largest_component, unit
 from ..scene.light import Directional, Point, Sky
+from ..trace.grid import Grid
 from ..trace.hit import Hit
+from ..trace.triangle import triangle_corners
+from ..trace.walk_start import place_on_grid
 from ..trace.world import World, unblocked
 
 # A cosine below this is rounded off; 0.6 degrees from the horizon of the shading normal.
@@ -22,10 +25,25 @@ def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vecto
     light = world.lights[number]
     if isinstance(light, Sky):
         cosine = hit.ns[2] * hit.side.astype(hit.ns.dtype)
-        return light.radiance * (jnp.pi * (1 + cosine) / 2), jnp.zeros((), jnp.int32)
+        share = (1 + cosine) / 2
+        for k, grid, _ in world.grids:
+            seen = world.sky[k]
+            if seen is not None:
+                share = jnp.where((hit.object == k) & (hit.side > 0), _seen_share(grid, seen, hit), share)
+        return light.radiance * (jnp.pi * share), jnp.zeros((), jnp.int32)
     wi, arriving, distance = materialise(_towards(light, hit.p))
     lit, exhausted = _visible(number, world, wi, distance, hit, active)
     return jnp.where(lit, arriving * _cosine(world, wi, hit), 0), exhausted
+
+
+def _seen_share(grid: Grid, sky: Float[jax.Array, "_ 3"], hit: Hit) -> Scalar:
+    """Of an even sky's light, what arrives at the upper side; from the visible sky at the vertices, see `sky_vector`."""
+    ix, iy, x, y = place_on_grid(grid, hit)
+    upper = hit.triangle == 1
+    first, between, last = triangle_corners(sky, grid.shape[1], ix, iy, upper)
+    u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
+    on_first, on_last = jnp.where(upper, v, u), jnp.where(upper, u, v)
+    return jnp.maximum(dot(first + on_first * (between - first) + on_last * (last - between), hit.ns), 0)
 
 
 def unshadowed_irradiance(world: World, light: Directional | Point, hit: Hit) -> Vector:

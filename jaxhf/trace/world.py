@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Float
 
 from ..core.affine import affine
 from ..core.masked import only_where
@@ -25,6 +26,7 @@ from .ceiling import Ceiling, clears, make_ceiling
 from .cylinder import make_tube
 from .grid import Grid, make_grid
 from .hit import Hit
+from .horizon import visible_sky
 from .intersect import Surface, blocked, intersect
 from .skirt import make_walls
 from .status import Status
@@ -39,6 +41,8 @@ class World(eqx.Module):
       lights: as the scene's.
       ceilings: for each light and each object, where that object cannot keep the light from itself; None for all but a
         heightfield under a directional light, and where no walk is to be spared.
+      sky: for each object, what it leaves to see of the sky at its vertices, see `visible_sky`; None for all but heightfields,
+        and where no sky is hidden.
       settings: nothing in them is left to the scene, see `resolve_settings`.
     """
 
@@ -46,6 +50,7 @@ class World(eqx.Module):
     materials: tuple[Material, ...]
     lights: tuple[Light, ...]
     ceilings: tuple[tuple[Ceiling | None, ...], ...]
+    sky: tuple[Float[jax.Array, "_ 3"] | None, ...]
     settings: Settings = eqx.field(static=True)
 
     @property
@@ -76,8 +81,14 @@ def make_world(scene: Scene, settings: Settings) -> World:
         materials=tuple(obj.material for obj in scene.objects),
         lights=scene.lights,
         ceilings=tuple(tuple(_make_ceiling(surface, light, spared) for surface in surfaces) for light in scene.lights),
+        sky=tuple(_visible_sky(surface, scene) for surface in surfaces),
         settings=settings,
     )
+
+
+def _visible_sky(surface: Surface, scene: Scene) -> Float[jax.Array, "_ 3"] | None:
+    azimuths = scene.sky_occlusion
+    return None if azimuths is None or not isinstance(surface, Grid) else visible_sky(surface, azimuths)
 
 
 def _make_ceiling(surface: Surface, light: Light, wanted: bool) -> Ceiling | None:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 
 import jax
@@ -44,6 +45,7 @@ FIELD = """
 shape = "heightfield"
 heights = [[0, 1], [2, 3], [4, 5]]
 """
+BY_DATE = "time = 2026-06-21T12:00:00Z\nlatitude = 46.5\nlongitude = 8"
 
 
 def read(tmp_path, text, **arguments):
@@ -171,6 +173,7 @@ def test_every_part_of_a_scene(tmp_path):
         ("", (-0.5, 0.5, np.sqrt(0.5))),
         ("azimuth = 90\naltitude = 0", (1, 0, 0)),
         ("azimuth = 180", (0, -np.sqrt(0.5), np.sqrt(0.5))),
+        (BY_DATE, Directional.at(datetime(2026, 6, 21, 12, tzinfo=UTC), 46.5, 8).towards),
         ("towards = [0, 0, 2]", (0, 0, 2)),
     ],
 )
@@ -179,6 +182,12 @@ def test_directional_lights(tmp_path, text, towards):
     assert isinstance(light, Directional)
     np.testing.assert_allclose(light.towards, towards, atol=1e-15)
     np.testing.assert_array_equal(light.irradiance, (np.pi,) * 3)
+
+
+def test_a_sky_that_terrain_hides(tmp_path):
+    (sky,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "sky"\nradiance = 1\nocclusion = 8\n{FIELD}').lights
+    assert isinstance(sky, Sky)
+    assert sky.occlusion == 8
 
 
 def test_the_old_name_of_irradiance(tmp_path):
@@ -410,6 +419,10 @@ MISTAKES = [
     (view(PINHOLE), 5, "camera must have 'fy', it is missing"),
     (light('type = "directional"\ntowards = [0, 0, 0]'), 12, "lights[0].towards must not be zero"),
     (light('type = "directional"\ntowards = [0, 0, 1]\nazimuth = 3'), 12, "towards must stand without azimuth and altitude"),
+    (light(f'type = "directional"\n{BY_DATE}\nazimuth = 3'), 15, "azimuth must stand without time and latitude and long"),
+    (light(f'type = "directional"\n{BY_DATE.replace("T12", "T23")}'), 12, "time must be one at which the sun is up, its al"),
+    (light(f'type = "directional"\n{BY_DATE.replace("Z", "")}'), 12, "time must be a date and time with its offset from UTC"),
+    (light('type = "directional"\nlatitude = 3'), 10, "time must be given with time, latitude and longitude, it is missing"),
     (light('type = "sky"\nradiance = 1\n[[lights]]\ntype = "sky"\nradiance = 1'), 10, "lights may hold one Sky"),
     (f'{CAMERA}[[objects]]\nshape = "cylinder"\nradius = -1', 8, "objects[0].radius must be positive, it is -1.0"),
     (f'{CAMERA}[[objects]]\nshape = "cylinder"\nz_min = 3', 8, "objects[0].z_min must lie below z_max, they are 3.0 and 1.0"),

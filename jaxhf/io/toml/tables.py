@@ -12,6 +12,7 @@ from .. import procedural
 from .values import (
     colour,
     grid,
+    instant,
     matrix,
     number,
     numbers,
@@ -36,17 +37,23 @@ class Key(NamedTuple):
 Keys = Mapping[str, Key]
 
 
-def _directional(towards, azimuth, altitude, irradiance, radiance) -> Directional:
+def _directional(irradiance, radiance, **direction) -> Directional:
     if irradiance is not None and radiance is not None:
         raise ArgumentError("", "radiance", "must stand without irradiance, whose old name it is")
     irradiance = radiance if irradiance is None else irradiance
-    if towards is None:
-        return Directional.from_angles(
-            315.0 if azimuth is None else azimuth, 45.0 if altitude is None else altitude, irradiance
-        )
-    if azimuth is not None or altitude is not None:
-        raise ArgumentError("", "towards", "must stand without azimuth and altitude, it says the same")
-    return Directional(towards, irradiance)
+    given = {name: value for name, value in direction.items() if value is not None}
+    ways = [keys for keys in (("towards",), ("azimuth", "altitude"), ("time", "latitude", "longitude")) if given.keys() & keys]
+    if len(ways) > 1:
+        first, *_ = given.keys() & ways[0]
+        raise ArgumentError("", first, f"must stand without {' and '.join(ways[1])}, it says the same")
+    if "towards" in given:
+        return Directional(given["towards"], irradiance)
+    if "time" in given or "latitude" in given or "longitude" in given:
+        for name in ("time", "latitude", "longitude"):
+            if name not in given:
+                raise ArgumentError("", name, "must be given with time, latitude and longitude, it is missing")
+        return Directional.at(**given, irradiance=irradiance)
+    return Directional.from_angles(**given, irradiance=irradiance)
 
 
 def _point(position, intensity) -> Point:
@@ -87,12 +94,14 @@ LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
             "towards": Key(numbers(3), None),
             "azimuth": Key(number, None),
             "altitude": Key(number, None),
+            "time": Key(instant, None),
+            **{name: Key(number, None) for name in ("latitude", "longitude")},
             "irradiance": Key(colour, None),
             "radiance": Key(colour, None),  # the old name of irradiance
         },
     ),
     "point": (_point, {"position": Key(numbers(3)), "intensity": Key(colour)}),
-    "sky": (Sky, {"radiance": Key(colour)}),
+    "sky": (Sky, {"radiance": Key(colour), "occlusion": Key(whole, None)}),
 }
 MATERIALS: dict[str, tuple[Callable[..., Material], Keys]] = {
     "matte": (Matte, {"albedo": Key(or_word(colour, ", or the name of a texture"), 0.7)}),

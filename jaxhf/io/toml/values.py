@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,12 @@ def number(value: Any) -> float:
 def whole(value: Any) -> int:
     if not _is_whole(value):
         raise ValueError("a whole number")
+    return value
+
+
+def instant(value: Any) -> datetime:
+    if not isinstance(value, datetime) or value.tzinfo is None:
+        raise ValueError("a date and time with its offset from UTC, without quotes, such as 2026-06-21T12:00:00Z")
     return value
 
 

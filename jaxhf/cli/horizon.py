@@ -1,0 +1,64 @@
+"""`jaxhf horizon`: how high the terrain stands round each of its points, direction by direction."""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from . import arguments, interruption
+from .skyview import add_terrain, read
+
+_EXAMPLES = """examples:
+  jaxhf horizon dem.tif -o horizon.npy --azimuths 36
+  jaxhf horizon dem.tif -o west.tif --azimuth 270"""
+
+
+def add(commands: Any) -> None:
+    about = "Map horizon angles, in degrees above the horizontal, at least 0: exact and without a search radius."
+    command = commands.add_parser(
+        "horizon", help="map the horizon angles of a terrain", description=about, epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    add_terrain(command, "the map: .npy of shape (azimuths, rows, columns), or .tif, one file an azimuth: OUT_090.tif")
+    command.add_argument("--azimuth", type=float, metavar="DEGREES", help="one direction, from north, clockwise, in its place")
+    command.set_defaults(run=run)
+
+
+def run(options: argparse.Namespace) -> None:
+    import numpy as np
+
+    from ..core.errors import ArgumentError
+    from ..io.files import replacing, write_npy
+    from ..io.rasters import require_writable_raster, save_raster
+
+    path = Path(options.output)
+    if path.suffix.lower() == ".png":
+        raise ArgumentError("", "--output", f"must end in .tif or .npy, as angles are not bytes, it is {path}")
+    require_writable_raster(path)
+    if options.azimuth is not None and not np.isfinite(options.azimuth):
+        raise ArgumentError("", "--azimuth", f"must be finite, it is {options.azimuth}")
+    stored, terrain = read(options)
+    arguments.set_up_jax(options)
+    from ..maps.skyview import horizon
+    from ..trace.horizon import even_azimuths
+
+    begin = time.perf_counter()
+    azimuths = even_azimuths(options.azimuths) if options.azimuth is None else np.array([options.azimuth])
+    whole = path.suffix.lower() == ".npy" and len(azimuths) > 1
+    maps, highest = [], 0.0
+    for azimuth in azimuths:
+        (angles,) = np.asarray(horizon(terrain, [azimuth]))
+        highest = max(highest, float(np.nanmax(angles)))
+        if whole:
+            maps.append(angles)
+            continue
+        interruption.raise_from_now_on()
+        degrees = f"{azimuth:03.0f}" if azimuth == round(azimuth) else f"{azimuth:06.2f}"
+        one = path if options.azimuth is not None else path.with_name(f"{path.stem}_{degrees}{path.suffix}")
+        save_raster(one, angles, stored, nodata=np.nan)
+    if whole:
+        interruption.raise_from_now_on()
+        with replacing(path) as temporary:
+            write_npy(temporary, np.stack(maps))
+    took = time.perf_counter() - begin
+    print(f"{path}: horizon angles up to {highest:.2f} degrees, {len(azimuths)} azimuths, {took:.1f} s")

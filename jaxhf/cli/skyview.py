@@ -1,0 +1,76 @@
+"""`jaxhf skyview`: how much of the sky the terrain leaves to see, as a map."""
+
+import argparse
+import time
+from typing import TYPE_CHECKING, Any
+
+from . import arguments, interruption
+
+if TYPE_CHECKING:
+    from ..io.terrain import Terrain
+
+_EXAMPLES = """examples:
+  jaxhf skyview dem.tif -o sky.tif
+  jaxhf skyview dem.tif -o sky.png --azimuths 64 --weighting slope"""
+
+
+def add(commands: Any) -> None:
+    about = "Map the sky-view factor: the share of the sky that the terrain leaves to see, exact and without a search radius."
+    command = commands.add_parser(
+        "skyview", help="map the sky-view factor of a terrain", description=about, epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    add_terrain(command, "the map: .tif or .npy (0 to 1), or .png (0 to 255)")
+    command.add_argument(
+        "--weighting", choices=("solid-angle", "horizontal", "slope"), default="solid-angle",
+        help="share of the sky's solid angle, or of its light on horizontal ground or on the slope [solid-angle]",
+    )  # fmt: skip
+    command.set_defaults(run=run)
+
+
+def add_terrain(command: argparse.ArgumentParser, output: str) -> None:
+    """What `jaxhf skyview` and `jaxhf horizon` have in common."""
+    command.add_argument("terrain", metavar="IN", help="heights: GeoTIFF and others, see jaxhf info")
+    command.add_argument("-o", "--output", required=True, metavar="OUT", help=output)
+    command.add_argument("--azimuths", type=int, default=32, metavar="K", help="directions, at even steps from north on [32]")
+    arguments.add_raster(command)
+    arguments.add_machine(command)
+
+
+def read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
+    """The terrain as the file places it, and in metres, in the precision that is asked for."""
+    import dataclasses
+
+    from ..core.errors import ArgumentError, UserError
+    from ..io.errors import FileError
+    from ..io.load_terrain import read_terrain
+
+    if options.azimuths < 1:
+        raise ArgumentError("", "--azimuths", f"must be a whole number from 1 on, it is {options.azimuths}")
+    stored = read_terrain(options.terrain, options.z_scale, options.nodata)
+    if stored.nodata.all():
+        raise UserError(f"{options.terrain}: there is no height in it")
+    stored = dataclasses.replace(stored, heights=stored.heights.astype(options.precision))
+    try:
+        return stored, stored.in_metres()
+    except FileError as error:
+        raise FileError(f"{options.terrain}: {error}") from error
+
+
+def run(options: argparse.Namespace) -> None:
+    import numpy as np
+
+    from ..io.rasters import require_writable_raster, save_raster
+
+    path = require_writable_raster(options.output)
+    stored, terrain = read(options)
+    arguments.set_up_jax(options)
+    from ..maps.skyview import sky_view
+
+    begin = time.perf_counter()
+    seen = np.asarray(sky_view(terrain, options.azimuths, weighting=options.weighting))
+    took = time.perf_counter() - begin
+    values = np.rint(255 * np.nan_to_num(np.clip(seen, 0, 1))).astype(np.uint8) if path.suffix.lower() == ".png" else seen
+    interruption.raise_from_now_on()
+    save_raster(path, values, stored, nodata=None if values.dtype == np.uint8 else np.nan)
+    print(f"{path}: sky-view factor {np.nanmin(seen):.3f} .. {np.nanmax(seen):.3f}, {options.azimuths} azimuths, {took:.1f} s")

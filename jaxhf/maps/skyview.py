@@ -1,0 +1,143 @@
+"""How high the terrain stands round each of its points, and how much of the sky it leaves to see."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Float
+
+from ..core.compilation import compiled
+from ..core.devices import local_mesh, on_every_device
+from ..core.errors import ArgumentError
+from ..io.terrain import Terrain
+from ..scene.heightfield import Heightfield
+from ..trace.horizon import Summary, cell_directions, even_azimuths, over_horizon, sky_vector
+from ..trace.normals import vertex_normals
+
+
+def horizon(
+    terrain: Any,
+    azimuths: Any = 32,
+    *,
+    dx: float | None = None,
+    dy: float | None = None,
+    lowest: float = 0.0,
+    mesh: Mesh | None = None,
+) -> Float[jax.Array, "k ny nx"]:
+    """The horizon angle at each vertex, in degrees: how high the terrain rises above the horizontal in a direction.
+
+    Exact on the surface that is rendered, two triangles to a cell, to the end of the terrain: there is no search radius. The
+    earth's curvature does not count. Differentiable in the heights: the angle moves with the point that makes the horizon.
+
+    Args:
+      terrain: a `Terrain` (degrees count as metres, see `load_heights`), a `Heightfield`, or heights, shape (ny, nx), row 0 in
+        the south, nan where there is none.
+      azimuths: degrees clockwise from north (y), shape (k,); or how many, from north on at even steps.
+      dx, dy: cell size of heights given as an array, in the unit of the heights, 1 if not given; dx alone counts for both.
+      lowest: the angle where nothing stands higher, degrees: 0, the horizontal; -90 shows terrain that falls away, and
+        stays where there is none.
+      mesh: the devices that share the work, see `render`.
+
+    Returns:
+      Degrees, shape (k, ny, nx); nan where there is no height.
+
+    Raises:
+      ValueError: an argument has a value that it cannot have.
+    """
+    field = _field("horizon", terrain, dx, dy)
+    if np.ndim(azimuths) == 0:
+        azimuths = even_azimuths(_count("horizon", azimuths))
+    azimuths = np.asarray(azimuths, np.float64)
+    if azimuths.ndim != 1 or not azimuths.size or not np.isfinite(azimuths).all():
+        raise ArgumentError("horizon", "azimuths", f"must be a whole number or a list of finite numbers, they are {azimuths}")
+    if not -90 <= lowest < 90:
+        raise ArgumentError("horizon", "lowest", f"must be from -90 to below 90 degrees, it is {lowest}")
+    return _mapped("degrees", field, azimuths, -np.inf if lowest == -90 else np.tan(np.deg2rad(lowest)), mesh)
+
+
+def sky_view(
+    terrain: Any,
+    azimuths: int = 32,
+    *,
+    weighting: str = "solid-angle",
+    dx: float | None = None,
+    dy: float | None = None,
+    mesh: Mesh | None = None,
+) -> Float[jax.Array, "ny nx"]:
+    """The sky-view factor at each vertex: the share of the sky that the terrain leaves to see, 0 to 1.
+
+    From horizon angles h at least 0, exact and without a search radius as `horizon` has them, by `weighting`:
+
+    - "solid-angle": the mean over azimuths of 1 - sin h, the share of the upper hemisphere (Zakšek, Oštir and Kokalj,
+      Sky-view factor as a relief visualization technique, Remote Sensing 3(2), 2011, equation 3).
+    - "horizontal": the mean of cos² h, the share of an even sky's light that a horizontal surface receives.
+    - "slope": that of the surface as it is tilted (Dozier and Frew, Rapid calculation of terrain parameters for radiation
+      modeling from digital elevation data, IEEE Transactions on Geoscience and Remote Sensing 28(5), 1990, equation 7b). Its
+      normal is that of `vertex_normals`. A plane of slope S without other terrain has (1 + cos S) / 2.
+
+    Args:
+      azimuths: how many directions, from north on at even steps.
+      terrain, dx, dy, mesh: as for `horizon`.
+
+    Returns:
+      Shape (ny, nx), nan where there is no height; differentiable in the heights.
+
+    Raises:
+      ValueError: an argument has a value that it cannot have.
+    """
+    field = _field("sky_view", terrain, dx, dy)
+    if weighting not in _WEIGHTINGS:
+        raise ArgumentError("sky_view", "weighting", f"must be among {', '.join(_WEIGHTINGS)}, it is {weighting!r}")
+    found = _mapped(weighting, field, even_azimuths(_count("sky_view", azimuths)), 0.0, mesh)
+    if weighting != "slope":
+        return found
+    normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
+    received = jnp.sum(jnp.moveaxis(found, 0, -1) * normals, -1) / jnp.linalg.norm(normals, axis=-1)
+    return jnp.maximum(received, 0)
+
+
+def _degrees(slopes: jax.Array) -> jax.Array:
+    return jnp.rad2deg(jnp.arctan(slopes))
+
+
+def _solid_angle(slopes: jax.Array) -> jax.Array:
+    return jnp.mean(1 - slopes * jax.lax.rsqrt(1 + slopes * slopes), 0)
+
+
+def _horizontal(slopes: jax.Array) -> jax.Array:
+    return jnp.mean(1 / (1 + slopes * slopes), 0)
+
+
+_WEIGHTINGS = ("solid-angle", "horizontal", "slope")
+_SUMMARIES: dict[str, Summary] = dict(
+    zip(("degrees", *_WEIGHTINGS), (_degrees, _solid_angle, _horizontal, sky_vector), strict=True)
+)
+
+
+def _mapped(summary: str, field: Heightfield, azimuths: np.ndarray, lowest: float, mesh: Mesh | None) -> jax.Array:
+    dtype, mesh = field.heights.dtype, local_mesh() if mesh is None else mesh
+    heights, directions = on_every_device((field.heights, cell_directions(azimuths, field.dx, field.dy, dtype)), mesh)
+    return _over(summary, mesh, heights, directions, np.asarray(lowest, dtype))
+
+
+@functools.partial(compiled, newer=True, static_argnames=("summary", "mesh"))
+def _over(summary: str, mesh: Mesh, heights: jax.Array, directions: jax.Array, lowest: jax.Array) -> jax.Array:
+    return over_horizon(_SUMMARIES[summary], mesh, jnp.where(jnp.isfinite(heights), heights, jnp.nan), directions, lowest)
+
+
+def _field(owner: str, terrain: Any, dx: float | None, dy: float | None) -> Heightfield:
+    if not isinstance(terrain, Terrain | Heightfield):
+        return Heightfield(terrain, 1.0 if dx is None and dy is None else dx, dy)
+    if dx is not None or dy is not None:
+        kind = type(terrain).__name__
+        raise ArgumentError(owner, "dx" if dy is None else "dy", f"must stand without a {kind}, which has its own cell size")
+    return terrain.in_metres().heightfield() if isinstance(terrain, Terrain) else terrain
+
+
+def _count(owner: str, azimuths: Any) -> int:
+    if isinstance(azimuths, bool) or not isinstance(azimuths, int | np.integer) or azimuths < 1:
+        raise ArgumentError(owner, "azimuths", f"must be a whole number from 1 on, it is {azimuths!r}")
+    return int(azimuths)

@@ -1,0 +1,314 @@
+"""How steeply the surface rises above each vertex of a grid, direction by direction, as far as the grid reaches.
+
+Along a line over the triangulated surface the height is linear between two crossings of edges, so the largest slope that is
+seen from a vertex is that of a crossing. In one direction all vertices of a grid meet the crossings at the same offsets and
+at the same shares of edges. A square tile of vertices therefore looks at one crossing after the other without a gather, and
+leaves out stretches of the way over which nothing is high enough to raise the slope of any of its vertices.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh
+from jaxtyping import Bool, Float, Int
+
+from ..core.devices import local_mesh, map_over
+from ..core.types import Index, Scalar
+from .grid import Grid
+
+# Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
+_TILE = 32  # vertices along its side
+_STRETCH = 32  # cells, along the axis on which a direction moves faster
+_TOGETHER = 4  # crossings in one pass over a tile
+_GRAIN = 8  # cells from one of the windows whose highest points are kept to the next
+_MARGIN = _TILE + 1
+
+# The kinds of edges, by where they lead from their first vertex, in x and y; the last is that of crossings at a vertex.
+_ALONG_X, _ALONG_Y, _DIAGONAL, _VERTEX = range(4)
+_TO_SECOND = np.array([[1, 0], [0, 1], [1, 1], [0, 0]], np.int32)
+
+# Slopes in all directions to what is wanted of them: arrays without an axis for the direction, or with one in front.
+Summary = Callable[[Float[jax.Array, "k *at"]], jax.Array]
+
+
+class _Crossings(eqx.Module):
+    """Crossings of one direction with the edges of a grid, from a vertex outwards; an entry each.
+
+    Attributes:
+      inverse: 1 / the horizontal distance, falling; 0 at entries without a crossing.
+      share: how far along the edge; nan at such entries.
+      kind: of the edge.
+      x, y, x2, y2: from the vertex to the first and to the second vertex of the edge, cells.
+    """
+
+    inverse: Float[jax.Array, " n"]
+    share: Float[jax.Array, " n"]
+    kind: Int[jax.Array, " n"]
+    x: Int[jax.Array, " n"]
+    y: Int[jax.Array, " n"]
+    x2: Int[jax.Array, " n"]
+    y2: Int[jax.Array, " n"]
+
+
+def even_azimuths(count: int) -> Float[np.ndarray, " k"]:
+    """Degrees clockwise from north, from 0 on."""
+    return np.arange(count) * (360 / count)
+
+
+def cell_directions(azimuths: Float[np.ndarray, " k"], dx: float, dy: float, dtype: Any) -> Float[np.ndarray, "k 2"]:
+    """Cells in x and in y for each unit of horizontal distance; exact along lines of the grid and along diagonals."""
+    turns = np.deg2rad(azimuths % 360)
+    unit = np.stack([np.sin(turns), np.cos(turns)], -1)
+    unit[np.abs(unit) < 1e-12] = 0
+    x, y = (unit / (dx, dy)).T
+    return np.stack([x, np.where(np.abs(x - y) < 1e-12 * np.abs(x), x, y)], -1).astype(dtype)
+
+
+def sky_vector(slopes: Float[jax.Array, "k *at"]) -> Float[jax.Array, "3 *at"]:
+    """The integral of w / pi over the directions w of the visible sky, from horizons at even azimuths, at least horizontal.
+
+    Its product with a normal is the irradiance from an even sky of radiance 1 / pi, where all the visible sky lies on the upper
+    side of the surface; after Dozier and Frew (1990), equation 7b, with h = atan(slope) for the height of the horizon.
+    """
+    turns = np.deg2rad(even_azimuths(slopes.shape[0])).reshape(-1, *[1] * (slopes.ndim - 1))
+    square = 1 / (1 + slopes * slopes)
+    level = jnp.pi / 2 - jnp.arctan(slopes) - slopes * square
+    east, north = (jnp.asarray(f(turns), slopes.dtype) for f in (np.sin, np.cos))
+    return jnp.stack(
+        [
+            jnp.mean(level * jnp.broadcast_to(east, level.shape), 0),
+            jnp.mean(level * jnp.broadcast_to(north, level.shape), 0),
+            jnp.mean(square, 0),
+        ]
+    )
+
+
+def visible_sky(grid: Grid, azimuths: int) -> Float[jax.Array, "vertices 3"]:
+    """`sky_vector` at the vertices of a grid, world frame; its z axis must be upright there. Differentiable in the heights."""
+    z, linear = grid.z, grid.world_from_grid.linear
+    level = jnp.asarray(cell_directions(even_azimuths(azimuths), 1.0, 1.0, z.dtype))
+    directions = lax.stop_gradient(level @ grid.grid_from_world.linear[:2, :2].T)
+    flat = jnp.zeros((), z.dtype)
+    seen = over_horizon(sky_vector, local_mesh(1), z * linear[2, 2], directions, flat)
+    return jnp.moveaxis(seen, 0, -1).reshape(-1, 3)
+
+
+def _crossings(shape: tuple[int, int], direction: Float[jax.Array, "2"]) -> _Crossings:
+    (ny, nx), dx, dy, dtype = shape, direction[0], direction[1], direction.dtype
+    rounding = 8 * float(jnp.finfo(dtype).eps)
+
+    def of_lines(most: int, rate: Scalar, moving: Scalar, kind: int) -> tuple[jax.Array, ...]:
+        """Of lines that the direction passes at `rate`, while it moves along them at `moving`, and their numbers."""
+        line, size = jnp.arange(1, most + 1, dtype=jnp.int32), jnp.abs(rate)
+        at = line.astype(dtype) * (moving / jnp.where(size > 0, size, 1))
+        at_vertex = jnp.abs(at - jnp.round(at)) <= rounding * jnp.maximum(jnp.abs(at), 1)
+        first = jnp.where(at_vertex, jnp.round(at), jnp.floor(at))
+        share = jnp.where(size > 0, jnp.where(at_vertex, 0, at - first), jnp.nan)
+        kinds = jnp.where(at_vertex, _VERTEX, kind).astype(jnp.int32)
+        return size / line.astype(dtype), share, kinds, first.astype(jnp.int32), jnp.where(rate < 0, -line, line)
+
+    *columns, columns_y, columns_x = of_lines(nx - 1, dx, dy, _ALONG_Y)
+    *rows, rows_x, rows_y = of_lines(ny - 1, dy, dx, _ALONG_X)
+    *diagonals, diagonals_x, number = of_lines(nx + ny - 2, dx - dy, dx, _DIAGONAL)  # of x - y
+    families = (*columns, columns_x, columns_y), (*rows, rows_x, rows_y), (*diagonals, diagonals_x, diagonals_x - number)
+    entries = [jnp.concatenate(parts) for parts in zip(*families, strict=True)]
+    order = jnp.argsort(-entries[0])
+    missing = -order.size % _TOGETHER
+    inverse, share, kind, x, y = (jnp.pad(values[order], (0, missing)) for values in entries)
+    share = share.at[order.size :].set(jnp.nan)
+    second = jnp.asarray(_TO_SECOND)[kind]
+    return _Crossings(inverse, share, kind, x, y, x + second[:, 0], y + second[:, 1])
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def over_horizon(
+    summary: Summary, mesh: Mesh, z: Float[jax.Array, "ny nx"], directions: Float[jax.Array, "k 2"], lowest: Scalar
+) -> jax.Array:
+    """A summary of the slopes of the horizon at each vertex: of each direction, the largest that any point of the surface has.
+
+    A slope is (height of the point - height of the vertex) / horizontal distance, with the surface as the renderer has it. It
+    has a derivative in the heights, that of the slope to the point that was found, none in the other arguments.
+
+    Args:
+      summary: of the slopes, shape (k, ...), what is returned for places of shape (...); elementwise in these.
+      mesh: the devices among which tiles are dealt out.
+      z: heights, nan in holes; a vertex that is a hole gives nan.
+      directions: cells in x and in y for each unit of horizontal distance.
+      lowest: the slope where nothing rises higher; may be -inf.
+    """
+    return _searched(summary, mesh, z, directions, lowest, False)[0]
+
+
+@over_horizon.defjvp
+def _over_horizon_jvp(summary: Summary, mesh: Mesh, primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]):
+    z, directions, lowest = lax.stop_gradient(primals)
+    slopes, found = _searched(lambda slopes: slopes, mesh, z, directions, lowest, True)
+    ny, nx = z.shape
+    iy, ix = (at.astype(jnp.int32) for at in jnp.indices(z.shape))
+
+    def change(of_one: tuple[jax.Array, jax.Array]) -> jax.Array:
+        """Of the slopes in one direction."""
+        direction, found = of_one
+        on = jax.tree.map(lambda values: values[jnp.maximum(found, 0)], _crossings((ny, nx), direction))
+        low, high = tangents[0][iy + on.y, ix + on.x], tangents[0][iy + on.y2, ix + on.x2]
+        raised = ((low - tangents[0]) + on.share * (high - low)) * on.inverse
+        return jnp.where(found >= 0, raised, 0)
+
+    return jax.jvp(summary, (slopes,), (lax.map(change, (directions, found)),))
+
+
+def _searched(
+    summary: Summary, mesh: Mesh, z: jax.Array, directions: jax.Array, lowest: Scalar, numbered: bool
+) -> tuple[jax.Array, Int[jax.Array, "k ny nx"] | None]:
+    """The summary, and if they are to be numbered, the entries of `_crossings` that were found; -1 for none."""
+    (ny, nx), bare = z.shape, jnp.isnan(z)
+    columns, rows = math.ceil(nx / _TILE), math.ceil(ny / _TILE)
+    view = _View.of(z, directions)
+
+    def one_tile(shared: tuple["_View", Scalar], number: Index) -> tuple[jax.Array, jax.Array | None]:
+        view, lowest = shared
+        x, y = (number % columns) * _TILE, (number // columns) * _TILE
+        ways = jnp.arange(view.end.shape[0], dtype=jnp.int32)
+        slopes, found = lax.map(lambda way: _from_tile(view, way, x, y, lowest, numbered), ways)
+        return summary(slopes), found
+
+    tiles = map_over(mesh, one_tile, (view, lowest), jnp.arange(rows * columns, dtype=jnp.int32))
+
+    def assembled(tiles: jax.Array) -> jax.Array:
+        tail = tiles.shape[1:-2]
+        grid = jnp.moveaxis(tiles.reshape(rows, columns, *tail, _TILE, _TILE), (0, 1), (-4, -2))
+        return grid.reshape(*tail, rows * _TILE, columns * _TILE)[..., :ny, :nx]
+
+    result, found = jax.tree.map(assembled, tiles)
+    return jnp.where(jnp.broadcast_to(bare, result.shape), jnp.nan, result), found
+
+
+class _View(eqx.Module):
+    """What all tiles share.
+
+    Attributes:
+      heights: with a margin, nan beyond the grid.
+      edges: for each kind, heights at the first vertices of edges, with a margin; nan where no cell of the surface has it.
+      windows: the highest vertex of squares that begin at every multiple of `_GRAIN`, from `_reach()` of them before the grid.
+      crossings: of each direction.
+      bounds: between stretches, the horizontal distances.
+      begins: the first entry of the crossings beyond each.
+      end: the distance at which a direction has left the grid, wherever it began.
+      first_window: where a stretch begins in the least x and in the least y, from the vertex, cells.
+    """
+
+    heights: Float[jax.Array, "rows columns"]
+    edges: Float[jax.Array, "4 rows columns"]
+    windows: Float[jax.Array, "window_rows window_columns"]
+    crossings: Any  # a `_Crossings` with a leading axis
+    bounds: Float[jax.Array, "k bounds"]
+    begins: Int[jax.Array, "k bounds"]
+    end: Float[jax.Array, " k"]
+    first_window: Int[jax.Array, "k stretches 2"]
+
+    @staticmethod
+    def of(z: Float[jax.Array, "ny nx"], directions: Float[jax.Array, "k 2"]) -> "_View":
+        (ny, nx), dtype = z.shape, z.dtype
+        count = math.ceil((max(nx, ny) - 1) / _STRETCH)
+        margin = ((_MARGIN, _MARGIN + _TILE), (_MARGIN, _MARGIN + _TILE))
+
+        def along(direction: jax.Array) -> tuple[_Crossings, jax.Array, jax.Array, jax.Array, jax.Array]:
+            crossings, size = _crossings((ny, nx), direction), jnp.abs(direction)
+            bounds = jnp.arange(count + 1, dtype=dtype) * (_STRETCH / jnp.max(size))
+            end = jnp.min(jnp.array([nx - 1, ny - 1], dtype) / jnp.maximum(size, jnp.finfo(dtype).tiny))
+            begins = jnp.searchsorted(-crossings.inverse, -1 / bounds, side="right").astype(jnp.int32)
+            begins = jnp.minimum(begins, jnp.sum(crossings.inverse * end > 0.999, dtype=jnp.int32))
+            ends = jnp.outer(bounds, direction)
+            return crossings, bounds, begins, end, jnp.floor(jnp.minimum(ends[:-1], ends[1:])).astype(jnp.int32)
+
+        padded = jnp.pad(z, margin, constant_values=jnp.nan)
+        edges = jnp.pad(_edges(z), ((0, 0), *margin), constant_values=jnp.nan)
+        return _View(padded, edges, _windows(z), *lax.map(along, directions))
+
+
+def _from_tile(
+    view: _View, way: Index, x: Index, y: Index, lowest: Scalar, numbered: bool
+) -> tuple[Float[jax.Array, "tile tile"], Int[jax.Array, "tile tile"] | None]:
+    """Slopes in one direction from the vertices of the tile that begins at (x, y), and the entries of what was found.
+
+    The crossings of all directions are handed on and looked up one by one: those of one would be copied for each tile.
+    """
+    bounds, begins, end, first = (values[way] for values in (view.bounds, view.begins, view.end, view.first_window))
+    crossings = view.crossings
+    stretches = first.shape[0]
+
+    def moved(heights: jax.Array, by_x: Index, by_y: Index) -> jax.Array:
+        """Of the tile, moved by some cells. The start is clamped: a tile beyond the margin is one within it, all nan."""
+        return lax.dynamic_slice(heights, (y + _MARGIN + by_y, x + _MARGIN + by_x), (_TILE, _TILE))
+
+    def moved_edges(kind: Index, by_x: Index, by_y: Index) -> jax.Array:
+        start = kind, y + _MARGIN + by_y, x + _MARGIN + by_x
+        return lax.dynamic_slice(view.edges, start, (1, _TILE, _TILE))[0]
+
+    z = moved(view.heights, jnp.zeros_like(x), jnp.zeros_like(y))
+    window = [(at + first[:, k]) // _GRAIN + _reach() for k, at in enumerate((x, y))]
+    column, row = (jnp.clip(at, 0, n - 1) for at, n in zip(window, view.windows.shape[::-1], strict=True))
+    top = view.windows[row, column]
+    top_from_here = lax.cummax(top, reverse=True)
+
+    def rises(top: Scalar, slopes: jax.Array, near: Scalar, far: Scalar) -> Bool[jax.Array, ""]:
+        """Whether a point of this height, between two distances, could stand above the slope of some vertex."""
+        return (top - z > slopes * jnp.where(slopes >= 0, near, far)).any()
+
+    def look(group: Index, carry: tuple[jax.Array, jax.Array | None]) -> tuple[jax.Array, jax.Array | None]:
+        slopes, found = carry
+        for k in range(_TOGETHER):
+            n = group * _TOGETHER + k
+            at = way, n
+            low = moved_edges(crossings.kind[at], crossings.x[at], crossings.y[at])
+            high = moved(view.heights, crossings.x2[at], crossings.y2[at])
+            slope = ((low - z) + crossings.share[at] * (high - low)) * crossings.inverse[at]
+            steeper = slope > slopes  # never where it is nan
+            slopes = jnp.where(steeper, slope, slopes)
+            found = None if found is None else jnp.where(steeper, n, found)
+        return slopes, found
+
+    def walk(carry: tuple[Index, Any]) -> tuple[Index, Any]:
+        k, seen = carry
+        groups = begins[k] // _TOGETHER, (begins[k + 1] + _TOGETHER - 1) // _TOGETHER
+        needed = rises(top[k], seen[0], bounds[k], bounds[k + 1])
+        return k + 1, lax.cond(needed, lambda seen: lax.fori_loop(*groups, look, seen), lambda seen: seen, seen)
+
+    def going(carry: tuple[Index, Any]) -> Bool[jax.Array, ""]:
+        k, (slopes, _) = carry
+        here = jnp.minimum(k, stretches - 1)
+        return (k < stretches) & rises(top_from_here[here], slopes, bounds[here], end)
+
+    seen = jnp.full_like(z, lowest), jnp.full(z.shape, -1, jnp.int32) if numbered else None
+    return lax.while_loop(going, walk, (jnp.zeros((), jnp.int32), seen))[1]
+
+
+def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
+    """For each kind, heights at the first vertices of edges; nan where no cell of the surface has the edge."""
+    whole = jnp.pad(jnp.isfinite(z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:]), 1)
+    north_east, north_west, south_east, south_west = whole[1:, 1:], whole[1:, :-1], whole[:-1, 1:], whole[:-1, :-1]
+    east, north = north_east | south_east, north_east | north_west
+    return jnp.where(jnp.stack([east, north, north_east, east | north_west | south_west]), z[None], jnp.nan)
+
+
+def _reach() -> int:
+    """Windows side by side that a tile moves over within a stretch, wherever between their beginnings it begins."""
+    return math.ceil((_TILE + _STRETCH + 2) / _GRAIN) + 1
+
+
+def _windows(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "window_rows window_columns"]:
+    ny, nx = z.shape
+    reach, padding = _reach(), ((0, -ny % _GRAIN), (0, -nx % _GRAIN))
+    known = jnp.pad(jnp.where(jnp.isnan(z), -jnp.inf, z), padding, constant_values=-jnp.inf)
+    blocks = known.reshape(known.shape[0] // _GRAIN, _GRAIN, -1, _GRAIN).max((1, 3))
+    blocks = jnp.pad(blocks, reach, constant_values=-jnp.inf)
+    rows, columns = (n - reach + 1 for n in blocks.shape)
+    high = functools.reduce(jnp.maximum, (blocks[k : k + rows] for k in range(reach)))
+    return functools.reduce(jnp.maximum, (high[:, k : k + columns] for k in range(reach)))

@@ -1,0 +1,67 @@
+"""`jaxhf skyview` and `jaxhf horizon`: the values of the functions of those names, where the terrain lies."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import jaxhf
+from jaxhf.cli.main import main
+
+Z = np.random.default_rng(0).uniform(size=(5, 7))
+Z[2, 3] = np.nan
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """A command on that terrain, whose cells are of 2 x 3, in double precision; its exit code and what it says."""
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
+    path = tmp_path / "terrain.npz"
+    jaxhf.save_heights(path, jaxhf.Terrain(Z, 2.0, 3.0, 100.0, 50.0))
+
+    def command(name, output, *options):
+        code = main([name, str(path), "-o", str(tmp_path / output), "--precision", "float64", *options])
+        return code, "".join(capsys.readouterr())
+
+    return command
+
+
+def test_skyview(run, tmp_path):
+    expected = np.asarray(jaxhf.sky_view(Z, 4, dx=2.0, dy=3.0))
+    code, said = run("skyview", "sky.npy", "--azimuths", "4")
+    assert code == 0
+    assert f": sky-view factor {np.nanmin(expected):.3f} .. {np.nanmax(expected):.3f}, 4 azimuths, " in said
+    np.testing.assert_array_equal(np.load(tmp_path / "sky.npy"), expected)
+    assert run("skyview", "sky.png", "--azimuths", "4")[0] == 0
+    with Image.open(tmp_path / "sky.png") as picture:
+        np.testing.assert_array_equal(np.asarray(picture)[::-1], np.rint(255 * np.nan_to_num(expected)))
+
+
+def test_horizon(run, tmp_path):
+    expected = [np.asarray(jaxhf.horizon(Z, [azimuth], dx=2.0, dy=3.0))[0] for azimuth in (0.0, 90.0, 180.0, 270.0)]
+    assert run("horizon", "all.npy", "--azimuths", "4")[0] == 0
+    np.testing.assert_array_equal(np.load(tmp_path / "all.npy"), expected)
+    pytest.importorskip("rasterio")
+    assert run("horizon", "west.tif", "--azimuth", "270")[0] == 0
+    west = jaxhf.load_heights(tmp_path / "west.tif")
+    np.testing.assert_array_equal(west.heights, expected[3])
+    assert (west.dx, west.dy, west.x0, west.y0) == (2, 3, 100, 50)
+    assert run("horizon", "each.tif", "--azimuths", "4")[0] == 0
+    names = sorted(path.name for path in tmp_path.glob("each*"))
+    assert names == [f"each_{degrees}.tif" for degrees in ("000", "090", "180", "270")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("skyview", "sky.npy", "--azimuths", "0"), "--azimuths must be a whole number from 1 on, it is 0"),
+        (("skyview", "sky.txt"), "sky.txt"),
+        (("horizon", "h.png"), "--output must end in .tif or .npy, as angles are not bytes, it is "),
+        (("horizon", "h.npy", "--azimuth", "nan"), "--azimuth must be finite, it is nan"),
+    ],
+)
+def test_mistakes_are_one_line(run, arguments, message):
+    code, said = run(*arguments)
+    assert code == 2
+    assert said.startswith("jaxhf: error: ")
+    assert message in said
+    assert said.count("\n") == 1

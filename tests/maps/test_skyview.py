@@ -1,0 +1,144 @@
+"""Horizon angles and sky-view factors, against all crossings one by one, closed forms, cast rays and differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxhf
+
+SHAPE = (41, 73)
+Y, X = np.indices(SHAPE).astype(float)
+AZIMUTHS = np.array([0, 45, 90, 180, 225, 315, 17, 100.0, 200, 333, 26.56505117707799])
+
+
+def surface(z, x, y):
+    """Heights at points in cells, nan beyond the surface; of a cell to the lower left where a point lies on its border."""
+    ny, nx = z.shape
+    ix, iy = np.floor(x).astype(int), np.floor(y).astype(int)
+    inside = (ix >= 0) & (iy >= 0) & (ix < nx - 1) & (iy < ny - 1)
+    ix, iy = np.clip(ix, 0, nx - 2), np.clip(iy, 0, ny - 2)
+    u, v = x - ix, y - iy
+    a, b, c, d = z[iy, ix], z[iy, ix + 1], z[iy + 1, ix], z[iy + 1, ix + 1]
+    height = np.where(u >= v, a + u * (b - a) + v * (d - b), a + v * (c - a) + u * (d - c))
+    return np.where(inside & np.isfinite(a + b + c + d), height, np.nan)
+
+
+def every_crossing(z, azimuth, dx, dy, lowest):
+    """Horizon angles in double precision, each crossing of a line from each vertex looked at from all cells round it."""
+    turn = np.deg2rad(azimuth)
+    gx, gy = np.sin(turn) / dx, np.cos(turn) / dy
+    slopes = np.full(z.shape, np.tan(np.deg2rad(lowest)) if lowest > -90 else -np.inf)
+    iy, ix = np.indices(z.shape)
+    tiny = 1e-9
+    for rate in (gx, gy, gx - gy):
+        for line in range(1, sum(z.shape)) if abs(rate) > 1e-12 else ():
+            s = line / abs(rate)
+            for off_x, off_y in ((tiny, 2 * tiny), (2 * tiny, tiny), (-tiny, tiny), (tiny, -tiny), (-tiny, -2 * tiny)):
+                height = surface(z, ix + gx * s + off_x, iy + gy * s + off_y)
+                slopes = np.fmax(slopes, (height - z) / s)
+    return np.where(np.isnan(z), np.nan, np.rad2deg(np.arctan(slopes)))
+
+
+@pytest.mark.parametrize(("dtype", "lowest", "tolerance"), [(np.float64, 0.0, 1e-6), (np.float32, -90.0, 2e-4)])
+def test_horizon_is_that_of_every_crossing(dtype, lowest, tolerance):
+    """Several tiles and stretches, rectangular cells, holes, directions along lines, along diagonals and through vertices.
+
+    Points are taken 1e-9 cells off the lines, at slopes of up to 8; single precision is good to some 1e-6 of an angle.
+    """
+    rng = np.random.default_rng(4)
+    z = 4 * rng.uniform(size=SHAPE) + 0.3 * X
+    z[rng.integers(SHAPE[0], size=40), rng.integers(SHAPE[1], size=40)] = np.nan
+    z = z.astype(dtype).astype(float)
+    found = jaxhf.horizon(z.astype(dtype), AZIMUTHS, dx=2.0, dy=1.0, lowest=lowest)
+    assert found.dtype == dtype
+    for azimuth, angles in zip(AZIMUTHS, np.asarray(found), strict=True):
+        np.testing.assert_allclose(angles, every_crossing(z, azimuth, 2.0, 1.0, lowest), atol=tolerance)
+
+
+def test_closed_forms():
+    """A plane, a valley, a pit with a flat floor, a far wall a little above a near one; the sky that an inclined plane sees."""
+    a = np.deg2rad(AZIMUTHS)[:, None, None]
+    plane = np.asarray(jaxhf.horizon(0.5 * X - 0.2 * Y, AZIMUTHS))[:, 1:-1, 1:-1]
+    slope = 0.5 * np.sin(a) - 0.2 * np.cos(a)
+    np.testing.assert_allclose(plane, np.rad2deg(np.arctan(np.fmax(slope, 0))) + 0 * plane, atol=1e-9)
+    valley = np.asarray(jaxhf.horizon(0.7 * np.abs(X - 36), AZIMUTHS))[:, 20, 36]
+    np.testing.assert_allclose(valley, np.rad2deg(np.arctan(0.7 * np.abs(np.sin(a[:, 0, 0])))), atol=1e-9)
+    pit = np.asarray(jaxhf.horizon(np.where(np.hypot(X - 36, Y - 20) < 17.5, -12.0, 0.0), AZIMUTHS))[:, 20, 36]
+    assert np.all((pit > np.rad2deg(np.arctan(12 / 19))) & (pit < np.rad2deg(np.arctan(12 / 17))))
+    walls = np.asarray(jaxhf.horizon(np.where(X == 20, 6.0, np.where(X == 33, 33 * 0.302, 0.0)), AZIMUTHS))[2, :, 0]
+    np.testing.assert_allclose(walls, np.rad2deg(np.arctan(0.302)), atol=1e-9)
+    seen = jaxhf.sky_view(0.5 * X - 0.2 * Y, 32, weighting="slope")[1:-1, 1:-1]
+    np.testing.assert_allclose(seen, (1 + 1 / np.sqrt(1.29)) / 2, atol=1e-3)
+
+
+def test_sky_view_is_the_mean_over_horizons():
+    z = np.random.default_rng(5).uniform(size=(5, 7))
+    h = np.deg2rad(np.asarray(jaxhf.horizon(z, 6, dx=2.0, dy=3.0)))
+    for weighting, share in (("solid-angle", 1 - np.sin(h)), ("horizontal", np.cos(h) ** 2)):
+        found = jaxhf.sky_view(jaxhf.Heightfield(z, 2.0, 3.0), 6, weighting=weighting)
+        np.testing.assert_allclose(found, share.mean(0), rtol=1e-12)
+    np.testing.assert_array_equal(jaxhf.sky_view(jaxhf.Terrain(z, 2.0, 3.0), 6, weighting="horizontal"), found)
+
+
+def test_rays_just_above_the_horizon_meet_nothing_and_rays_just_below_do():
+    rng = np.random.default_rng(7)
+    z = np.cumsum(np.cumsum(rng.normal(size=SHAPE), 0), 1) / 8
+    field = jaxhf.Heightfield(z, 3.0, 2.0, 100.0, -7.0)
+    for azimuth, angle in zip(np.deg2rad(AZIMUTHS), np.asarray(jaxhf.horizon(field, AZIMUTHS)), strict=True):
+        rises = (angle > 0.1) & (angle < 89.9)
+        assert rises.mean() > 0.2
+        o = np.stack([100 + 3 * X, -7 + 2 * Y, z + 1e-7], -1)[rises][:256]
+        for off, status in ((0.01, jaxhf.Status.MISS), (-0.01, jaxhf.Status.HIT)):
+            h = np.deg2rad(angle + off)[rises][:256]
+            d = np.stack([np.sin(azimuth) * np.cos(h), np.cos(azimuth) * np.cos(h), np.sin(h)], -1)
+            if azimuth % (np.pi / 4):  # else the rays run along edges and the border, where rounding decides
+                assert np.all(np.asarray(jaxhf.cast(field, o, d).status) == int(status))
+
+
+def test_derivatives_are_those_of_differences():
+    rng = np.random.default_rng(3)
+    z, dz = rng.normal(size=(2, 9, 12))
+    z[4, 5], dz[4, 5] = np.nan, 0
+    weights, eps = rng.normal(size=z.shape), 1e-6
+
+    def weighted(z):
+        seen = jaxhf.sky_view(z, 6, weighting="slope")
+        return jnp.sum(jnp.where(jnp.isnan(seen), 0, seen * weights))
+
+    numeric = (weighted(z + eps * dz) - weighted(z - eps * dz)) / (2 * eps)
+    assert abs(numeric) > 1e-2
+
+    @jax.jit
+    def both(z, dz):
+        _, forward = jax.linearize(weighted, z)
+        return forward(dz), jax.linear_transpose(forward, z)(jnp.ones(()))[0]
+
+    tangent, gradient = both(z, dz)
+    np.testing.assert_allclose(tangent, numeric, rtol=1e-6)
+    assert np.all(np.isfinite(gradient))
+    np.testing.assert_allclose(np.sum(gradient * dz), numeric, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: jaxhf.horizon(np.zeros((2, 2)), 0), "horizon: azimuths must be a whole number from 1 on, it is 0"),
+        (lambda: jaxhf.horizon(np.zeros((2, 2)), [np.nan]), "horizon: azimuths must be a whole number or a list of finite"),
+        (
+            lambda: jaxhf.horizon(np.zeros((2, 2)), lowest=90.0),
+            "horizon: lowest must be from -90 to below 90 degrees, it is 90.0",
+        ),
+        (lambda: jaxhf.horizon(np.zeros(4)), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (4,)"),
+        (lambda: jaxhf.sky_view(np.zeros((2, 2)), -2), "sky_view: azimuths must be a whole number from 1 on, it is -2"),
+        (lambda: jaxhf.sky_view(np.zeros((2, 2)), weighting="x"), "sky_view: weighting must be among solid-angle, horiz"),
+        (
+            lambda: jaxhf.sky_view(jaxhf.Heightfield(np.zeros((2, 2))), dx=1.0),
+            "sky_view: dx must stand without a Heightfield, w",
+        ),
+    ],
+)
+def test_what_is_refused(make, message):
+    with pytest.raises(jaxhf.ArgumentError) as error:
+        make()
+    assert str(error.value).startswith(message)
