@@ -23,7 +23,7 @@ _SUN, _SKY = 0.8, 0.3  # radiance of white ground that faces the sun, and what t
 _ABOVE, _BELOW = (0.60, 0.72, 0.86), (0.95, 0.95, 0.93)  # the background's highest and lowest row
 _HAZE = (0.78, 0.84, 0.90)
 _SHALLOW, _DEEP = (0.16, 0.38, 0.46), (0.02, 0.09, 0.20)
-_WALLS = (0.16, 0.14, 0.125)
+_WALLS = (0.27, 0.245, 0.22)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -61,24 +61,16 @@ def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch):
 
 
 def test_a_picture_is_draped_from_corner_to_corner(terrain, tmp_path):
-    texels = np.zeros((4, 4, 3), np.uint8)
-    texels[:, :2, 0], texels[:, 2:, 2] = 255, 255  # red in the west
+    from jaxhf.io.drape import load_drape
+
+    texels = np.zeros((4, 6, 3), np.uint8)
+    texels[:, :2, 0], texels[:2, :, 2] = 255, 255  # red in the west, blue in the north
     imageio.imwrite(tmp_path / "drape.png", texels)
-    command = [
-        "view",
-        terrain,
-        "-o",
-        str(tmp_path / "out.npy"),
-        "--drape",
-        str(tmp_path / "drape.png"),
-        "--from",
-        "180",
-        *SMALL,
-    ]
-    assert main([*command, "--above", "80", "--haze", "0"]) == 0
-    image = np.load(tmp_path / "out.npy")
-    assert (image[10:22, 12:20, 0] > 2 * image[10:22, 12:20, 2]).all()
-    assert (image[10:22, 28:36, 2] > 2 * image[10:22, 28:36, 0]).all()
+    draped = load_drape(tmp_path / "drape.png", jaxhf.load_heights(terrain))
+    np.testing.assert_array_equal(draped, texels[::-1] / 255)
+    imageio.imwrite(tmp_path / "grey.png", texels[..., 0])
+    grey = load_drape(tmp_path / "grey.png", jaxhf.load_heights(terrain))
+    np.testing.assert_array_equal(grey, texels[::-1, :, :1] / 255 * np.ones(3))
 
 
 def test_a_geotiff_is_draped_where_it_lies(tmp_path):
