@@ -136,7 +136,7 @@ class _Stage:
 
         if self.options.drape is not None:
             return load_drape(self.options.drape, self.terrain)
-        return linear_from_srgb(color_relief(self.terrain, self.options.ramp).astype(np.float64) / 255)
+        return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(self.terrain, self.options.ramp)]
 
     def _field(self) -> "Heightfield":
         from ..scene.heightfield import Heightfield

@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -95,7 +96,8 @@ def block(field: Heightfield, colours: Any, camera: Perspective, look: Look, bas
       base: the level of the floor; None: neither walls nor a floor.
     """
     at_vertices = np.shape(colours)[:-1] == field.heights.shape
-    albedo = ImageTexture(colours, at_vertices=at_vertices) if np.ndim(colours) == 3 else colours
+    colours = jnp.asarray(colours, field.heights.dtype)
+    albedo = ImageTexture(colours, at_vertices=at_vertices) if colours.ndim == 3 else colours
     objects = [Object(field, Matte(albedo))]
     if base is not None:
         objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))

@@ -1,5 +1,6 @@
 """Where a camera must stand so that it sees all of a terrain."""
 
+import itertools
 import math
 
 import numpy as np
@@ -7,6 +8,8 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from .heightfield import Heightfield
+
+_MOST = 1024  # points along a side that are looked at
 
 
 def framing_pose(
@@ -78,15 +81,26 @@ def _central(across: Float[np.ndarray, " n"], depth: Float[np.ndarray, " n"]) ->
 
 
 def _outline(field: Heightfield, base: float | None) -> Float[np.ndarray, "n 3"]:
-    """The vertices that have a height, and where the border stands on the level `base`."""
-    heights = np.asarray(field.heights, np.float64)
-    iy, ix = np.nonzero(np.isfinite(heights))
-    if not iy.size:
+    """The vertices that have a height, and where the border stands on the level `base`.
+
+    Of a large terrain the corners of boxes round blocks of vertices, some 1024 x 1024 of them, stand for these.
+    """
+    heights = np.asarray(field.heights)
+    heights = np.where(np.isfinite(heights), heights, np.nan)
+    ny, nx = heights.shape
+    size = math.ceil(max(ny, nx) / _MOST)
+    points = []
+    for end in (np.fmax, np.fmin)[: min(size, 2)]:
+        blocks = end.reduceat(end.reduceat(heights, range(0, ny, size)), range(0, nx, size), axis=1)
+        iy, ix = np.nonzero(~np.isnan(blocks))
+        for right, up in itertools.product(range(0, size, max(size - 1, 1)), repeat=2):
+            x, y = np.minimum(ix * size + right, nx - 1), np.minimum(iy * size + up, ny - 1)
+            at = field.x0 + x * field.dx, field.y0 + y * field.dy
+            points.append(np.stack([*at, blocks[iy, ix].astype(np.float64)], axis=1))
+    points = np.concatenate(points)
+    if not len(points):
         raise ArgumentError("framing", "field", "must have a height, all of its vertices are holes")
-    points = np.stack([field.x0 + ix * field.dx, field.y0 + iy * field.dy, heights[iy, ix]], axis=1)
     if base is None:
         return points
-    ny, nx = heights.shape
     x1, y1 = field.x0 + (nx - 1) * field.dx, field.y0 + (ny - 1) * field.dy
-    floor = [(x, y, base) for x in (field.x0, x1) for y in (field.y0, y1)]
-    return np.concatenate([points, floor])
+    return np.concatenate([points, [(x, y, base) for x in (field.x0, x1) for y in (field.y0, y1)]])

@@ -42,6 +42,23 @@ def test_a_framing_camera_sees_all_of_a_terrain(azimuth, altitude, fov, width, h
         np.testing.assert_allclose(camera.world_from_camera, looking.world_from_camera, atol=1e-9)
 
 
+def test_large_terrain_is_seen_by_its_blocks(monkeypatch):
+    """A little farther away than by its vertices, never nearer."""
+    heights = np.cumsum(np.random.default_rng(5).normal(size=(61, 83)), axis=1)
+    heights[10:14, 20:24] = np.nan
+    field = jaxhf.Heightfield(heights.astype(np.float32), 1.0)
+    near = np.asarray(jaxhf.Perspective.framing(field, 200.0, 40.0).world_from_camera)
+    monkeypatch.setattr("jaxhf.scene.framing._MOST", 30)
+    camera = jaxhf.Perspective.framing(field, 200.0, 40.0)
+    far = np.asarray(camera.world_from_camera)
+    assert 0 < np.dot(near[:3, 3] - far[:3, 3], far[:3, 2]) < 0.05 * 61
+    y, x = np.mgrid[:61, :83]
+    points = np.stack([x, y, heights], -1)[np.isfinite(heights)]
+    film = camera.film_from_world()
+    seen = np.asarray(film.linear, float) @ points.T + np.asarray(film.offset, float)[:, None]
+    assert max(np.abs(2 * seen[k] / seen[2] / 512 - 1).max() for k in (0, 1)) < 0.95
+
+
 def test_a_camera_that_goes_round_keeps_its_distance():
     x, y = np.meshgrid(100 + 2.0 * np.arange(12), -50 + 1.0 * np.arange(7))
     points = np.stack([x, y, HEIGHTS], -1).reshape(-1, 3)
