@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..core.affine import require_invertible
 from ..core.errors import ArgumentError, UserError
+from ..core.settings import MOST_SAMPLES
 from ..core.types import AnyArray, MatrixLeaf, float_leaf
 from .camera import Camera
 from .cylinder import Cylinder
@@ -80,6 +81,8 @@ class Scene(eqx.Module):
             raise ArgumentError("Scene", "lights", "may hold one Sky, they hold more")
         if not isinstance(self.samples, int) or self.samples < 1:
             raise ArgumentError("Scene", "samples", f"must be a whole number from 1 on, it is {self.samples!r}")
+        if self.samples > MOST_SAMPLES:
+            raise ArgumentError("Scene", "samples", f"must be at most {MOST_SAMPLES}, it is {self.samples}")
 
     @property
     def heightfields(self) -> tuple[Heightfield, ...]:
