@@ -103,8 +103,10 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence
     from ..io.toml.fit import load_case
     from .limits import require_memory
     from .progress import bar
+    from .scene_warnings import warn
 
     case = load_case(path, np.dtype(precision))
+    warn(case.scenes)
     require_memory(case.scenes[0], jax.local_device_count())
     options: dict[str, Any] = {"checkpoint": outputs.checkpoint, "resume": outputs.resume, **case.options}
     interruption.raise_from_now_on()

@@ -30,7 +30,9 @@ def run(options: argparse.Namespace) -> None:
         return
     from ..io.scenes import load_scene
     from .describe import scene_lines
+    from .scene_warnings import warn
 
     scene = load_scene(options.file)
     print(f"{options.file}: {scene.camera.width} x {scene.camera.height} pixels, {scene.samples} samples a pixel")
     print("\n".join(scene_lines(scene)))
+    warn([scene])

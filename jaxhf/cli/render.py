@@ -51,11 +51,16 @@ def draw(options: argparse.Namespace, load: "Callable[[], Scene]", aovs: tuple[s
       saving: for `save_image`.
     """
     from ..io.images import require_writable
+    from ..rendering.aovs import known_aovs
+    from .scene_warnings import warn
 
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)
-    image, found, report = _timed_render(load(), settings, options.devices, aovs)
+    aovs = known_aovs("render", aovs)
+    scene = load()
+    warn([scene])
+    image, found, report = _timed_render(scene, settings, options.devices, aovs)
     finish(options.output, image, report, aovs=found, **saving)
 
 

@@ -1,12 +1,22 @@
 """Textures: images spread over a surface."""
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..core.types import AnyArray, Point2, Vector, float_leaf
+
+
+def _texels(value: Any) -> Any:
+    if isinstance(value, np.ndarray | jax.Array) and value.dtype.kind in "bu":
+        rule = f"must hold linear colours in floats, 1 being white; theirs are {value.dtype} (load_image decodes a picture)"
+        raise ArgumentError("ImageTexture", "texels", rule)
+    return float_leaf(value)
 
 
 class ImageTexture(eqx.Module):
@@ -16,7 +26,7 @@ class ImageTexture(eqx.Module):
       texels: linear colours, shape (h, w, 3): row 0 is v = 0, u runs along a row, texel centres lie at half steps.
     """
 
-    texels: Float[AnyArray, "h w 3"] = eqx.field(converter=float_leaf)
+    texels: Float[AnyArray, "h w 3"] = eqx.field(converter=_texels)
 
     def __check_init__(self):
         if len(self.texels.shape) != 3 or self.texels.shape[2] != 3 or 0 in self.texels.shape:

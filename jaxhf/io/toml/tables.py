@@ -10,6 +10,7 @@ from ...scene.light import Directional, Light, Point, Sky
 from ...scene.material import Material, Matte, Mirror
 from .. import procedural
 from .values import (
+    angle_above_horizon,
     colour,
     grid,
     matrix,
@@ -86,7 +87,7 @@ LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
         {
             "towards": Key(numbers(3), None),
             "azimuth": Key(number, None),
-            "altitude": Key(number, None),
+            "altitude": Key(angle_above_horizon, None),
             "irradiance": Key(colour, None),
             "radiance": Key(colour, None),  # the old name of irradiance
         },
