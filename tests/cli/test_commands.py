@@ -68,6 +68,24 @@ def test_a_slip_gets_the_word_that_was_meant(capsys, line, answer):
     assert re.search(answer, text), text
 
 
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        ("render hills.npz -o a.png", "known: .pbrt, .toml; this is a terrain, for jaxhf hillshade, relief or convert\n"),
+        ("hillshade scene.toml -o a.png", ".xyz; this is a scene, for jaxhf render\n"),
+        ("render scene.toml -o a.tif", "known: .exr, .npy, .pfm, .png\n"),  # and not the .pfm that is spelt alike
+        ("render scene.toml -o a.pgn", "did you mean '.png'?\n"),
+        ("fit case.toml -o a.png", "known: .npy, .npz, .tif, .tiff\n"),
+        ("fit scene.toml -o a.npz", "scene.toml: a fit must have 'pictures', those that were measured; this is a scene, "
+        "for `jaxhf render`\n"),
+    ],
+)  # fmt: skip
+def test_an_ending_gets_what_fits_the_command(folder, capsys, line, answer):
+    np.savez(folder / "hills.npz", heights=np.eye(4))
+    code, text = said(capsys, *line.split())
+    assert (code, text.count("\n"), text.endswith(answer)) == (2, 1, True), text
+
+
 SCENE = """samples = 1
 [camera]
 type = "perspective"
@@ -84,6 +102,7 @@ albedo = "rock"
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)  # JAX is set up already
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "case.toml").write_text('scene = "scene.toml"\n[[pictures]]\nimage = "seen.png"\n[fit]\nprior = "prior.npz"\n')
