@@ -13,7 +13,7 @@ from jaxhf.cli.main import main
 from jaxhf.cli.scene_warnings import scene_warnings
 from jaxhf.core.errors import ArgumentError, UserError
 
-HILLS = np.array([[0.0, 1.0, 0.0], [2.0, 3.0, 2.0], [0.0, 1.0, 0.0]])  # 3 at (1, 1); spacing 1
+HILLS = np.array([[0.0, 1.0, 0.0], [2.0, 3.0, 2.0], [0.0, 1.0, 1.0]])  # 3 at (1, 1); spacing 1
 SCENES = Path(__file__).parents[2] / "scenes"
 SUN = jaxhf.Directional.from_angles()
 
@@ -33,10 +33,10 @@ def scene(eye=(1.0, -4.0, 3.0), target=(1.0, 1.0, 0.0), heights=HILLS, lights=(S
         ({"fov": 1.0}, None),
         ({"heights": HILLS * np.nan}, r"objects\[0\]: none of its heights is finite"),
         ({"heights": np.where(HILLS == 3, -3.4e38, HILLS)}, r"heights reach -3.4e\+38; is that a value that means no height"),
-        # A point of the triangle (1, 1), (2, 1), (2, 2), at (1.5, 1.25): 3 - 0.5 - 0.25 * 2.
-        ({"eye": (1.5, 1.25, 2.01)}, None),
-        ({"eye": (1.5, 1.25, 1.9)}, r"eye stands 0.1 below the surface of objects\[0\], whose height there is 2:"),
-        ({"eye": (1.25, 1.5, 1.7)}, r"eye stands 0.05 below .* is 1.75:"),  # of (1, 1), (2, 2), (1, 2): 3 - 0.5 * 2 - 0.25
+        # A point of the triangle (1, 1), (2, 1), (2, 2), at (1.5, 1.25): 3 - 0.5 - 0.25.
+        ({"eye": (1.5, 1.25, 2.26)}, None),
+        ({"eye": (1.5, 1.25, 2.15)}, r"eye stands 0.1 below the surface of objects\[0\], whose height there is 2.25:"),
+        ({"eye": (1.25, 1.5, 1.95)}, r"eye stands 0.05 below .* is 2:"),  # of (1, 1), (2, 2), (1, 2): 3 - 0.5 * 2
         ({"eye": (2.5, 1.25, -1.0)}, None),  # beside it
         ({"eye": (1.5, 1.25, 1.9), "turn": np.eye(4)}, None),  # where an object is turned, below has no meaning
         ({"target": (1.0, -9.0, 3.0)}, "none of the terrain is in the picture, it spans x 0 to 2, y 0 to 2, z 0 to 3"),
