@@ -11,6 +11,11 @@ from ..core.settings import Settings
 TERRAIN = ".tif and others that GDAL reads, .npz, .npy, .asc, .hgt, .png (grey), .exr, .pfm or .hfield (MuJoCo)"
 
 
+def examples(*commands: str) -> str:
+    """The end of a command's --help."""
+    return "\n  ".join(("examples:", *commands))
+
+
 def add_settings(command: argparse.ArgumentParser, names: Collection[str], **defaults: str) -> None:
     """Adds an option for each of these fields of `Settings`, with the help that its metadata holds.
 
@@ -19,18 +24,19 @@ def add_settings(command: argparse.ArgumentParser, names: Collection[str], **def
       names: of the fields.
       defaults: what --help names as the default of a field, where it is not that of `Settings`.
     """
+    group = command.add_argument_group("accuracy and speed")
     for knob in dataclasses.fields(Settings):
         option = knob.name.replace("_", "-")
         if knob.name not in names:
             continue
         if knob.type is bool:
-            command.add_argument(
+            group.add_argument(
                 f"--no-{option}", dest=knob.name, action="store_false", default=argparse.SUPPRESS,
                 help=f"leave out {knob.metadata['help']}",
             )  # fmt: skip
             continue
         default = defaults.get(knob.name, knob.metadata.get("none", knob.default))
-        command.add_argument(
+        group.add_argument(
             f"--{option}", type=whole_number if int in (knob.type, *get_args(knob.type)) else str, default=argparse.SUPPRESS,
             metavar=knob.metadata.get("metavar"), help=f"{knob.metadata['help']} [{default}]",
         )  # fmt: skip
@@ -49,10 +55,14 @@ def settings(options: argparse.Namespace) -> Settings:
 
 
 def add_size(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--width", type=int, metavar="PIXELS", help="size; with one of the two, the other keeps the proportions"
+    group = command.add_argument_group("size")
+    group.add_argument(
+        "--width",
+        type=whole_number,
+        metavar="PIXELS",
+        help="of the picture; with one of the two, the other keeps the proportions",
     )
-    command.add_argument("--height", type=int, metavar="PIXELS")
+    group.add_argument("--height", type=whole_number, metavar="PIXELS")
 
 
 def size(options: argparse.Namespace) -> tuple[int | None, int | None]:
@@ -66,19 +76,21 @@ def size(options: argparse.Namespace) -> tuple[int | None, int | None]:
 
 def add_raster(command: argparse.ArgumentParser) -> None:
     """How numbers stored in a file of heights are to be read."""
-    command.add_argument("--z-scale", type=float, default=1.0, metavar="S", help="heights are multiplied by it [1]")
-    command.add_argument("--nodata", type=float, metavar="V", help="a stored value that means no height [as the file says]")
+    group = command.add_argument_group("heights as they are stored")
+    group.add_argument("--z-scale", type=float, default=1.0, metavar="S", help="heights are multiplied by it [1]")
+    group.add_argument("--nodata", type=float, metavar="V", help="a stored value that means no height [as the file says]")
 
 
 def add_machine(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
+    group = command.add_argument_group("machine")
+    group.add_argument(
         "--devices",
-        type=int,
+        type=whole_number,
         metavar="N",
         help="cores that share the work, each with a copy [all, at most 16, fewer for a small picture]",
     )
-    command.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
-    command.add_argument(
+    group.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
+    group.add_argument(
         "--no-cache", dest="cache", action="store_false",
         help="keep no compiled programs for the next run [kept in the folder JAXHF_CACHE, by default one in the user's cache "
         "folder; JAXHF_CACHE=off: keep none]",

@@ -3,12 +3,16 @@
 import argparse
 from typing import Any
 
-from . import mapping
+from . import arguments, mapping
 
 
 def add(commands: Any) -> None:
     about = "Map where slopes face: degrees clockwise from north in 32-bit floats, -9999 where flat, as gdaldem aspect."
-    command = commands.add_parser("aspect", help="map where slopes face", description=about)
+    examples = arguments.examples(
+        "jaxhf aspect terrain.tif -o aspect.tif",
+        "jaxhf aspect terrain.tif -o aspect.tif --zero-for-flat --compute-edges",
+    )
+    command = commands.add_parser("aspect", help="map where slopes face", description=about, epilog=examples)
     mapping.add_files(command, ".tif (keeps its place) or .npy")
     command.add_argument("--trigonometric", action="store_true", help="counterclockwise from east")
     command.add_argument("--zero-for-flat", action="store_true", help="0 in place of -9999")

@@ -22,7 +22,7 @@ def scene_lines(scene: "Scene") -> Iterator[str]:
         place = "" if obj.world_from_object is None else ", with a transform"
         yield f"object {k}: {what}, {_material(obj.material)}{place}"
     for k, light in enumerate(scene.lights):
-        values = ", ".join(f"{name} {_numbers(value)}" for name, value in vars(light).items())
+        values = ", ".join(f"{name} {_numbers(value)}" for name, value in vars(light).items() if value is not None)
         yield f"light {k}: {type(light).__name__}, {values}"
 
 
@@ -78,4 +78,4 @@ def _material(material: Any) -> str:
 
 
 def _numbers(values: Any) -> str:
-    return "(" + ", ".join(f"{float(value):.6g}" for value in values) + ")"
+    return "(" + ", ".join(f"{float(value):.6g}" for value in np.ravel(values)) + ")"

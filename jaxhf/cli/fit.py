@@ -2,11 +2,14 @@
 
 import argparse
 import dataclasses
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import ArgumentError
 from . import arguments, interruption
+from .overwriting import require_no_input
 
 if TYPE_CHECKING:
     from ..fitting.fit import Fit
@@ -15,7 +18,12 @@ if TYPE_CHECKING:
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("fit", help="recover heights from pictures", description="Recover heights from pictures.")
+    about = "Recover heights from pictures. Beside OUT stand OUT_std and OUT_albedo.npy, where they are asked for."
+    examples = arguments.examples(
+        "jaxhf fit case.toml -o heights.tif --report report.html",
+        "jaxhf fit case.toml -o heights.tif --resume",
+    )
+    command = commands.add_parser("fit", help="recover heights from pictures", description=about, epilog=examples)
     command.add_argument("case", metavar="CASE", help="a .toml file: a scene, its pictures, and what is known")
     command.add_argument("-o", "--output", required=True, metavar="OUT", help="the heights: .npy, .npz or .tif")
     command.add_argument("--report", metavar="PAGE", help="an .html page with plots of heights, pictures and convergence")
@@ -26,8 +34,12 @@ def add(commands: Any) -> None:
 
 def run(options: argparse.Namespace) -> None:
     outputs = Outputs(Path(options.output), Path(options.report) if options.report else None, options.resume)
+    require_no_input(options, outputs.std, outputs.albedo)
     arguments.set_up_jax(options)
-    print(fit_file(options.case, outputs, options.precision))
+    report, warnings = fit_file(options.case, outputs, options.precision)
+    print(report)
+    for warning in warnings:
+        print(f"jaxhf: warning: {warning}", file=sys.stderr)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,8 +85,11 @@ class Outputs:
         return self.heights.with_name(f"{self.heights.name}.checkpoint")
 
 
-def fit_file(path: str, outputs: Outputs, precision: str) -> str:
-    """Fits what a file asks for and writes the results; returns lines about them, the last of them why the fit stopped.
+def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence[str]]:
+    """Fits what a file asks for and writes the results.
+
+    Returns:
+      Lines about them, the last of them why the fit stopped; and what speaks against trusting them.
 
     Raises:
       FileNotFoundError, ValueError: anything that is wrong in the file, before anything is traced.
@@ -88,8 +103,10 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
     from ..io.toml.fit import load_case
     from .limits import require_memory
     from .progress import bar
+    from .scene_warnings import warn
 
     case = load_case(path, np.dtype(precision))
+    warn(case.scenes)
     require_memory(case.scenes[0], jax.local_device_count())
     options: dict[str, Any] = {"checkpoint": outputs.checkpoint, "resume": outputs.resume, **case.options}
     interruption.raise_from_now_on()
@@ -131,8 +148,7 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> str:
         f"{found.stats['steps']} steps, {found.stats['seconds']:.3g} s, loss {found.stats['loss']:.6g}, "
         f"chi2 {found.stats['chi2']:.4g}"
     )
-    lines += [f"warning: {warning}" for warning in found.warnings]
-    return "\n".join(lines)
+    return "\n".join(lines), found.warnings
 
 
 def _views(case: "Case", found: "Fit") -> list[str]:

@@ -8,17 +8,13 @@ from typing import Any
 from . import arguments, interruption
 from .skyview import add_terrain, read
 
-_EXAMPLES = """examples:
-  jaxhf horizon dem.tif -o horizon.npy --azimuths 36
-  jaxhf horizon dem.tif -o west.tif --azimuth 270"""
-
 
 def add(commands: Any) -> None:
     about = "Map horizon angles, in degrees above the horizontal, at least 0: exact and without a search radius."
-    command = commands.add_parser(
-        "horizon", help="map the horizon angles of a terrain", description=about, epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    examples = arguments.examples(
+        "jaxhf horizon dem.tif -o horizon.npy --azimuths 36", "jaxhf horizon dem.tif -o west.tif --azimuth 270"
+    )
+    command = commands.add_parser("horizon", help="map the horizon angles of a terrain", description=about, epilog=examples)
     add_terrain(command, "the map: .npy of shape (azimuths, rows, columns), or .tif, one file an azimuth: OUT_090.tif")
     command.add_argument("--azimuth", type=float, metavar="DEGREES", help="one direction, from north, clockwise, in its place")
     command.set_defaults(run=run)

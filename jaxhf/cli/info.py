@@ -9,7 +9,11 @@ from . import arguments
 
 def add(commands: Any) -> None:
     about = "Print what a scene or a terrain file holds."
-    command = commands.add_parser("info", help="print what a scene or a terrain file holds", description=about)
+    examples = arguments.examples(
+        "jaxhf info terrain.tif",
+        "jaxhf info scene.toml",
+    )
+    command = commands.add_parser("info", help="print what a scene or a terrain file holds", description=about, epilog=examples)
     command.add_argument("file", metavar="FILE", help=f"a .toml or .pbrt scene; heights: {arguments.TERRAIN}")
     command.set_defaults(run=run)
 
@@ -26,7 +30,9 @@ def run(options: argparse.Namespace) -> None:
         return
     from ..io.scenes import load_scene
     from .describe import scene_lines
+    from .scene_warnings import warn
 
     scene = load_scene(options.file)
     print(f"{options.file}: {scene.camera.width} x {scene.camera.height} pixels, {scene.samples} samples a pixel")
     print("\n".join(scene_lines(scene)))
+    warn([scene])

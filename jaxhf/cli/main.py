@@ -1,6 +1,7 @@
 """The command line: how it begins and how errors end. Ctrl-C is looked after first; all else is imported after that."""
 
 import gc
+import os
 import sys
 import warnings
 from collections.abc import Sequence
@@ -9,7 +10,7 @@ from . import interruption
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns its exit code: 0, 2 after an error of the user's, 130 after Ctrl-C.
+    """Runs one command; returns its exit code: 0, 2 after an error of the user's, 130 after Ctrl-C, 141 where nobody reads on.
 
     Args:
       arguments: None: those of this process, which then is the command's, also in what Ctrl-C does to it.
@@ -18,7 +19,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         interruption.end_at_once()
         gc.set_threshold(50_000, 50, 100)  # tracing makes many objects that live on, and so do imports
     from ..core.errors import UserError
+    from .overwriting import require_no_input
     from .parser import make_parser
+    from .progress import quiet
 
     options = make_parser().parse_args(arguments)
     try:
@@ -27,10 +30,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = lambda message, *_, **__: print(
                 f"jaxhf: warning: {' '.join(str(message).split())}", file=sys.stderr
             )
-            options.run(options)
+            require_no_input(options)
+            with quiet(options.quiet):
+                options.run(options)
+                sys.stdout.flush()
     except KeyboardInterrupt as stopped:
         print(f"\njaxhf: {str(stopped) or 'interrupted'}", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # of `jaxhf info x | head -1`: who reads has enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where Python flushes the rest at the end
+        return 128 + 13
     except (UserError, OSError) as error:
         print(f"jaxhf: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

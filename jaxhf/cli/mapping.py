@@ -8,42 +8,46 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.errors import UserError
 from ..maps.choices import ALGORITHMS, VARIANTS
+from . import arguments
 
 if TYPE_CHECKING:
     from ..io.terrain import Terrain
 
 
 def add_files(command: argparse.ArgumentParser, written: str) -> None:
-    command.add_argument("terrain", metavar="IN", help="heights: GeoTIFF and other rasters, .npy, .npz, .png (16 bits)")
+    command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("-o", "--output", required=True, metavar="OUT", help=f"the map: {written}")
     command.add_argument("--nodata", type=float, metavar="V", help="a stored value that means no height [as the file says]")
 
 
 def add_spacing(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
+    group = command.add_argument_group("spacing")
+    group.add_argument(
         "--scale",
         type=float,
         metavar="S",
         help="vertical units in a horizontal one [1; degrees are measured in metres at the middle latitude]",
     )
-    command.add_argument("--dx", type=float, metavar="D", help="spacing of the columns [as the file says]")
-    command.add_argument("--dy", type=float, metavar="D", help="spacing of the rows [as the file says]")
+    group.add_argument("--dx", type=float, metavar="D", help="spacing of the columns [as the file says]")
+    group.add_argument("--dy", type=float, metavar="D", help="spacing of the rows [as the file says]")
 
 
 def add_slope(command: argparse.ArgumentParser, edges: bool = True) -> None:
-    command.add_argument("--algorithm", choices=ALGORITHMS, default="horn", help="slopes from eight neighbours or four [horn]")
+    group = command.add_argument_group("slopes")
+    group.add_argument("--algorithm", choices=ALGORITHMS, default="horn", help="slopes from eight neighbours or four [horn]")
     if edges:
-        command.add_argument("--compute-edges", action="store_true", help="also at the border and beside holes")
+        group.add_argument("--compute-edges", action="store_true", help="also at the border and beside holes")
 
 
 def add_light(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
+    group = command.add_argument_group("light")
+    group.add_argument(
         "--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the light, from north, clockwise [315]"
     )
-    command.add_argument("--altitude", type=float, default=45.0, metavar="DEGREES", help="of the light, above the horizon [45]")
-    command.add_argument("--z-factor", type=float, default=1.0, metavar="Z", help="heights are multiplied by it [1]")
-    command.add_argument("--variant", choices=VARIANTS, default="regular", help="kind of hillshade [regular]")
-    command.add_argument(
+    group.add_argument("--altitude", type=float, default=45.0, metavar="DEGREES", help="of the light, above the horizon [45]")
+    group.add_argument("--z-factor", type=float, default=1.0, metavar="Z", help="heights are multiplied by it [1]")
+    group.add_argument("--variant", choices=VARIANTS, default="regular", help="kind of hillshade [regular]")
+    group.add_argument(
         "--shadows", action="store_true", help="what terrain keeps the light from is black: shadows as they fall"
     )
 

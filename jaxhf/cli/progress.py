@@ -1,10 +1,64 @@
-"""Progress bars: on a terminal only, and gone when the work is done."""
+"""Progress bars: on a terminal only, not under --quiet, and gone when the work is done."""
 
-from typing import Any
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+_QUIET = ContextVar("_QUIET", default=False)
+
+
+@contextlib.contextmanager
+def quiet(wanted: bool) -> Iterator[None]:
+    """Within, standard output is dropped and no bar is shown, if that is wanted; warnings and errors are as ever."""
+    if not wanted:
+        yield
+        return
+    token = _QUIET.set(True)
+    try:
+        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+            yield
+    finally:
+        _QUIET.reset(token)
+
+
+def is_quiet() -> bool:
+    return _QUIET.get()
 
 
 def bar(**options: Any) -> "tqdm[Any]":
     """A bar on standard error, as `tqdm` with these options; in a pipe it shows nothing."""
-    return tqdm(disable=None, leave=False, dynamic_ncols=True, **options)
+    from tqdm import tqdm
+
+    return tqdm(disable=True if is_quiet() else None, leave=False, dynamic_ncols=True, **options)
+
+
+@contextlib.contextmanager
+def compiled_bar(compiling: Callable[[], float], **options: Any) -> Iterator[Callable[[int, int], None]]:
+    """A bar that says "compiling" until the first report, and from then on how much of the time is left.
+
+    Args:
+      compiling: the seconds that went to compilation since the bar began: what is left is estimated without them.
+      options: of `bar`.
+
+    Yields:
+      What is to be called with (done, in all): the `progress` of `render`.
+    """
+    with bar(bar_format="{desc}", desc="compiling", smoothing=0, **options) as shown:
+
+        def advance(done: int, total: int) -> None:
+            if shown.disable:
+                return
+            if shown.bar_format:
+                shown.bar_format = None
+                shown.set_description_str(refresh=False)
+                shown.start_t += compiling()
+                shown.last_print_t = 0  # the first report is shown, however soon it comes
+            shown.total = total
+            shown.update(done - shown.n)
+
+        yield advance

@@ -15,7 +15,12 @@ if TYPE_CHECKING:
 
 
 def add(commands: Any) -> None:
-    command = commands.add_parser("render", help="render a scene to a picture", description="Render a scene to a picture.")
+    examples = arguments.examples(
+        "jaxhf render scene.toml -o picture.png --width 960",
+        "jaxhf render scene.toml -o picture.exr --samples 16 --aovs depth,normal",
+    )
+    about = "Render a scene to a picture."
+    command = commands.add_parser("render", help="render a scene to a picture", description=about, epilog=examples)
     command.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
     command.add_argument(
         "-o", "--output", required=True, metavar="OUT", help="the picture: .png (sRGB), .exr, .npy or .pfm (linear)"
@@ -46,11 +51,16 @@ def draw(options: argparse.Namespace, load: "Callable[[], Scene]", aovs: tuple[s
       saving: for `save_image`.
     """
     from ..io.images import require_writable
+    from ..rendering.aovs import known_aovs
+    from .scene_warnings import warn
 
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)
-    image, found, report = _timed_render(load(), settings, options.devices, aovs)
+    aovs = known_aovs("render", aovs)
+    scene = load()
+    warn([scene])
+    image, found, report = _timed_render(scene, settings, options.devices, aovs)
     finish(options.output, image, report, aovs=found, **saving)
 
 
@@ -96,7 +106,7 @@ def _timed_render(
     from ..rendering.render import render
     from ..trace.world import resolve_settings
     from .limits import require_memory, worthwhile_devices
-    from .progress import bar
+    from .progress import compiled_bar
 
     samples = resolve_settings(settings, scene).samples or 1
     on_host = devices is None and jax.default_backend() == "cpu"
@@ -104,12 +114,7 @@ def _timed_render(
     require_memory(scene, mesh.size)
     compiling = _CompileTime()
     begin = time.perf_counter()
-    with bar(unit=" pixels", unit_scale=True, delay=0.5) as shown:
-
-        def advance(done: int, total: int) -> None:
-            shown.total = total
-            shown.update(done - shown.n)
-
+    with compiled_bar(lambda: compiling.seconds, unit=" pixels", unit_scale=True) as advance:
         image, found = render(scene, settings, aovs=tuple(dict.fromkeys(("exhausted", *aovs))), progress=advance, mesh=mesh)
     elapsed = time.perf_counter() - begin
     seconds = max(elapsed - compiling.seconds, 1e-9)

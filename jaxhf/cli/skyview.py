@@ -9,17 +9,13 @@ from . import arguments, interruption
 if TYPE_CHECKING:
     from ..io.terrain import Terrain
 
-_EXAMPLES = """examples:
-  jaxhf skyview dem.tif -o sky.tif
-  jaxhf skyview dem.tif -o sky.png --azimuths 64 --weighting slope"""
-
 
 def add(commands: Any) -> None:
     about = "Map the sky-view factor: the share of the sky that the terrain leaves to see, exact and without a search radius."
-    command = commands.add_parser(
-        "skyview", help="map the sky-view factor of a terrain", description=about, epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    examples = arguments.examples(
+        "jaxhf skyview dem.tif -o sky.tif", "jaxhf skyview dem.tif -o sky.png --azimuths 64 --weighting slope"
+    )
+    command = commands.add_parser("skyview", help="map the sky-view factor of a terrain", description=about, epilog=examples)
     add_terrain(command, "the map: .tif or .npy (0 to 1), or .png (0 to 255)")
     command.add_argument(
         "--weighting", choices=("solid-angle", "horizontal", "slope"), default="solid-angle",

@@ -4,7 +4,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from . import interruption
+from . import arguments, interruption
 
 if TYPE_CHECKING:
     from ..study.plan import Sweep
@@ -16,18 +16,32 @@ def add(commands: Any) -> None:
         "print the Pareto front of the settings, and keep a table and a plot. What was measured is kept: the same command "
         "goes on after Ctrl-C, and only prints when all is there. It says how long it will take."
     )
-    command = commands.add_parser("tradeoff", help="measure what each setting costs and gains", description=about)
+    examples = arguments.examples(
+        "jaxhf tradeoff scene.toml --quick",
+        "jaxhf tradeoff scene.toml --error 0.01 --knobs samples shading",
+    )
+    command = commands.add_parser(
+        "tradeoff", help="measure what each setting costs and gains", description=about, epilog=examples
+    )
     command.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
     command.add_argument("-o", "--output", metavar="FOLDER", help="for table, references and plot [NAME-tradeoff]")
-    command.add_argument("--error", type=float, metavar="E", help="recommend the cheapest settings within this error")
-    command.add_argument("--time", type=float, metavar="SECONDS", help="recommend the most exact settings within this time")
-    command.add_argument("--quick", action="store_true", help="fewer values, a smaller picture, a coarser reference")
-    command.add_argument("--fit", action="store_true", help="sweep tolerance and levels of a small fit, too")
-    command.add_argument("--knobs", nargs="+", default=(), metavar="KNOB", help="sweep only these")
-    command.add_argument("--width", type=int, metavar="PIXELS", help="size [the scene's, at most 480 for the longer side]")
-    command.add_argument("--devices", type=int, metavar="N", help="cores that share the work [all, at most 16]")
-    command.add_argument("--repeats", type=int, default=5, metavar="N", help="runs whose median is taken [5]")
-    command.add_argument("--markdown", action="store_true", help="print all figures as tables")
+    asked = command.add_argument_group("what is asked")
+    asked.add_argument("--error", type=float, metavar="E", help="recommend the cheapest settings within this error")
+    asked.add_argument("--time", type=float, metavar="SECONDS", help="recommend the most exact settings within this time")
+    measured = command.add_argument_group("what is measured")
+    measured.add_argument("--quick", action="store_true", help="fewer values, a smaller picture, a coarser reference")
+    measured.add_argument("--fit", action="store_true", help="sweep tolerance and levels of a small fit, too")
+    measured.add_argument("--knobs", nargs="+", default=(), metavar="KNOB", help="sweep only these")
+    measured.add_argument(
+        "--width", type=arguments.whole_number, metavar="PIXELS", help="size [the scene's, at most 480 for the longer side]"
+    )
+    measured.add_argument(
+        "--devices", type=arguments.whole_number, metavar="N", help="cores that share the work [all, at most 16]"
+    )
+    measured.add_argument(
+        "--repeats", type=arguments.whole_number, default=5, metavar="N", help="runs whose median is taken [5]"
+    )
+    asked.add_argument("--markdown", action="store_true", help="print all figures as tables")
     command.set_defaults(run=run)
 
 
@@ -70,7 +84,7 @@ def run(options: argparse.Namespace) -> None:
 def _watched(sweep: "Sweep", repeats: int) -> list[str]:
     """Measures what is missing, under a bar on a terminal; returns what failed."""
     from ..study import sweep as sweeping
-    from .progress import bar
+    from .progress import bar, is_quiet
 
     with bar(total=len(sweep.missing())) as shown:
 
@@ -78,5 +92,8 @@ def _watched(sweep: "Sweep", repeats: int) -> list[str]:
             shown.n, shown.total = done, total
             shown.set_postfix_str(what)
 
-        # What is printed on standard output may be a table on its way into a file.
-        return sweeping.run(sweep, repeats, lambda line: shown.write(line, file=sys.stderr), progress)
+        def tell(line: str) -> None:
+            if not is_quiet():
+                shown.write(line, file=sys.stderr)  # standard output may be a table on its way into a file
+
+        return sweeping.run(sweep, repeats, tell, progress)

@@ -22,8 +22,13 @@ _PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
 
 def add(commands: Any) -> None:
     about = "Show a terrain as a solid block in colours, from a place that shows all of it. A .gif or .mp4 goes round it."
-    command = commands.add_parser("view", help="show a terrain: a picture, or a film that goes round it", description=about)
-    command.add_argument("terrain", metavar="IN", help="heights, in any format that can be read")
+    examples = arguments.examples(
+        "jaxhf view dem.tif -o block.png", "jaxhf view dem.tif -o orbit.gif --size 640x400 --frames 48"
+    )
+    command = commands.add_parser(
+        "view", help="show a terrain as a solid block, or fly round it", description=about, epilog=examples
+    )
+    command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("-o", "--output", metavar="OUT", help=".png, .exr, .npy, .pfm; a film: .gif, .mp4 [IN's name, .png]")
     size = command.add_argument_group("picture")
     size.add_argument("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]")
@@ -71,6 +76,7 @@ def run(options: argparse.Namespace) -> None:
     from ..io.films import FILMS, require_writable_film
     from ..io.images import require_writable
     from ..io.load_terrain import load_heights
+    from .overwriting import require_no_input
 
     output = Path(options.output or Path(options.terrain).with_suffix(".png").name)
     film = output.suffix.lower() in FILMS
@@ -83,8 +89,7 @@ def run(options: argparse.Namespace) -> None:
             raise UserError(f"view: --{name} must be {'finite' if low else 'positive and finite'}, it is {value}")
     if options.frames < 2:
         raise UserError(f"view: --frames must be 2 or more, it is {options.frames}")
-    if output.resolve() == Path(options.terrain).resolve():
-        raise UserError(f"view: {output} is the terrain itself; name another file by -o")
+    require_no_input(options, output)
     (require_writable_film if film else require_writable)(output)
     size = _size(options.size)
     begin = time.perf_counter()

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from .errors import ArgumentError, UserError
 from .powers import floor_to_power_of_two
 from .ray import Ray
-from .types import AnyArray, Vector
+from .types import MOST, AnyArray, Vector
 
 
 class Affine(eqx.Module):
@@ -92,6 +92,8 @@ def require_invertible(owner: str, name: str, matrix: Any) -> None:
         return
     if not np.isfinite(matrix).all():
         raise ArgumentError(owner, name, f"must be finite, it is {matrix.tolist()}")
+    if np.abs(matrix).max() > MOST:
+        raise ArgumentError(owner, name, f"must be within -{MOST:g} and {MOST:g}, it is {matrix.tolist()}")
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise ArgumentError(owner, name, f"must be affine (last row 0 0 0 1), its last row is {matrix[3].tolist()}")
     columns = np.abs(matrix[:3, :3]).max(axis=0)

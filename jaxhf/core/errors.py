@@ -1,5 +1,7 @@
 """Errors that are not jaxhf's own: what a caller, or the author of a file, got wrong."""
 
+from typing import Any
+
 
 class UserError(ValueError):
     """A mistake in an argument or a file. The command line shows it as one line; any other ValueError keeps its traceback."""
@@ -23,3 +25,22 @@ class ArgumentError(UserError):
         super().__init__(f"{place}{rule}" if rule.startswith(":") else f"{place} {rule}")
         self.argument = argument
         self.rule = rule.removeprefix(": ")
+
+
+def require_kind(owner: str, argument: str, value: Any, kind: type | tuple[type, ...], wanted: str, hint: str = "") -> None:
+    """ArgumentError where a value is not of this kind.
+
+    Args:
+      owner, argument: see `ArgumentError`.
+      value, kind: as for `isinstance`.
+      wanted: the kind in words, with its article.
+      hint: what may be done instead, for the end of the message.
+    """
+    if not isinstance(value, kind):
+        raise ArgumentError(owner, argument, f"must be {wanted}, it is {kind_of(value)}{hint and '; '}{hint}")
+
+
+def kind_of(value: Any) -> str:
+    """The name of its type, with an article."""
+    name = type(value).__name__
+    return f"{'an' if name[0] in 'AEIOaeio' else 'a'} {name}"

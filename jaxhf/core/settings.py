@@ -14,6 +14,8 @@ Shading = Literal["smooth", "flat"]
 NormalScheme = Literal["central", "four", "six", "six-angle", "six-equal"]
 
 _MOST_CHUNK = 2**20  # of 1024 x 1024 pixels; each device takes 300 bytes a ray
+MOST_SAMPLES = 2**20  # of a grid of 1024 x 1024 in each pixel
+_MOST = 2**31 - 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,6 +117,9 @@ class Settings:
                 continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:
                 raise ArgumentError("Settings", name, f"must be a whole number from {least} on, it is {value!r}")
+            most = MOST_SAMPLES if name == "samples" else _MOST
+            if name != "chunk" and value > most:
+                raise ArgumentError("Settings", name, f"must be at most {most}, it is {value}")
         if self.chunk > _MOST_CHUNK:
             rule = f"must be at most {_MOST_CHUNK}, it is {self.chunk}; with 1024, the default, rays are traced fastest"
             raise ArgumentError("Settings", "chunk", rule)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .errors import ArgumentError
+from .errors import ArgumentError, UserError
 
 # What a leaf of a scene may be: float64 NumPy until the scene is rendered, or whatever JAX array or tracer the caller put
 # there. A type checker takes it for the latter, which it is wherever rays are traced.
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     AnyArray = jax.Array
 else:
     AnyArray = jax.Array | np.ndarray
+
+MOST = 1e30  # of a number in a scene: beyond, products overflow in single precision
 
 Scalar = Float[jax.Array, ""]
 Flag = Bool[jax.Array, ""]
@@ -36,7 +38,11 @@ def float_leaf(value: Any) -> Any:
     """
     if isinstance(value, jax.Array):
         return value if jnp.issubdtype(value.dtype, jnp.inexact) else value.astype(jnp.result_type(float))
-    return np.asarray(value, dtype=np.float64)
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        shown = repr(value)
+        raise UserError(f"{shown if len(shown) <= 60 else type(value).__name__} stands where numbers must") from error
 
 
 def rgb_leaf(value: Any) -> Any:
@@ -54,6 +60,12 @@ def require_number(owner: str, name: str, leaf: Any) -> None:
 
 
 def require_finite(owner: str, name: str, leaf: Any) -> None:
-    """Raises ArgumentError where a value that is known now, not traced, holds a nan or an inf."""
-    if isinstance(leaf, np.ndarray) and not np.isfinite(leaf).all():
+    """Raises ArgumentError where a value that is known now, not traced, holds a nan, an inf, or more than `MOST`."""
+    if not isinstance(leaf, np.ndarray):
+        return
+    if not np.isfinite(leaf).all():
         raise ArgumentError(owner, name, f"must be finite, it is {np.array2string(leaf, separator=', ')}")
+    if not (np.abs(leaf) <= MOST).all():
+        raise ArgumentError(
+            owner, name, f"must be within -{MOST:g} and {MOST:g}, it is {np.array2string(leaf, separator=', ')}"
+        )

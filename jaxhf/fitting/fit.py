@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, require_kind
 from ..core.settings import Settings
 from ..core.types import AnyArray
 from ..io.errors import FileError
@@ -175,7 +175,14 @@ def fit(
       FileNotFoundError, PermissionError: the checkpoint's folder is not there or cannot be written to, before as well.
       KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
+    for name, values in (("scenes", scenes), ("targets", targets)):
+        if isinstance(values, Scene | str):
+            raise ArgumentError("fit", name, f"must be a list, one for each picture, it is a {type(values).__name__}")
     scenes, targets = tuple(scenes), tuple(targets)
+    for k, target in enumerate(targets):
+        if isinstance(target, str | Path):
+            raise ArgumentError("fit", f"targets[{k}]", f"must be an image, it is a name: jaxhf.load_image({str(target)!r})")
+    require_kind("fit", "settings", settings or Settings(), Settings, "a jaxhf.Settings")
     options = FitOptions(
         settings=settings or Settings(), weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
         prior_length=prior_length, prior_exponent=prior_exponent, smoothness=smoothness, albedo=albedo,

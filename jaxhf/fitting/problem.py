@@ -331,7 +331,11 @@ def _require_alike(k: int, scene: Scene, first: Scene) -> None:
 def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray, np.ndarray]:
     """Target and weight of one picture, shape (h, w, c); what has no weight is zero."""
     size = (scene.camera.height, scene.camera.width)
-    target = np.asarray(target, np.float64)
+    target = np.asarray(target)
+    if target.dtype.kind not in "fV":  # the latter are bfloat16 and its like
+        rule = f"must hold linear radiance in floats, 1 being white; it holds {target.dtype} (load_image decodes a picture)"
+        raise ArgumentError("fit", f"targets[{k}]", rule)
+    target = target.astype(np.float64)
     if target.shape not in (size, (*size, 1), (*size, 3)):
         raise ArgumentError(
             "fit", f"targets[{k}]", f"must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}"

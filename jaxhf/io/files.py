@@ -4,7 +4,7 @@ import contextlib
 import math
 import os
 import secrets
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,6 +18,12 @@ MAX_PIXELS = 2**28  # 16384 x 16384, for images and for grids of heights
 
 PathLike = str | os.PathLike[str]
 Codec = TypeVar("Codec")
+_KINDS = {
+    **dict.fromkeys((".toml", ".pbrt"), "a scene, for jaxhf render"),
+    **dict.fromkeys((".tif", ".tiff", ".npz", ".asc", ".hgt"), "a terrain, for jaxhf hillshade, relief or convert"),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".exr", ".npy", ".pfm"), "a picture"),
+    **dict.fromkeys((".glb", ".obj", ".ply"), "a mesh"),
+}
 
 
 def by_ending(codecs: Mapping[str, Codec], path: Path, task: str) -> Codec:
@@ -25,8 +31,17 @@ def by_ending(codecs: Mapping[str, Codec], path: Path, task: str) -> Codec:
     ending = path.suffix.lower()
     if ending not in codecs:
         named = f"the ending {path.suffix!r}" if ending else "a name without an ending"
-        raise FileError(f"{path}: cannot {task} {named}; {nearest(ending, codecs)}")
+        raise FileError(f"{path}: cannot {task} {named}; {_fitting(ending, codecs, task)}")
     return codecs[ending]
+
+
+def _fitting(ending: str, known: Iterable[str], task: str) -> str:
+    """A tail for an error about an ending: the one that was meant; all that would do, where it is another kind of file."""
+    known = sorted(known)
+    if ending not in _KINDS:
+        return nearest(ending, known, cutoff=0.7)
+    is_other = task.startswith("read") and _KINDS[ending] not in map(_KINDS.get, known)
+    return f"known: {', '.join(known)}" + is_other * f"; this is {_KINDS[ending]}"
 
 
 def require_file(path: PathLike) -> Path:

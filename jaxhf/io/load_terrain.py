@@ -79,7 +79,7 @@ def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = No
         terrain = reader(path, nodata, nodata_overrules)
         if z_scale == 1:
             return terrain
-        with np.errstate(over="ignore"):
+        with np.errstate(over="ignore", invalid="ignore"):
             scaled = terrain.heights * terrain.heights.dtype.type(z_scale)
         if np.isinf(scaled).any():
             raise FileError(f"heights times z_scale must fit into {scaled.dtype}, z_scale is {z_scale}")

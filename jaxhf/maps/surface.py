@@ -64,7 +64,8 @@ def surface(
 def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:
     values = np.asarray(heights)
     if values.dtype.kind not in "fiu":
-        raise ArgumentError(owner, "heights", f"must be real numbers, their dtype is {values.dtype}")
+        given = f"of {values.dtype}" if isinstance(heights, np.ndarray) else f"a {type(heights).__name__}"
+        raise ArgumentError(owner, "heights", f"must be an array of real numbers or a Terrain, they are {given}")
     if values.ndim != 2 or min(values.shape) < 2:
         raise ArgumentError(owner, "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {values.shape}")
     if values.dtype not in (np.float32, np.float64):
@@ -78,6 +79,8 @@ def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:
 def require_positive(owner: str, name: str, value: float) -> None:
     if not (math.isfinite(value) and value > 0):
         raise ArgumentError(owner, name, f"must be positive and finite, it is {value}")
+    if not 1e-30 <= value <= 1e30:
+        raise ArgumentError(owner, name, f"must be from 1e-30 to 1e30, it is {value}")
 
 
 def require_one_of(owner: str, name: str, value: str, known: tuple[str, ...]) -> None:

@@ -1,10 +1,12 @@
 """Arbitrary output variables: what a picture's rays met, besides their radiance."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from ..core.errors import ArgumentError
 from ..core.ray import Ray
 from ..shade.lighting import in_shadow
 from ..trace.world import World, first_hit
@@ -17,6 +19,17 @@ footprint. status: see `Status`. object: its number in the scene, -1 for none. c
 light but the sky, whether it fails to reach the hit (blocked, or behind the surface). steps: taken by the search for the hit,
 over all objects. exhausted: walks that ran out of steps, over all samples of the pixel, shadow and mirrored rays included.
 """
+
+
+def known_aovs(owner: str, names: Any) -> tuple[str, ...]:
+    """The names, if all are among `AOVS`; else an ArgumentError."""
+    if isinstance(names, str) or names is None:
+        raise ArgumentError(owner, "aovs", f"must be a list of names, as in aovs=('depth',); it is {names!r}")
+    names = tuple(names)
+    for name in names:
+        if name not in AOVS:
+            raise ArgumentError(owner, "aovs", f"must be among {', '.join(AOVS)}; one is {name!r}")
+    return names
 
 
 def observe(world: World, ray: Ray, aovs: tuple[str, ...]) -> dict[str, jax.Array]:

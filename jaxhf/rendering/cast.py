@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..core.autodiff import recomputed
 from ..core.compilation import compiled
-from ..core.errors import ArgumentError, UserError
+from ..core.errors import ArgumentError, UserError, require_kind
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import float_leaf
@@ -67,13 +67,20 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings | None = N
     Raises:
       ValueError: `o` or `d` does not end in an axis of length 3, or not exactly one of `o` and `leaving` is None.
     """
+    if not all(hasattr(heightfield, name) for name in ("heights", "dx", "dy", "x0", "y0")):
+        hint = "a scene has .heightfields" if isinstance(heightfield, Scene) else "jaxhf.Heightfield(heights, dx, dy) makes one"
+        require_kind("cast", "heightfield", heightfield, Heightfield, "a jaxhf.Heightfield", hint)
+    require_kind("cast", "settings", settings or Settings(), Settings, "a jaxhf.Settings")
+    if leaving is not None:
+        require_kind("cast", "leaving", leaving, Hit, "the Hit that an earlier cast returned")
     dtype = heightfield.heights.dtype
     corner = np.array([heightfield.x0, heightfield.y0, 0.0])
     if (o is None) == (leaving is None):
         raise UserError("cast: rays start at o or at the hits that they are leaving, and one of the two must be None")
     for name, value in (("o", o), ("d", d)):
-        if value is not None and np.shape(value)[-1:] != (3,):
-            raise ArgumentError("cast", name, f"must have shape (..., 3), its shape is {np.shape(value)}")
+        shape = () if value is None else np.shape(value)
+        if (value is not None or name == "d") and shape[-1:] != (3,):
+            raise ArgumentError("cast", name, f"must have shape (..., 3), its shape is {shape}")
     if leaving is not None:
         start, axes = leaving, leaving.t.ndim
     elif isinstance(o, jax.Array):
@@ -82,7 +89,13 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings | None = N
     else:
         start, axes = jnp.asarray(np.asarray(o, np.float64) - corner, dtype), np.ndim(o) - 1
     d = jnp.asarray(d, dtype)
-    batch = np.broadcast_shapes(jax.tree.leaves(start)[0].shape[:axes], d.shape[:-1])
+    starting = jax.tree.leaves(start)[0].shape[:axes]
+    try:
+        batch = np.broadcast_shapes(starting, d.shape[:-1])
+    except ValueError as error:
+        raise ArgumentError(
+            "cast", "d", f"must fit the {starting} rays that start, its leading axes are {d.shape[:-1]}"
+        ) from error
 
     def in_a_row(leaf: jax.Array, tail: tuple[int, ...]) -> jax.Array:
         return jnp.broadcast_to(leaf, (*batch, *tail)).reshape(-1, *tail)

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
+from pathlib import PurePath
 from typing import Any
 
 import equinox as eqx
@@ -19,13 +20,13 @@ from ..boundary.term import Boundaries, default_key, draw_boundaries, moved_ligh
 from ..core.autodiff import with_tangent
 from ..core.compilation import compiled, is_traced
 from ..core.devices import local_mesh, map_over, on_every_device
-from ..core.errors import ArgumentError, UserError
+from ..core.errors import UserError, require_kind
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.localise import localise, localise_camera
 from ..scene.scene import Scene
 from ..trace.world import World, make_world, resolve_settings
-from .aovs import AOVS
+from .aovs import known_aovs
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, trace_tiles
 
@@ -57,6 +58,7 @@ def prepare(scene: Scene, settings: Settings | None = None, *, mesh: Mesh | None
 
     The arguments are those of `render`.
     """
+    _require_scene("prepare", scene, Scene)
     settings, mesh = resolve_settings(settings or Settings(), scene), local_mesh() if mesh is None else mesh
     make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
     return Prepared(scene, mesh, make(on_every_device(localise(scene), mesh), settings=settings))
@@ -94,10 +96,8 @@ def render(
     Raises:
       ValueError: an unknown AOV, or settings or a mesh for a scene that was prepared with others.
     """
-    aovs = tuple(aovs)
-    for name in aovs:
-        if name not in AOVS:
-            raise ArgumentError("render", "aovs", f"must be among {', '.join(AOVS)}; one is {name!r}")
+    _require_scene("render", scene, (Scene, Prepared))
+    aovs = known_aovs("render", aovs)
     if not isinstance(scene, Prepared) and (progress is not None or scene.sky_occlusion is not None):
         scene, settings = prepare(scene, settings, mesh=mesh), None
     if isinstance(scene, Prepared):
@@ -117,6 +117,19 @@ def render(
         outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
+
+
+def _require_scene(owner: str, scene: Any, kind: type | tuple[type, ...]) -> None:
+    hint = ""
+    if isinstance(scene, str | PurePath):
+        hint = "jaxhf.load_scene reads one from a file"
+    elif isinstance(scene, list | tuple):
+        hint = f"{owner} takes one at a time"
+    elif hasattr(scene, "heights"):
+        hint = "which has a camera and lights besides: jaxhf.Scene([jaxhf.Object(heightfield)], camera, lights)"
+    elif isinstance(scene, Prepared):
+        hint = "whose .scene can be prepared anew"
+    require_kind(owner, "scene", scene, kind, "a jaxhf.Scene", hint)
 
 
 def _key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:

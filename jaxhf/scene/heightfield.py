@@ -1,7 +1,7 @@
 """Heights on a regular grid."""
 
 import math
-from typing import Any
+from typing import Any, SupportsFloat
 
 import equinox as eqx
 import jax
@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, require_kind
 from ..core.powers import next_power_of_two
 from ..core.types import AnyArray
 from .show import known, number, numbers
 
 # So that a walk's state fits into 32 bits; each side of the grid counts as the next power of two.
 MOST_CELLS = 2**28
+_FARTHEST = 1e18  # whose square and inverse square are numbers in single precision
 
 
 def _heights(value: Any) -> jax.Array:
@@ -65,6 +66,8 @@ class Heightfield(eqx.Module):
                 "must have at most 2**28 cells, each side rounded up to a power of two; "
                 f"shape {shape} makes {padded[0]} x {padded[1]}",
             )
+        for name, value in (("dx", dx), ("dy", dy), ("x0", x0), ("y0", y0)):
+            require_kind("Heightfield", name, 0.0 if value is None else value, SupportsFloat, "one number")
         square = dx if dy is None else dy  # one of the two alone counts for both
         self.dx = float(1 / (shape[1] - 1) if square is None else square if dx is None else dx)
         self.dy = float(1 / (shape[0] - 1) if square is None else square if dy is None else dy)
@@ -73,6 +76,8 @@ class Heightfield(eqx.Module):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise ArgumentError("Heightfield", name, f"must be positive and finite, it is {value}")
+            if not 1 / _FARTHEST <= value <= _FARTHEST:
+                raise ArgumentError("Heightfield", name, f"must be from {1 / _FARTHEST:g} to {_FARTHEST:g}, it is {value}")
         for name in ("x0", "y0"):
             if not math.isfinite(getattr(self, name)):
                 raise ArgumentError("Heightfield", name, f"must be finite, it is {getattr(self, name)}")

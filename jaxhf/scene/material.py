@@ -27,7 +27,8 @@ class Matte(eqx.Module):
     def __check_init__(self):
         if not isinstance(self.albedo, ImageTexture):
             if self.albedo.shape != (3,):
-                raise ArgumentError("Matte", "albedo", f"must be one number or three, its shape is {self.albedo.shape}")
+                hint = "; an image is an ImageTexture" if len(self.albedo.shape) > 1 else ""
+                raise ArgumentError("Matte", "albedo", f"must be one number or three, its shape is {self.albedo.shape}{hint}")
             require_finite("Matte", "albedo", self.albedo)
 
     def __repr__(self) -> str:

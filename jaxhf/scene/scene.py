@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.affine import require_invertible
-from ..core.errors import ArgumentError, UserError
+from ..core.errors import ArgumentError, UserError, kind_of
+from ..core.settings import MOST_SAMPLES
 from ..core.types import AnyArray, MatrixLeaf, float_leaf
 from .camera import Camera
 from .cylinder import Cylinder
@@ -21,6 +22,12 @@ from .show import numbers
 from .skirt import Skirt
 
 Shape = Heightfield | Cylinder | Skirt
+
+
+def _listed(values: Any) -> tuple[Any, ...]:
+    if not isinstance(values, Iterable):
+        raise UserError(f"Scene: objects and lights must be lists of them, here {kind_of(values)} stands alone")
+    return tuple(values)
 
 
 class Object(eqx.Module):
@@ -62,9 +69,9 @@ class Scene(eqx.Module):
       samples: rays a pixel that the scene asks for; `Settings.samples` overrules it.
     """
 
-    objects: tuple[Object, ...] = eqx.field(converter=tuple)
+    objects: tuple[Object, ...] = eqx.field(converter=_listed)
     camera: Camera
-    lights: tuple[Light, ...] = eqx.field(converter=tuple, default=())
+    lights: tuple[Light, ...] = eqx.field(converter=_listed, default=())
     samples: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
@@ -77,7 +84,8 @@ class Scene(eqx.Module):
         ):
             for value in values:
                 if not isinstance(value, kinds):
-                    raise ArgumentError("Scene", name, f"does not take a {type(value).__name__}")
+                    hint = ", jaxhf.Object(shape, material) does" if name == "objects" and isinstance(value, Shape) else ""
+                    raise ArgumentError("Scene", name, f"does not take a {type(value).__name__}{hint}")
         if sum(isinstance(light, Sky) for light in self.lights) > 1:
             raise ArgumentError("Scene", "lights", "may hold one Sky, they hold more")
         if self.sky_occlusion is not None:
@@ -87,6 +95,8 @@ class Scene(eqx.Module):
                     raise ArgumentError("Scene", f"objects[{number}].world_from_object", rule)
         if not isinstance(self.samples, int) or self.samples < 1:
             raise ArgumentError("Scene", "samples", f"must be a whole number from 1 on, it is {self.samples!r}")
+        if self.samples > MOST_SAMPLES:
+            raise ArgumentError("Scene", "samples", f"must be at most {MOST_SAMPLES}, it is {self.samples}")
 
     @property
     def sky_occlusion(self) -> int | None:

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -12,9 +13,8 @@ from ..core.types import AnyArray, Point2, Vector, float_leaf
 
 
 def _texels(value: Any) -> Any:
-    dtype = getattr(value, "dtype", None)
-    if dtype is not None and not np.issubdtype(dtype, np.floating):
-        rule = f"must be linear floats, 0 to 1, they are {dtype}; load_image makes them of a picture"
+    if isinstance(value, np.ndarray | jax.Array) and value.dtype.kind in "bu":
+        rule = f"must hold linear colours in floats, 1 being white; theirs are {value.dtype} (load_image decodes a picture)"
         raise ArgumentError("ImageTexture", "texels", rule)
     return float_leaf(value)
 

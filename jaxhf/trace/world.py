@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Float
 
 from ..core.affine import affine
+from ..core.errors import require_kind
 from ..core.masked import only_where
 from ..core.materialise import materialise
 from ..core.ray import Ray
@@ -66,6 +67,7 @@ class World(eqx.Module):
 
 def resolve_settings(settings: Settings, scene: Scene) -> Settings:
     """The settings with what they leave to the scene filled in."""
+    require_kind("", "settings", settings, Settings, "a jaxhf.Settings")
     samples = scene.samples if settings.samples is None else settings.samples
     return dataclasses.replace(settings, samples=grid_side(samples) ** 2, edge_samples=settings.edge_samples or 0)
 

@@ -305,7 +305,7 @@ BAD = {
     ),
     "negative width": (GOOD, "scene.toml", ["--width", "-4"], r"--width must be .* it is -4"),
     "zero height": (GOOD, "scene.toml", ["--height", "0"], r"--height must be .* it is 0"),
-    "size that is no number": (GOOD, "scene.toml", ["--width", "wide"], r"--width: .*'wide'"),
+    "size that is no number": (GOOD, "scene.toml", ["--width", "wide"], r"--width must be .*'wide'"),
     "negative width in the scene": (
         {"scene.toml": CAMERA + "width = -3\n" + FIELD},
         "scene.toml",
@@ -313,7 +313,7 @@ BAD = {
         r"scene\.toml:5: .*width must be .*-3",
     ),
     "samples that are no square": (GOOD, "scene.toml", ["--samples", "3"], r"samples must be a square number .* it is 3"),
-    "chunk that is no number": (GOOD, "scene.toml", ["--chunk", "many"], r"--chunk: .*'many'"),
+    "chunk that is no number": (GOOD, "scene.toml", ["--chunk", "many"], r"--chunk must be .*'many'"),
     "chunk of a whole picture and more": (GOOD, "scene.toml", ["--chunk", "1e8"], r"chunk must be at most 1048576, .*1024"),
     "unknown shading": (GOOD, "scene.toml", ["--shading", "x"], r"shading.*smooth.*flat.*'x'"),
     "unknown traversal": (GOOD, "scene.toml", ["--traversal", "x"], r"traversal.*'x'"),

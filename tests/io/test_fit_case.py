@@ -301,7 +301,7 @@ BAD = {
     "wrong levels": (WHOLE + '\n[fit]\nlevels = ["a"]\n', r":18: fit\.levels must be a list of finite numbers"),
     "wrong uncertainty": (WHOLE + "\n[fit]\nuncertainty = 1.5\n", r":18: fit\.uncertainty must be a whole number or a string"),
     "bad setting": (WHOLE + "\n[settings]\nsamples = 3\n", r":18: settings\.samples must be a square number"),
-    "no pictures": (SCENE, r": a scene must have 'pictures', it is missing"),
+    "no pictures": (SCENE, r": a fit must have 'pictures', .* this is a scene"),
     "an empty list": ("pictures = []\n" + SCENE, r":1: pictures must hold at least one picture"),
     "no image": (SCENE + "[[pictures]]\n", r":13: pictures\[0\] must have 'image'"),
     "an image that is not there": (WHOLE.replace("grey", "gray"), r":15: pictures\[0\]\.image: there is no file 'gray\.npy'"),

@@ -242,7 +242,7 @@ BAD_FILES = [
     ("line.npy", lambda path: np.save(path, np.zeros(4)), "shape (h, w, 3) or (h, w), it has (4,)"),
     ("rgba.npy", lambda path: np.save(path, np.zeros((2, 2, 4))), "shape (h, w, 3) or (h, w), it has (2, 2, 4)"),
     ("empty.npy", lambda path: np.save(path, np.zeros((0, 3))), "its size must be positive"),
-    ("x.tga", text, "cannot read an image with the ending '.tga'; did you mean"),
+    ("x.tga", text, "cannot read an image with the ending '.tga'; known: .exr, .jpeg"),
     ("x", text, "a name without an ending; known: .exr, .jpeg, .jpg, .npy, .pfm, .png"),
 ]
 

@@ -100,5 +100,5 @@ def test_a_texture_at_vertices_gives_each_its_colour():
 
 
 def test_bytes_are_no_texture():
-    with pytest.raises(jaxhf.ArgumentError, match="must be linear floats, 0 to 1, they are uint8; load_image"):
+    with pytest.raises(jaxhf.ArgumentError, match="must hold linear colours in floats, 1 being white; theirs are uint8"):
         jaxhf.ImageTexture(np.zeros((2, 2, 3), np.uint8))

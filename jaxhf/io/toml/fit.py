@@ -127,6 +127,9 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     dtype, path = require_precision(dtype), require_file(path)
     by_ending({".toml": None}, path, "read what to fit from")
     part = open_toml(path)
+    if "pictures" not in part.table and "camera" in part.table:
+        part.require_known(_CASE)
+        raise part.error("a fit must have 'pictures', those that were measured; this is a scene, for `jaxhf render`")
     values = part.read(_CASE)
     settings = _given(part.at("settings", table=values["settings"]), _SETTINGS)
     settings = part.at("settings", table=values["settings"]).made(Settings, **settings)

@@ -10,6 +10,7 @@ from ...scene.light import Directional, Light, Point, Sky
 from ...scene.material import Material, Matte, Mirror
 from .. import procedural
 from .values import (
+    angle_above_horizon,
     colour,
     grid,
     instant,
@@ -93,7 +94,7 @@ LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
         {
             "towards": Key(numbers(3), None),
             "azimuth": Key(number, None),
-            "altitude": Key(number, None),
+            "altitude": Key(angle_above_horizon, None),
             "time": Key(instant, None),
             **{name: Key(number, None) for name in ("latitude", "longitude")},
             "irradiance": Key(colour, None),

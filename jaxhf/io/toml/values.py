@@ -1,6 +1,7 @@
 """What a value in a TOML scene may be: for each kind a function that returns it, or raises ValueError with what it must be."""
 
 import math
+import sys
 from collections.abc import Callable
 from datetime import datetime
 from typing import Any
@@ -9,12 +10,21 @@ import numpy as np
 from jaxtyping import Float
 
 from ...core.affine import rotate, scale, translate
+from ...core.types import MOST
 from ..errors import nearest
+
+_FARTHEST = 1e18  # of a position: squares of distances are numbers in single precision
 
 
 def number(value: Any) -> float:
     if not _is_number(value):
         raise ValueError("a finite number")
+    return _in_range(value)
+
+
+def angle_above_horizon(value: Any) -> float:
+    if not -90 <= number(value) <= 90:
+        raise ValueError("from -90 to 90 degrees")
     return float(value)
 
 
@@ -57,7 +67,7 @@ def or_word(kind: Callable[[Any], Any], tail: str = " or a string") -> Callable[
 def number_list(value: Any) -> list[float]:
     if not isinstance(value, list) or not all(map(_is_number, value)):
         raise ValueError("a list of finite numbers")
-    return [float(item) for item in value]
+    return [_in_range(item, _FARTHEST) for item in value]
 
 
 def numbers(count: int) -> Callable[[Any], list[float]]:
@@ -78,10 +88,10 @@ def size(value: Any) -> list[int]:
 def factors(value: Any) -> list[float]:
     """Three numbers, or one that stands for all of them."""
     if _is_number(value):
-        return [float(value)] * 3
+        return [_in_range(value)] * 3
     if not _is_list(value, 3, _is_number):
         raise ValueError("a finite number or a list of 3")
-    return number_list(value)
+    return [_in_range(item) for item in value]
 
 
 def colour(value: Any) -> list[float]:
@@ -100,6 +110,7 @@ def grid(value: Any) -> Float[np.ndarray, "ny nx"]:
         for ix, height in enumerate(row):
             if not _is_number(height):
                 raise ValueError(f"made of finite numbers, row {iy} column {ix} is {height!r}")
+            _in_range(height, sys.float_info.max)
     return np.array(value, np.float64)
 
 
@@ -152,7 +163,13 @@ def table_of_tables(value: Any) -> dict[str, dict[str, Any]]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return type(value) is int or (isinstance(value, float) and math.isfinite(value))
+
+
+def _in_range(value: Any, most: float = MOST) -> float:
+    if not -most <= value <= most:
+        raise ValueError(f"within -{most:g} and {most:g}")
+    return float(value)
 
 
 def _is_whole(value: Any) -> bool:

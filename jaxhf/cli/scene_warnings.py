@@ -1,0 +1,93 @@
+"""What is allowed in a scene, but hardly meant: said before it is rendered."""
+
+import sys
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+if TYPE_CHECKING:
+    from ..scene.camera import Camera
+    from ..scene.heightfield import Heightfield
+    from ..scene.scene import Object, Scene
+
+_NARROW = 1.0  # degrees
+_MOST_HEIGHT = 1e18
+
+
+def warn(scenes: "Iterable[Scene]") -> None:
+    """Prints what speaks against these scenes on standard error, each line once."""
+    for line in dict.fromkeys(line for scene in scenes for line in scene_warnings(scene)):
+        print(f"jaxhf: warning: {line}", file=sys.stderr)
+
+
+def scene_warnings(scene: "Scene") -> Iterator[str]:
+    """A line for each thing that makes a picture black or odd without being an error."""
+    from ..scene.camera import Perspective
+    from ..scene.heightfield import Heightfield
+
+    if not scene.lights:
+        yield "the scene has no lights: the picture is black"
+    camera = scene.camera
+    if isinstance(camera, Perspective) and float(camera.fov) < _NARROW:
+        yield f"camera: fov is {float(camera.fov):.4g} degrees, less than {_NARROW:g}; it is not in radians"
+    corners = []
+    for k, item in enumerate(scene.objects):
+        if not isinstance(item.shape, Heightfield):
+            return  # the rest asks whether anything can be seen
+        heights = np.asarray(item.shape.heights)
+        finite = heights[np.isfinite(heights)]
+        if not finite.size:
+            yield f"objects[{k}]: none of its heights is finite, there is nothing to see"
+            continue
+        lowest, highest = float(finite.min()), float(finite.max())
+        if max(-lowest, highest) > _MOST_HEIGHT:
+            far = lowest if -lowest > highest else highest
+            yield f"objects[{k}]: heights reach {far:.7g}; is that a value that means no height (nodata)?"
+        elif isinstance(camera, Perspective) and item.world_from_object is None:
+            eye = np.asarray(camera.world_from_camera, np.float64)[:3, 3]
+            ground = _height_at(item.shape, heights, eye[0], eye[1])
+            if eye[2] <= ground:
+                below = f"{ground - eye[2]:.4g} below the surface of objects[{k}], whose height there is {ground:.6g}"
+                yield f"camera: eye stands {below}: it is seen from below"
+        corners.append(_box(item, item.shape, lowest, highest))
+    if corners and all(_out_of_view(camera, points) for points in corners):
+        low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
+        spans = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high, strict=True))
+        yield f"camera: none of the terrain is in the picture, it spans {spans}"
+
+
+def _height_at(field: "Heightfield", heights: np.ndarray, x: float, y: float) -> float:
+    """The height of the triangle over (x, y); -inf beside the footprint, nan in a hole."""
+    column, row = (x - field.x0) / field.dx, (y - field.y0) / field.dy
+    ny, nx = heights.shape
+    if not (0 <= column <= nx - 1 and 0 <= row <= ny - 1):
+        return -np.inf
+    ix, iy = min(int(column), nx - 2), min(int(row), ny - 2)
+    (z00, z10), (z01, z11) = heights[iy : iy + 2, ix : ix + 2].astype(np.float64)
+    fx, fy = column - ix, row - iy
+    return float(z00 + (fx * (z10 - z00) + fy * (z11 - z10) if fx >= fy else fy * (z01 - z00) + fx * (z11 - z01)))
+
+
+def _box(item: "Object", field: "Heightfield", lowest: float, highest: float) -> Float[np.ndarray, "8 3"]:
+    """The corners of a heightfield's bounding box, in the world."""
+    ny, nx = field.heights.shape
+    xs, ys = (field.x0, field.x0 + (nx - 1) * field.dx), (field.y0, field.y0 + (ny - 1) * field.dy)
+    points = np.array([(x, y, z) for x in xs for y in ys for z in (lowest, highest)], np.float64)
+    if item.world_from_object is None:
+        return points
+    matrix = np.asarray(item.world_from_object, np.float64)
+    return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
+def _out_of_view(camera: "Camera", points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether all points lie beyond one and the same side of what a camera sees: then so does their convex hull."""
+    from ..scene.camera import Perspective
+
+    matrix = np.asarray(camera.world_from_camera, np.float64)
+    x, y, z = np.linalg.inv(matrix[:3, :3]) @ (points - matrix[:3, 3]).T
+    short = min(camera.width, camera.height)
+    half = np.tan(np.radians(float(camera.fov)) / 2) * z if isinstance(camera, Perspective) else float(camera.extent) / 2
+    right, up = half * camera.width / short, half * camera.height / short
+    return any(side.all() for side in (z <= 0, x > right, -x > right, y > up, -y > up))
