@@ -37,7 +37,7 @@ def add(commands: Any) -> None:
     camera = command.add_argument_group("camera")
     camera.add_argument(
         "--from", dest="camera_azimuth", type=float, metavar="DEGREES",
-        help="where the camera stands, clockwise from north [110 before the sun]",
+        help="where the camera stands, clockwise from north [110 left of the sun]",
     )  # fmt: skip
     camera.add_argument(
         "--above", dest="camera_altitude", type=float, default=35.0, metavar="DEGREES", help="above the horizon [35]"
@@ -51,7 +51,10 @@ def add(commands: Any) -> None:
     light.add_argument("--haze", type=float, default=0.15, metavar="SHARE", help="of light lost along the terrain [0.15]")
     ground = command.add_argument_group("terrain")
     ground.add_argument(
-        "--exaggeration", type=float, metavar="X", help="heights are multiplied by it [1 to 20, by how flat the terrain is]"
+        "--exaggeration",
+        type=float,
+        metavar="X",
+        help="heights are multiplied by it [a round number, 1 unless terrain is flat]",
     )
     tint = ground.add_mutually_exclusive_group()
     tint.add_argument(
