@@ -54,7 +54,7 @@ def add(commands: Any) -> None:
         "--exaggeration",
         type=float,
         metavar="X",
-        help="heights are multiplied by it [a round number, 1 unless terrain is flat]",
+        help="heights are multiplied by it [1, or more on flat terrain]",
     )
     tint = ground.add_mutually_exclusive_group()
     tint.add_argument(
