@@ -16,13 +16,12 @@ def examples(*commands: str) -> str:
     return "\n  ".join(("examples:", *commands))
 
 
-def add_settings(command: argparse.ArgumentParser, names: Collection[str], **defaults: str) -> None:
+def add_settings(command: argparse.ArgumentParser, names: Collection[str]) -> None:
     """Adds an option for each of these fields of `Settings`, with the help that its metadata holds.
 
     Args:
       command: gets the options; one that is not given is absent from the parsed namespace.
       names: of the fields.
-      defaults: what --help names as the default of a field, where it is not that of `Settings`.
     """
     group = command.add_argument_group("accuracy and speed")
     for knob in dataclasses.fields(Settings):
@@ -35,7 +34,7 @@ def add_settings(command: argparse.ArgumentParser, names: Collection[str], **def
                 help=f"leave out {knob.metadata['help']}",
             )  # fmt: skip
             continue
-        default = defaults.get(knob.name, knob.metadata.get("none", knob.default))
+        default = knob.metadata.get("none", knob.default)
         group.add_argument(
             f"--{option}", type=whole_number if int in (knob.type, *get_args(knob.type)) else str, default=argparse.SUPPRESS,
             metavar=knob.metadata.get("metavar"), help=f"{knob.metadata['help']} [{default}]",

@@ -2,7 +2,6 @@
 
 import argparse
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,49 +35,23 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    if options.aovs and Path(options.output).suffix.lower() != ".exr":
-        raise UserError(f"--aovs are layers of an .exr, {options.output} is none")
-    draw(options, lambda: _load(options), options.aovs)
-
-
-def draw(options: argparse.Namespace, load: "Callable[[], Scene]", aovs: tuple[str, ...] = (), **saving: Any) -> None:
-    """Renders a scene, saves the picture and prints what it took.
-
-    Args:
-      options: output, the machine's and those of `Settings`.
-      load: makes the scene, when JAX is set up.
-      aovs: names out of `AOVS`, that are saved with the picture.
-      saving: for `save_image`.
-    """
-    from ..io.images import require_writable
-    from ..rendering.aovs import known_aovs
+    from ..io.images import require_writable, save_image
     from .scene_warnings import warn
 
+    if options.aovs and Path(options.output).suffix.lower() != ".exr":
+        raise UserError(f"--aovs are layers of an .exr, {options.output} is none")
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)
-    aovs = known_aovs("render", aovs)
-    scene = load()
+    from ..rendering.aovs import known_aovs
+
+    aovs = known_aovs("render", options.aovs)
+    scene = _load(options)
     warn([scene])
     image, found, report = _timed_render(scene, settings, options.devices, aovs)
-    finish(options.output, image, report, aovs=found, **saving)
-
-
-def finish(path: str, image: Any, report: str, **saving: Any) -> None:
-    """Saves a picture and prints what it took."""
-    from ..io.images import save_image
-
     interruption.raise_from_now_on()
-    save_image(path, image, **saving)
-    print(f"{path}: {report}")
-
-
-def report_line(width: int, height: int, samples: int, seconds: float, compiling: float, device: str, exhausted: int) -> str:
-    rays = width * height * samples
-    return (
-        f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), {seconds:.3g} s + {compiling:.3g} s compiling, "
-        f"{device}, {rays / seconds:.3g} rays/s, {exhausted} rays exhausted"
-    )
+    save_image(options.output, image, aovs=found)
+    print(f"{options.output}: {report}")
 
 
 def _load(options: argparse.Namespace) -> "Scene":
@@ -122,7 +95,12 @@ def _timed_render(
     device = f"{mesh.size} x {jax.devices()[0].device_kind}"
     exhausted = int(np.sum(found["exhausted"]))
     asked = {name: found[name] for name in aovs}
-    return image, asked, report_line(width, height, samples, seconds, compiling.seconds, device, exhausted)
+    rays = width * height * samples
+    report = (
+        f"{width} x {height} pixels, {rays} camera rays ({samples} a pixel), {seconds:.3g} s + {compiling.seconds:.3g} s "
+        f"compiling, {device}, {rays / seconds:.3g} rays/s, {exhausted} rays exhausted"
+    )
+    return image, asked, report
 
 
 class _CompileTime:
