@@ -120,6 +120,8 @@ def render(
 
 
 def _require_scene(owner: str, scene: Any, kind: type | tuple[type, ...]) -> None:
+    if isinstance(scene, kind):
+        return
     hint = ""
     if isinstance(scene, str | PurePath):
         hint = "jaxhf.load_scene reads one from a file"
