@@ -14,8 +14,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..io.terrain import Terrain
+    from ..rendering.view import Look
     from ..scene.camera import Perspective
     from ..scene.heightfield import Heightfield
+    from ..scene.scene import Scene
 
 _PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
 
@@ -146,6 +148,15 @@ class _Stage:
             return load_drape(self.options.drape, self.terrain)
         return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(self.terrain, self.options.ramp)]
 
+    def _scene(self, field: "Heightfield", camera: "Perspective", look: "Look") -> "Scene":
+        from ..core.devices import local_mesh
+        from ..rendering.view import block
+        from .limits import require_memory
+
+        scene = block(field, self.colours, camera, look, self.base)
+        require_memory(scene, local_mesh().size)
+        return scene
+
     def _field(self) -> "Heightfield":
         from ..scene.heightfield import Heightfield
 
@@ -165,13 +176,13 @@ class _Stage:
 
     def picture(self, output: Path) -> str:
         from ..io.images import save_image
-        from ..rendering.view import block, photograph
+        from ..rendering.view import photograph
         from .progress import bar
 
         field = self._field()
         camera = self._camera(field, self._azimuth)
         with bar(total=self.look.samples, unit=" samples", delay=0.5) as shown:
-            image = photograph(block(field, self.colours, camera, self.look, self.base), camera, self.look, shown.update)
+            image = photograph(self._scene(field, camera, self.look), camera, self.look, shown.update)
         interruption.raise_from_now_on()
         save_image(output, image)
         return f"{self.size[0]} x {self.size[1]} pixels"
@@ -182,7 +193,7 @@ class _Stage:
         from ..io.films import writing_film
         from ..io.images import srgb_from_linear
         from ..rendering.render import prepare
-        from ..rendering.view import block, photograph
+        from ..rendering.view import photograph
         from .progress import bar
 
         field = self._field()
@@ -197,7 +208,7 @@ class _Stage:
             for turn, look in zip(turns, suns, strict=True):
                 camera = self._camera(field, turn, around=options.sun_from is None)
                 if ready is None or look != lit:
-                    ready, lit = prepare(block(field, self.colours, camera, look, self.base)), look
+                    ready, lit = prepare(self._scene(field, camera, look)), look
                 image = photograph(ready, camera, look)
                 add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
                 shown.update()
