@@ -26,7 +26,7 @@ An output file that is there is replaced, whole or not at all; never one that th
 Exit codes: 0, done; 2, a mistake, which one line on standard error names; 130, interrupted by Ctrl-C."""
 
 
-_KINDS = {"float": "a number", "int": "a whole number", "whole_number": "a whole number"}
+_KINDS = {"float": "a number", "int": "a whole number", "whole_number": "a whole number", "_angles": "two angles, as 90,10"}
 
 
 class _Formatter(argparse.HelpFormatter):

@@ -197,16 +197,17 @@ class _Stage:
         from .progress import bar
 
         field = self._field()
-        turns = [self._azimuth + 360 * k / options.frames for k in range(options.frames)]
-        suns = [self.look] * options.frames
-        if options.sun_from is not None:
-            turns = [self._azimuth] * options.frames
+        if options.sun_from is None:
+            turns = [self._azimuth + 360 * k / options.frames for k in range(options.frames)]
+            cameras = [self._camera(field, turn, around=True) for turn in turns]
+            looks = [self.look] * options.frames
+        else:
+            cameras = [self._camera(field, self._azimuth)] * options.frames
             path = np.linspace(options.sun_from, options.sun_to, options.frames)
-            suns = [dataclasses.replace(self.look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
+            looks = [dataclasses.replace(self.look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
         ready, lit = None, None
         with writing_film(output, 24) as add, bar(total=options.frames, unit=" frames") as shown:
-            for turn, look in zip(turns, suns, strict=True):
-                camera = self._camera(field, turn, around=options.sun_from is None)
+            for camera, look in zip(cameras, looks, strict=True):
                 if ready is None or look != lit:
                     ready, lit = prepare(self._scene(field, camera, look)), look
                 image = photograph(ready, camera, look)

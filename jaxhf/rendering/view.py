@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
-from ..core.settings import Settings
 from ..scene.camera import Perspective
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Sky
@@ -123,7 +122,7 @@ def photograph(
       progress: called after each sample.
     """
     side = math.isqrt(look.samples)
-    scene = scene if isinstance(scene, Prepared) else prepare(scene, Settings(samples=1))
+    scene = scene if isinstance(scene, Prepared) else prepare(scene)
     size = _length(scene.scene.objects[0].shape)
     total = np.zeros((camera.height, camera.width, 3))
     for k in range(side * side):
