@@ -162,7 +162,7 @@ def _sampling_error(samples: Float[jax.Array, "pixels n c"]) -> Float[jax.Array,
 
 def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "h w c"]:
     settings = resolve_settings(settings, scene)
-    at_vertices = _at_vertices(make_world(scene, settings))
+    at_vertices = vertex_values(make_world(scene, settings))
     numbers = motion(scene.lights, scene.camera, known.view)
     of_samples = _product(mesh, at_vertices, known.slopes, known.vertices)
     of_samples = _with_view(of_samples, known.view, numbers)
@@ -255,7 +255,7 @@ def _boundary_samples(channels: int, seen: tuple[World, Camera, View], drawn: tu
     return slopes, jax.vmap(functools.partial(deciding_vertices, world), out_axes=1)(samples), view
 
 
-def _at_vertices(world: World) -> Float[jax.Array, "vertices n"]:
+def vertex_values(world: World) -> Float[jax.Array, "vertices n"]:
     """Heights and, with smooth shading, the normals' components, over all surfaces."""
     grids = [grid for _, grid, _ in world.grids]
     heights = jnp.concatenate([grid.rows for grid in grids])[:, None]

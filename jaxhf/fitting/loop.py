@@ -21,6 +21,7 @@ from ..io.errors import FileError
 from ..scene.heightfield import Heightfield
 from .basis import Unknowns, balanced_units, make_basis
 from .history import Step, Stop, print_progress
+from .normal_matrix import is_sparse
 from .options import FitOptions
 from .problem import Problem, mode_curvature
 from .residuals import heights_of, linearised, pictures_and_influence
@@ -222,7 +223,7 @@ class FitLoop:
         """Varies all modes about the present surface, whatever the level at which the fit stopped."""
         surface = np.asarray(self.problem.basis.surface(self.unknowns.coefficients))
         known = self.known(self.unknowns)
-        if self.options.uncertainty is not None:  # nothing else is solved for any more
+        if self.options.uncertainty is not None and not is_sparse(known):  # for LSMR, of which draws are then made
             self.units, _ = self._measured_units(self.unknowns)
         basis = make_basis(self.field, surface, 1.0, self.units)
         self.problem = dataclasses.replace(known, basis=basis)

@@ -88,7 +88,7 @@ def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Pro
     pictures = tuple(
         linearise_each(
             views(unknowns, problem, group),
-            _completion(unknowns, group, heights),
+            completion(unknowns, group, heights),
             problem.settings,
             problem.mesh,
             group.targets.shape[-1],
@@ -112,7 +112,7 @@ def views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
     return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, stacked)
 
 
-def _completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
+def completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
     """Makes the scene of one picture from its own leaves, those that the group shares, these heights and the unknowns."""
 
     def complete(scene: Scene) -> Scene:
@@ -125,7 +125,7 @@ def _completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]
 def _simulate(
     unknowns: Unknowns, problem: Problem, heights: Float[Array, "ny nx"], group: Group, linear: Linearised | None
 ) -> Float[Array, "n h w c"]:
-    n, change, scenes = len(group.indices), _completion(unknowns, group, heights), views(unknowns, problem, group)
+    n, change, scenes = len(group.indices), completion(unknowns, group, heights), views(unknowns, problem, group)
     if linear is not None:
         image = picture_each(linear, scenes, change, problem.settings, problem.mesh)
     else:

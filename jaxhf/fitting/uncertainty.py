@@ -1,4 +1,4 @@
-"""How sure a fit is of its heights: standard deviations from the Gauss-Newton matrix, by samples or by a dense inverse."""
+"""How sure a fit is of its heights: standard deviations from the normal matrix, by samples or by a dense inverse."""
 
 import dataclasses
 import time
@@ -18,14 +18,18 @@ from ..core.devices import on_every_device
 from ..core.errors import ArgumentError
 from .basis import Unknowns
 from .history import Draws
+from .linearise import can_be_linearised
+from .normal_matrix import NormalMatrix, is_sparse
 from .problem import Problem
 from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import influence_function, robust_weight
 from .view import KNOWN
 
 _INNER_TOLERANCE = 1e-6
+EXACT_UNKNOWNS = 4096
+"""Up to so many unknowns the normal matrix is inverted where "exact" is asked for: 128 MiB, some 10 s."""
 EXACT_ENTRIES = 2**24
-"""Up to so many residuals times unknowns the matrix is formed where "exact" is asked for: 128 MiB in double precision."""
+"""The same of residuals times unknowns, where J is not sparse and is formed first."""
 
 
 def standard_deviations(
@@ -37,7 +41,7 @@ def standard_deviations(
 ) -> tuple[Float[np.ndarray, "ny nx"], int | None]:
     """The standard deviation of each height, given what the pictures and the prior say; shape (ny, nx), height units.
 
-    The Gauss-Newton matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs
+    The normal matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs
     them; its inverse is the covariance (Laplace's approximation). Albedo, exposures, offsets, lights and cameras vary
     along, so their doubt counts too. Besides, each DCT coefficient has the prior N(0, `Basis.prior_amplitude`²), and the
     albedo, each exposure and each offset N(0, 1): a direction on which no picture depends, such as the mean of all heights,
@@ -46,10 +50,11 @@ def standard_deviations(
     Args:
       unknowns: at which the fit ended; all modes are varied.
       problem: `linearised` there, or it is here.
-      samples: "exact" forms J as a dense matrix and inverts H. A number, without any dense matrix: that many
-        x = argmin |J x - z|², z normal, are drawn; their covariance is H⁻¹ (Papandreou and Yuille, Gaussian sampling by local
-        perturbations, 2010), so each deviation is right to 1 / √(2 · samples), however the heights are correlated.
-      inner_steps: of LSMR, each, at most five times as many as in a step of the fit.
+      samples: "exact" inverts H as a dense matrix. A number, without any dense matrix: that many x = argmin |J x - z|², z
+        normal, are drawn; their covariance is H⁻¹ (Papandreou and Yuille, Gaussian sampling by local perturbations, 2010), so
+        each deviation is right to 1 / √(2 · samples), however the heights are correlated.
+      inner_steps: of LSMR, each, at most five times as many as in a step of the fit; only where J is not sparse, see
+        `NormalMatrix`.
       report: called after each sample.
 
     Returns:
@@ -59,13 +64,18 @@ def standard_deviations(
       KeyboardInterrupt: Ctrl-C before there were two samples.
     """
     unknowns, problem = on_every_device((unknowns, linearised(unknowns, problem)), problem.mesh)
+    matrix = NormalMatrix(unknowns, problem) if is_sparse(problem) else None
     if samples == "exact":
-        return np.sqrt(np.asarray(_exact_variance(unknowns, problem))), None
+        variance = _exact_variance(unknowns, problem) if matrix is None else matrix.variance()
+        return np.sqrt(np.asarray(variance)), None
     total, drawn, count = np.zeros(problem.basis.crop(problem.basis.base).shape), 0, int(samples)
     begin = time.perf_counter()
     try:
         while drawn < count:
-            draw = np.asarray(_draw(unknowns, problem, jax.random.key(drawn), 5 * inner_steps), np.float64)
+            if matrix is None:
+                draw = np.asarray(_draw(unknowns, problem, jax.random.key(drawn), 5 * inner_steps), np.float64)
+            else:
+                draw = matrix.draw(drawn)
             total, drawn = total + draw * draw, drawn + 1
             if report is not None:
                 seconds = time.perf_counter() - begin
@@ -100,10 +110,15 @@ def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tu
 
 
 def require_small(unknowns: Unknowns, problem: Problem) -> None:
-    """Raises ValueError where "exact" would make a matrix above `EXACT_ENTRIES`."""
+    """Raises ValueError where "exact" would make a matrix above `EXACT_UNKNOWNS` or `EXACT_ENTRIES`."""
+    count = sum(leaf.size for leaf in jax.tree.leaves(unknowns))
+    if unknowns.albedo is None and all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
+        if count > EXACT_UNKNOWNS:
+            rule = f"'exact' takes at most {EXACT_UNKNOWNS} unknowns, there are {count}; give a number of samples"
+            raise ArgumentError("fit", "uncertainty", rule)
+        return
     rows = sum(group.targets.size for group in problem.groups) + 4 * problem.basis.base.size
-    entries = rows * sum(leaf.size for leaf in jax.tree.leaves(unknowns))
-    if entries > EXACT_ENTRIES:
+    if (entries := rows * count) > EXACT_ENTRIES:
         raise ArgumentError(
             "fit",
             "uncertainty",

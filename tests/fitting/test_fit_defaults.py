@@ -13,6 +13,7 @@ from jaxhf.fitting import uncertainty as _uncertainty
 from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
 from jaxhf.fitting.history import Draws
+from jaxhf.fitting.normal_matrix import NormalMatrix
 from jaxhf.fitting.problem import make_problem
 from jaxhf.fitting.residuals import picture_residuals
 from jaxhf.fitting.robust import influence_function, soften
@@ -115,7 +116,7 @@ def test_samples_can_be_stopped_with_what_is_there(monkeypatch):
             raise KeyboardInterrupt
         return np.full((12, 12), 2.0)
 
-    monkeypatch.setattr(_uncertainty, "_draw", draw)
+    monkeypatch.setattr(NormalMatrix, "draw", draw)
     stop = 3
     std, drawn = _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
     assert drawn == 3

@@ -13,8 +13,10 @@ import jaxhf
 from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
 from jaxhf.core.devices import local_mesh
 from jaxhf.fitting import linearise as _linearise
-from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each
+from jaxhf.fitting.jacobian import picture_by_vertices, vertex_slopes, vertices_by_heights
+from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each, vertex_values
 from jaxhf.fitting.view import View, moved
+from jaxhf.rendering.samples import PictureSamples
 from jaxhf.scene.localise import localise
 from jaxhf.trace.grid import Grid
 from jaxhf.trace.world import make_world
@@ -106,14 +108,32 @@ def test_matrix_is_the_derivative_of_render(which, settings, channels, derivativ
         assert np.nanmax(np.abs(theirs)) > 1e-3
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-11 * np.nanmax(np.abs(theirs)))
 
+    still = (tangent[0], *(jnp.zeros_like(other) for other in tangent[1:]))
+
     @jax.jit
     def products(linear):
         picture = functools.partial(by_matrix, linear)
-        return jax.jvp(picture, (heights,), (tangent,))[1], jax.vjp(picture, heights)[1](cotangent)[0]
+        forward, first = (jax.jvp(picture, (heights,), (change,))[1] for change in (tangent, still))
+        return forward, first, jax.vjp(picture, heights)[1](cotangent)[0]
 
-    forward, reverse = products(linear)
+    forward, first, reverse = products(linear)
     backwards = sum(np.nansum(np.asarray(a) * np.asarray(b)) for a, b in zip(reverse, tangent, strict=True))
     np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=1e-9)
+
+    @jax.jit
+    def vertices(heights):
+        here = localise(scene)
+        change = lambda new: eqx.tree_at(lambda scene: scene.heightfields[0].heights, here, new)  # noqa: E731
+        return vertex_slopes(lambda new: vertex_values(make_world(change(new), settings)), heights)
+
+    of_heights = vertices_by_heights(np.nan_to_num(vertices(heights[0])), scene)
+    one = jax.tree.map(lambda leaf: leaf[0], linear)
+    samples = PictureSamples(CAMERA, settings, None if one.edges is None else one.edges.resampled)
+    rows = picture_by_vertices(one, samples, channels - 1, of_heights.shape[0]) @ of_heights
+    expected = np.ravel(first[..., -1])
+    np.testing.assert_allclose(
+        rows @ np.nan_to_num(np.ravel(tangent[0])), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
+    )
 
 
 def test_matrix_is_the_derivative_in_light_and_camera(monkeypatch):

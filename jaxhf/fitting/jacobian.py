@@ -1,0 +1,187 @@
+"""The derivative of a fit's pictures in its unknowns as one sparse matrix, put together from `Linearised`.
+
+A product with it needs no loop over samples, and it can be multiplied by itself: the matrix of the samples' derivatives in the
+heights and normals at vertices, times that of these in the heights.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..boundary.term import resampled_side
+from ..core.compilation import compiled
+from ..rendering.samples import PictureSamples
+from ..rendering.tiles import Tiling
+from ..scene.heightfield import Heightfield
+from ..scene.scene import Scene
+from ..trace.world import make_world
+from .basis import Unknowns
+from .linearise import Linearised, vertex_values
+from .problem import Group, Problem
+from .residuals import completion, picture_residuals, views
+from .robust import robust_weight
+
+sp: Any = scipy.sparse  # whose stubs miss much
+Sparse = Any
+"""A `scipy.sparse.csr_array`."""
+
+_REACH = 3  # A vertex's normal depends on heights one row and one column off: of each 3 x 3 heights on one.
+
+
+def pictures_jacobian(unknowns: Unknowns, problem: Problem) -> Sparse:
+    """The derivative of the pictures' residuals, each times the root of its robust weight.
+
+    Args:
+      unknowns: whose albedo is known.
+      problem: `linearised` there.
+
+    Returns:
+      A row for each value of each picture, a column for each height without padding, then for each of `other_unknowns`.
+    """
+    assert problem.linearised is not None
+    heights = problem.basis.heights(unknowns.coefficients)
+    slopes, weights, others = _dense_parts(heights, unknowns, problem)
+    blocks = []
+    for n, (group, known) in enumerate(zip(problem.groups, problem.linearised, strict=True)):
+        scene = group.complete(group.scenes, heights)
+        of_heights = vertices_by_heights(np.asarray(slopes[n], np.float64), scene)
+        for k in range(len(group.indices)):
+            here = jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k]), known)
+            samples = PictureSamples(scene.camera, problem.settings, None if here.edges is None else here.edges.resampled)
+            weight = np.asarray(weights[n][k], np.float64)
+            more = np.asarray(others[n][:, k], np.float64).reshape(-1, *weight.shape)
+            for channel in range(weight.shape[-1]):
+                rows = picture_by_vertices(here, samples, channel, of_heights.shape[0])
+                by_heights = sp.diags_array(weight[..., channel].ravel()) @ (rows @ of_heights)
+                by_others = more[..., channel].reshape(len(more), rows.shape[0]).T
+                blocks.append(sp.hstack([by_heights, sp.csr_array(by_others)]))
+    return sp.vstack(blocks, format="csr")
+
+
+def other_unknowns(unknowns: Unknowns) -> Any:
+    """What is unknown besides heights, as a tree."""
+    return eqx.tree_at(lambda unknowns: unknowns.coefficients, unknowns, None)
+
+
+@functools.partial(compiled, jit=eqx.filter_jit)
+def _dense_parts(
+    heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem
+) -> tuple[list[Float[Array, "9 vertices m"]], list[Float[Array, "n h w c"]], list[Float[Array, "k n h w c"]]]:
+    """For each group the `vertex_slopes`, what the derivative of each of its pictures' values is multiplied by, and the
+    derivatives of the weighted residuals in the other unknowns."""
+    residuals, pictures = jax.linearize(lambda u: picture_residuals(u, problem), unknowns)
+    roots = [jnp.sqrt(robust_weight(part, problem.loss, problem.loss_scale)) for part in residuals]
+    flat, unflat = jax.flatten_util.ravel_pytree(unknowns)  # coefficients are the first of them
+    beyond = unknowns.coefficients.size + jnp.arange(flat.size - unknowns.coefficients.size)
+
+    def column(k: Array) -> list[Array]:
+        changes = pictures(unflat(jnp.zeros_like(flat).at[k].set(1)))
+        return [root * change for root, change in zip(roots, changes, strict=True)]
+
+    others = lax.map(column, beyond) if beyond.size else [jnp.zeros((0, *root.shape), root.dtype) for root in roots]
+    slopes = []
+    for group in problem.groups:
+        first = jax.tree.map(lambda leaf: leaf[0], views(unknowns, problem, group))
+
+        def values(heights: Array, group: Group = group, scene: Scene = first) -> Array:
+            return vertex_values(make_world(completion(unknowns, group, heights)(scene), problem.settings))
+
+        slopes.append(vertex_slopes(values, heights))
+    weights = []
+    for group, root in zip(problem.groups, roots, strict=True):
+        exposures = 1 if unknowns.exposures is None else unknowns.exposures[jnp.array(group.indices)].reshape(-1, 1, 1, 1)
+        weights.append(group.weights * root * exposures)
+    return slopes, weights, others
+
+
+def vertex_slopes(
+    values: Callable[[Float[Array, "ny nx"]], Float[Array, "vertices m"]], heights: Float[Array, "ny nx"]
+) -> Float[Array, "9 vertices m"]:
+    """How values at vertices change with every third height of every third row, beginning at each of nine."""
+    row, column = jnp.indices(heights.shape)
+    phase = row % _REACH * _REACH + column % _REACH
+    _, change = jax.linearize(values, heights)
+    return lax.map(lambda k: change((phase == k).astype(heights.dtype)), jnp.arange(_REACH**2))
+
+
+def vertices_by_heights(slopes: Float[np.ndarray, "9 vertices m"], scene: Scene) -> Sparse:
+    """The derivative of what stands at the vertices of all grids, number by number, in the first heightfield's heights.
+
+    Args:
+      slopes: `vertex_slopes`.
+      scene: whose grids they are.
+    """
+    shapes = [obj.shape.heights.shape for obj in scene.objects if isinstance(obj.shape, Heightfield)]
+    shape = scene.heightfields[0].heights.shape
+    numbers, (ny, nx) = slopes.shape[2], shape
+    rows, columns, values, first = [], [], [], 0
+    for other in shapes:
+        count = other[0] * other[1]
+        if other == shape:  # of another size it has heights of its own
+            at = np.divmod(np.arange(count), nx)
+            for k in range(_REACH**2):
+                # The nearest height of this phase.
+                row, column = (i + (phase - i + 1) % _REACH - 1 for i, phase in zip(at, divmod(k, _REACH), strict=True))
+                inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
+                here = slopes[k, first : first + count]
+                vertex, number = np.nonzero(np.where(inside[:, None], here, 0))
+                rows.append((first + vertex) * numbers + number)
+                columns.append((row * nx + column)[vertex])
+                values.append(here[vertex, number])
+        first += count
+    return sp.csr_array(
+        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(first * numbers, ny * nx)
+    )
+
+
+def picture_by_vertices(known: Linearised, samples: PictureSamples, channel: int, columns: int) -> Sparse:
+    """The derivative of a channel of one picture in what stands at the vertices: a row for each pixel, and so many columns."""
+    tiling = Tiling(samples.camera, samples.settings)
+    pixels, (chunks, _, numbers, size) = tiling.width * tiling.height, known.slopes.shape
+    at_vertex = 4 if numbers == 12 else 1
+    vertex, number = np.arange(3), np.zeros(3, int)
+    if numbers == 12:  # the three heights, then each vertex's normal
+        vertex, number = np.concatenate([vertex, np.repeat(vertex, 3)]), np.concatenate([number, np.tile([1, 2, 3], 3)])
+    slopes = np.moveaxis(np.asarray(known.slopes)[:, channel], 1, 2).reshape(chunks * size, numbers)
+    places = np.moveaxis(np.asarray(known.vertices), 1, 2).reshape(chunks * size, 3)[:, vertex] * at_vertex + number
+    shape = pixels, columns
+    # Which samples each pixel has: `PictureSamples.in_pixels` of their numbers.
+    each = samples.settings.samples or 1
+    slots = np.moveaxis(np.arange(tiling.count * each * size).reshape(tiling.count, each, size), 1, 2)
+    slots = tiling.assemble(slots).reshape(pixels, each)
+    share = np.full((pixels, 1), 1 / each)
+    if known.edges is None:
+        return _rows(slopes[slots] * share[..., None], places[slots], shape)
+    resampled, pixel, edges = np.asarray(known.edges.resampled), np.asarray(known.edges.pixel), known.edges
+    share[resampled] = 0
+    once_more = tiling.count * each * size + np.arange(resampled.size * resampled_side(samples.settings) ** 2)
+    once_more = once_more.reshape(resampled.size, -1)
+    finer = _rows(slopes[once_more] / once_more.shape[1], places[once_more], (resampled.size, shape[1]))
+    moving = np.moveaxis(np.asarray(edges.slopes)[:, channel], 1, 2).reshape(-1, 5)
+    heights = np.moveaxis(np.asarray(edges.vertices), 1, 2).reshape(-1, 5) * at_vertex
+    moving = _rows(moving[:, None], heights[:, None], (len(pixel), shape[1]))
+    return (
+        _rows(slopes[slots] * share[..., None], places[slots], shape)
+        + _selection(resampled, pixels) @ finer
+        + _selection(pixel, pixels) @ moving
+    )
+
+
+def _rows(values: Float[np.ndarray, "rows n k"], columns: np.ndarray, shape: tuple[int, int]) -> Sparse:
+    """A matrix whose rows hold equally many entries, some of them for the same column, which are added up."""
+    ends = np.arange(shape[0] + 1) * (values.size // shape[0])
+    return sp.csr_array((values.astype(np.float64).ravel(), columns.ravel(), ends), shape=shape)
+
+
+def _selection(rows: np.ndarray, count: int) -> Sparse:
+    """The matrix that adds its operand's rows to these of `count`."""
+    return sp.csr_array((np.ones(rows.size), (rows.ravel(), np.arange(rows.size))), shape=(count, rows.size))

@@ -1,0 +1,66 @@
+"""The normal matrix over heights against products with the residuals' derivative, and draws from its inverse."""
+
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_fit import HALF, OPTIONS, TRUTH, fit_options, pictures, rms, scenes
+
+from jaxhf.core.errors import ArgumentError
+from jaxhf.fitting import uncertainty as _uncertainty
+from jaxhf.fitting.normal_matrix import NormalMatrix
+from jaxhf.fitting.problem import make_problem
+from jaxhf.fitting.residuals import linearised
+from jaxhf.fitting.uncertainty import _operator, require_small, standard_deviations
+
+EVERYTHING = {
+    "light_std": 1, "camera_std": (0.01, 1), "exposures": True, "offsets": True, "smoothness": 1.0, "loss": "geman",
+    "prior": TRUTH, "prior_std": 0.05, "prior_length": 0.2, "prior_exponent": 2.6,
+}  # fmt: skip
+
+
+def test_it_is_the_square_of_the_residuals_derivative():
+    """With all that can be sought beside heights; an exponent that no polynomial in the Laplacian meets."""
+    problem, unknowns = make_problem(scenes(TRUTH + 0.001), pictures(), fit_options(**(OPTIONS | EVERYTHING)))
+    problem = linearised(unknowns, problem)
+    matrix = NormalMatrix(unknowns, problem)
+    operator, _ = _operator(unknowns, problem)
+    flat, unflat = jax.flatten_util.ravel_pytree(unknowns)
+    change = np.random.default_rng(0).standard_normal(flat.size)
+    expected, _ = jax.flatten_util.ravel_pytree(operator.T.mv(operator.mv(unflat(jnp.asarray(change)))))
+
+    basis, n = problem.basis, unknowns.coefficients.size
+    heights = basis.surface(jnp.asarray(change[:n].reshape(basis.base.shape))) - basis.base
+    product = matrix._product(np.concatenate([np.ravel(heights), change[n:]]))
+    modes = basis.scale * basis.transform(jnp.asarray(product[:n].reshape(basis.base.shape)))
+    np.testing.assert_allclose(np.concatenate([np.ravel(modes), product[n:]]), expected, rtol=1e-9, atol=1e-9 * rms(expected))
+
+
+def test_draws_have_its_inverse_as_their_covariance(monkeypatch):
+    """In the half that pictures show, and in the other, which only the prior knows; and by LSMR, where J is not sparse."""
+    known = {"prior": TRUTH, "prior_std": 0.05, "prior_length": 0.1, "noise": 0.005}
+    problem, unknowns = make_problem(scenes(TRUTH, camera=HALF), pictures(camera=HALF), fit_options(**(OPTIONS | known)))
+    problem = linearised(unknowns, problem)
+    exact, none = standard_deviations(unknowns, problem, "exact", 60)
+    assert none is None
+    assert exact[4:8, 1:5].max() < 0.5 * exact[:, 9:].min()
+
+    def off(count: int) -> list[float]:
+        sampled, drawn = standard_deviations(unknowns, problem, count, 60)
+        assert drawn == count
+        return [rms((sampled / exact - 1)[half]) * np.sqrt(2 * count) for half in (np.s_[:, :7], np.s_[:, 9:])]
+
+    assert max(off(4000)) < 2  # each has a spread of 1 / sqrt(2 n); they hang together
+    monkeypatch.setattr(_uncertainty, "is_sparse", lambda problem: False)
+    assert max(off(200)) < 3
+    by_columns, _ = standard_deviations(unknowns, problem, "exact", 60)
+    np.testing.assert_allclose(by_columns, exact, rtol=1e-6)
+
+
+def test_what_is_too_large_to_invert_is_refused():
+    """Sooner where J is not sparse."""
+    problem, unknowns = make_problem(scenes(np.zeros((60, 60))), pictures(), fit_options(**OPTIONS))
+    require_small(unknowns, problem)
+    problem, unknowns = make_problem(scenes(np.zeros((60, 60))), pictures(), fit_options(**OPTIONS, albedo="constant"))
+    with pytest.raises(ArgumentError, match="uncertainty 'exact' takes at most 16777216 residuals times"):
+        require_small(unknowns, problem)
