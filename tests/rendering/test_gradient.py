@@ -67,7 +67,7 @@ def parallel() -> jaxhf.Scene:
             jaxhf.Object(jaxhf.Skirt.of(field, -0.4), jaxhf.Matte((0.6, 0.5, 0.4)), place),
         ],
         jaxhf.Orthographic.look_at((0.6, -0.7, 0.9), (0.5, 0.5, 0.0), extent=0.9, width=SIZE, height=SIZE),
-        [jaxhf.Directional((-0.7, 0.2, 0.4), (2, 3, 4)), jaxhf.Sky((0.1, 0.2, 0.4)), jaxhf.Sun((-0.3, 1, 0.1), (4, 3, 2), 9)],
+        [jaxhf.Directional((-0.7, -0.4, 0.4), (2, 3, 4)), jaxhf.Sky((0.1, 0.2, 0.4)), jaxhf.Sun((-0.3, 1, 0.1), (4, 3, 2), 9)],
     )
 
 
