@@ -45,7 +45,7 @@ def without_bounds() -> None:
         grid = make_grid(*arguments, **options)
         return eqx.tree_at(lambda grid: grid.pyramid.bounds, grid, jnp.zeros(0, grid.z_top.dtype))
 
-    _search._SKIPS = 0
+    _search.SKIPS = 0
     _walk.Walk.skip = lambda self, state: state
     _world.make_grid = grid_of
 

@@ -21,7 +21,7 @@ from .rendering.render import Prepared as Prepared, prepare as prepare, render a
 from .scene.camera import Orthographic as Orthographic, Perspective as Perspective
 from .scene.cylinder import Cylinder as Cylinder
 from .scene.heightfield import Heightfield as Heightfield
-from .scene.light import Directional as Directional, Point as Point, Sky as Sky
+from .scene.light import Directional as Directional, Point as Point, Sky as Sky, Sun as Sun
 from .scene.material import Matte as Matte, Mirror as Mirror
 from .scene.scene import Object as Object, Scene as Scene
 from .scene.skirt import Skirt as Skirt

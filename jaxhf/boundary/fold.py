@@ -8,7 +8,7 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, unit
 from ..scene.camera import Camera
-from ..scene.light import Point, Sky
+from ..scene.light import Point, casts_sharp_shadows
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit
 from ..trace.intersect import intersect
@@ -54,7 +54,7 @@ def towards(world: World, camera: Camera, light: Index, p: Vector) -> tuple[Vect
     chosen = unit(sight)
     distance = dot(sight, chosen)
     for number, source in enumerate(world.lights):
-        if isinstance(source, Sky):
+        if not casts_sharp_shadows(source):
             continue
         there = source.p - p if isinstance(source, Point) else source.towards
         to = unit(there)

@@ -13,7 +13,7 @@ from ..core.settings import Shading
 from ..core.types import Index, Scalar
 from ..core.vector import unit
 from ..scene.camera import Camera
-from ..scene.light import Directional, Point, Sky
+from ..scene.light import Directional, Point, Sun, casts_sharp_shadows
 from ..trace.grid import Grid
 from ..trace.world import World
 from .silhouette import EdgeFlags, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
@@ -42,7 +42,7 @@ def edge_sets(world: World) -> tuple[EdgeSet, ...]:
     """All edges of the scene that may bound something, in one numbering. A cylinder has none."""
     found, first = [], 0
     casting = (
-        [number for number, light in enumerate(world.lights) if not isinstance(light, Sky)] if world.settings.shadows else []
+        [number for number, light in enumerate(world.lights) if casts_sharp_shadows(light)] if world.settings.shadows else []
     )
     for k, surface in enumerate(world.surfaces):
         if not isinstance(surface, Grid):
@@ -56,13 +56,14 @@ def edge_sets(world: World) -> tuple[EdgeSet, ...]:
 
 def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
     """Weights of the edges by their lengths as seen or lit, without tracing a ray; those of a set sum to one, or are zero."""
-    lights = {number: _viewpoint(light) for number, light in enumerate(world.lights) if not isinstance(light, Sky)}
+    lights = {number: _viewpoint(light) for number, light in enumerate(world.lights) if casts_sharp_shadows(light)}
+    standing = [*lights.values(), *(view for light in world.lights if isinstance(light, Sun) for view in _ends_of(light))]
     weights = []
     for edges in edge_sets(world):
         surface = world.surfaces[edges.surface]
         assert isinstance(surface, Grid)
         if edges.light is None:
-            flags = _standing(surface, camera, list(lights.values()), world.settings.shading)
+            flags = _standing(surface, camera, standing, world.settings.shading)
             lengths = seen_lengths(surface, camera)
         else:
             flags = silhouettes(surface, lights[edges.light])
@@ -88,7 +89,7 @@ def boundary_length(world: World, camera: Camera) -> Scalar:
         lengths = seen_lengths(surface, camera)
         total = total + jnp.sum(jnp.where(silhouettes(surface, Viewpoint(*camera.viewpoint())), lengths, 0))
         for light in world.lights if world.settings.shadows else ():
-            if not isinstance(light, Sky):
+            if casts_sharp_shadows(light):
                 total = total + jnp.sum(jnp.where(folds(surface, _viewpoint(light)), lengths, 0))
     return total
 
@@ -105,6 +106,14 @@ def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], shading: Shad
 
 def _viewpoint(light: Directional | Point) -> Viewpoint:
     return Viewpoint(light.p, True) if isinstance(light, Point) else Viewpoint(unit(light.towards), False)
+
+
+def _ends_of(sun: Sun) -> list[Viewpoint]:
+    """Its lowest and its highest point: triangles that face the same of these differ little in how much of the sun they see."""
+    towards = unit(sun.towards)
+    up, radius = jnp.array([0, 0, 1], towards.dtype), jnp.deg2rad(sun.angular_diameter) / 2
+    up = unit(up - towards[2] * towards)
+    return [Viewpoint(towards + side * radius * up, False) for side in (-1, 1)]
 
 
 class GuidingDistribution(eqx.Module):

@@ -25,7 +25,7 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
 from ..core.vector import largest_component, unit
 from ..scene.camera import Camera
-from ..scene.light import Point, Sky
+from ..scene.light import Point, casts_sharp_shadows
 from ..trace.cylinder import Tube, tube_distance
 from ..trace.grid import Grid
 from ..trace.skirt import wall_distance
@@ -166,7 +166,7 @@ def _away_from_light(world: World, point: BoundarySample, p: Vector) -> Vector:
     """The unit direction in which light goes on past p."""
     chosen = jnp.zeros_like(p)
     for number, light in enumerate(world.lights):
-        if not isinstance(light, Sky):
+        if casts_sharp_shadows(light):
             away = unit(p - light.p) if isinstance(light, Point) else -unit(light.towards)
             chosen = jnp.where(point.light == number, away, chosen)
     return chosen

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import datetime
 import math
 import time
 from pathlib import Path
@@ -48,8 +49,13 @@ def add(commands: Any) -> None:
     light = command.add_argument_group("light")
     light.add_argument("--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the sun, clockwise from north [315]")
     light.add_argument("--altitude", type=float, default=35.0, metavar="DEGREES", help="of the sun, above the horizon [35]")
-    light.add_argument("--sun-from", type=_angles, metavar="AZ,ALT", help="a film of a moving sun: where it begins")
-    light.add_argument("--sun-to", type=_angles, metavar="AZ,ALT", help="and where it ends")
+    light.add_argument(
+        "--sun-from", type=_sun, metavar="AZ,ALT|TIME",
+        help="a film of a moving sun: where it begins, or when, as in 2026-06-21T06:00:00Z",
+    )  # fmt: skip
+    light.add_argument("--sun-to", type=_sun, metavar="AZ,ALT|TIME", help="and where it ends, or when")
+    for name in ("latitude", "longitude"):
+        light.add_argument(f"--{name}", type=float, metavar="DEGREES", help="for times [that of the terrain's middle]")
     light.add_argument("--haze", type=float, default=0.15, metavar="SHARE", help="of light lost along the terrain [0.15]")
     ground = command.add_argument_group("terrain")
     ground.add_argument(
@@ -72,9 +78,47 @@ def add(commands: Any) -> None:
     command.set_defaults(run=run)
 
 
-def _angles(text: str) -> tuple[float, float]:
-    azimuth, altitude = text.split(",")
-    return float(azimuth), float(altitude)
+def _sun(text: str) -> tuple[float, float] | datetime.datetime:
+    """Azimuth and altitude, or a time with its offset from UTC."""
+    try:
+        if "," in text:
+            azimuth, altitude = text.split(",")
+            return float(azimuth), float(altitude)
+        time = datetime.datetime.fromisoformat(text)
+    except ValueError:
+        time = None
+    if time is None or time.tzinfo is None:
+        rule = "must be an azimuth and an altitude, as 90,10, or a time with its offset from UTC, as 2026-06-21T06:00:00Z"
+        raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
+    return time
+
+
+def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | None":
+    """The sun's azimuth and altitude in each frame of a film, shape (frames, 2); None where it stands still."""
+    import numpy as np
+
+    from ..scene.sun import sun
+
+    first, last, place = options.sun_from, options.sun_to, (options.latitude, options.longitude)
+    times = isinstance(first, datetime.datetime)
+    if times != isinstance(last, datetime.datetime):
+        raise UserError("view: --sun-from and --sun-to must both be angles or both be times")
+    if not times and place != (None, None):
+        raise UserError("view: --latitude and --longitude stand with times, as in --sun-from 2026-06-21T06:00:00Z")
+    if first is None or not times:
+        return None if first is None else np.linspace(first, last, options.frames)
+    if place == (None, None):
+        place = terrain.place
+    elif None in place:
+        raise UserError("view: --latitude and --longitude belong together, one is missing")
+    start, end = (np.datetime64(t.astimezone(datetime.UTC).replace(tzinfo=None), "us") for t in (first, last))
+    instants = start + (end - start) * np.arange(options.frames) // (options.frames - 1)
+    azimuth, altitude = sun(instants, *place)
+    if not (altitude > 0).all():
+        low = int(np.argmin(altitude))
+        when = instants[low].astype("datetime64[s]")
+        raise UserError(f"view: the sun must be up all the time, its altitude is {altitude[low]:.2f} degrees at {when}Z")
+    return np.stack([azimuth, altitude], -1)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -101,9 +145,10 @@ def run(options: argparse.Namespace) -> None:
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
     if terrain.nodata.all():
         raise UserError(f"view: {options.terrain} holds no height")
+    path = _sun_path(options, terrain)
     stage = _Stage(options, terrain, size)
     arguments.set_up_jax(options)
-    said = stage.film(output, options) if film else stage.picture(output)
+    said = stage.film(output, options, path) if film else stage.picture(output)
     print(f"{output}: {said}, heights x {stage.exaggeration:g}, {time.perf_counter() - begin:.1f} s")
 
 
@@ -187,7 +232,7 @@ class _Stage:
         save_image(output, image)
         return f"{self.size[0]} x {self.size[1]} pixels"
 
-    def film(self, output: Path, options: argparse.Namespace) -> str:
+    def film(self, output: Path, options: argparse.Namespace, path: "np.ndarray | None") -> str:
         import numpy as np
 
         from ..io.films import writing_film
@@ -197,13 +242,12 @@ class _Stage:
         from .progress import bar
 
         field = self._field()
-        if options.sun_from is None:
+        if path is None:
             turns = [self._azimuth + 360 * k / options.frames for k in range(options.frames)]
             cameras = [self._camera(field, turn, around=True) for turn in turns]
             looks = [self.look] * options.frames
         else:
             cameras = [self._camera(field, self._azimuth)] * options.frames
-            path = np.linspace(options.sun_from, options.sun_to, options.frames)
             looks = [dataclasses.replace(self.look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
         ready, lit = None, None
         with writing_film(output, 24) as add, bar(total=options.frames, unit=" frames") as shown:

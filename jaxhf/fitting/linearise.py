@@ -27,6 +27,7 @@ from ..core.materialise import materialise
 from ..core.settings import Settings
 from ..rendering.samples import PictureSamples
 from ..scene.camera import Camera
+from ..scene.light import Sun
 from ..scene.scene import Scene
 from ..shade.radiance import direct, has_mirrors
 from ..trace.grid import Grid
@@ -88,7 +89,9 @@ class LinearisedEdges(eqx.Module):
 
 
 def can_be_linearised(scene: Scene, settings: Settings) -> bool:
-    """Whether each sample depends on one triangle alone, as it does where no mirror shows another one."""
+    """Whether each sample depends on one triangle alone: where no mirror shows another one, and none makes a penumbra."""
+    if any(isinstance(light, Sun) for light in scene.lights):
+        return False
     return not has_mirrors((obj.material for obj in scene.objects), settings)
 
 

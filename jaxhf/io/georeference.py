@@ -1,9 +1,11 @@
 """What the coordinates of a terrain file mean: lengths on a map, or degrees on a globe."""
 
+import importlib
 import math
 import re
 from typing import NamedTuple
 
+from ..core.extras import import_extra
 from .errors import FileError
 
 
@@ -84,6 +86,19 @@ def coordinate_system(wkt: str) -> CoordinateSystem:
     if units and not math.isclose(float(units[-1][1]), math.pi / 180, rel_tol=1e-6):
         raise FileError(f"its coordinates must be in degrees, their unit is {units[-1][0]}")
     return CoordinateSystem(True, _globe(horizontal), number)
+
+
+def geographic(wkt: str, x: float, y: float) -> tuple[float, float]:
+    """The latitude and longitude of a point in a reference system, degrees; not finite where it has none."""
+    if re.match(_GEOGRAPHIC, wkt):
+        return y, x
+    rasterio = import_extra("rasterio", "finding the latitude and longitude of a terrain needs", "geo")
+    warp = importlib.import_module("rasterio.warp")
+    try:
+        (longitude,), (latitude,) = warp.transform(rasterio.crs.CRS.from_wkt(wkt), "EPSG:4326", [x], [y])
+    except rasterio.errors.RasterioError:  # a local system has no place on the globe
+        return math.nan, math.nan
+    return latitude, longitude
 
 
 def _globe(wkt: str) -> Ellipsoid | None:

@@ -16,6 +16,7 @@ from .georeference import (
     CoordinateSystem,
     Georeference,
     coordinate_system,
+    geographic,
     metres_per_degree,
 )
 
@@ -107,6 +108,20 @@ class Terrain:
         found = scale_x * self.dx, scale_y * self.dy, offset_x + scale_x * self.x0, offset_y + scale_y * self.y0
         dx, dy, x0, y0 = map(float, found)
         return dx, dy, x0, y0
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """The latitude and longitude of its middle, degrees, as `sun` and lights by date take them: `Sun.at(time, *place)`.
+
+        ValueError where its georeference does not say; where x and y are lengths on a map, that needs rasterio.
+        """
+        dx, dy, x0, y0 = self.in_file
+        (ny, nx), wkt = self.heights.shape, self.georeference.wkt if self.georeference else ""
+        latitude, longitude = geographic(wkt, x0 + (nx - 1) / 2 * dx, y0 + (ny - 1) / 2 * dy) if wkt else (math.nan, math.nan)
+        if not (-90 <= latitude <= 90 and -360 <= longitude <= 360):
+            found = f"it is in {self.georeference.name}" if self.georeference and wkt else "it has no georeference"
+            raise ArgumentError("Terrain", "place", f"must be given as latitude and longitude, {found}")
+        return latitude, longitude
 
     def heightfield(self, dtype: DTypeLike | None = None) -> "Heightfield":
         """The surface, to be rendered.

@@ -16,7 +16,7 @@ from ..core.types import AnyArray, MatrixLeaf, float_leaf
 from .camera import Camera
 from .cylinder import Cylinder
 from .heightfield import Heightfield
-from .light import Light, Sky
+from .light import Light, Sky, Sun
 from .material import Material, Matte
 from .show import numbers
 from .skirt import Skirt
@@ -65,7 +65,7 @@ class Scene(eqx.Module):
     Attributes:
       objects: at least one `Object`.
       camera: a `Perspective` or an `Orthographic`.
-      lights: any number of `Directional`, `Point` and at most one `Sky`.
+      lights: any number of `Directional`, `Sun`, `Point` and at most one `Sky`.
       samples: rays a pixel that the scene asks for; `Settings.samples` overrules it.
     """
 
@@ -88,10 +88,11 @@ class Scene(eqx.Module):
                     raise ArgumentError("Scene", name, f"does not take a {type(value).__name__}{hint}")
         if sum(isinstance(light, Sky) for light in self.lights) > 1:
             raise ArgumentError("Scene", "lights", "may hold one Sky, they hold more")
-        if self.sky_occlusion is not None:
+        sun = any(isinstance(light, Sun) for light in self.lights)
+        if sun or self.sky_occlusion is not None:
             for number, obj in enumerate(self.objects):
                 if isinstance(obj.shape, Heightfield) and not _upright(obj.world_from_object):
-                    rule = "must keep heights upright under a Sky with occlusion"
+                    rule = f"must keep heights upright under a {'Sun' if sun else 'Sky with occlusion'}"
                     raise ArgumentError("Scene", f"objects[{number}].world_from_object", rule)
         if not isinstance(self.samples, int) or self.samples < 1:
             raise ArgumentError("Scene", "samples", f"must be a whole number from 1 on, it is {self.samples!r}")

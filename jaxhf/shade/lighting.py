@@ -1,7 +1,11 @@
 """Light that arrives at a hit: its direction, its irradiance, and whether something blocks it."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Bool, Float
 
 from ..core.materialise import materialise
@@ -9,15 +13,22 @@ from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, largest_component, unit
-from ..scene.light import Directional, Point, Sky
+from ..scene.light import Directional, Point, Sky, Sun
+from ..trace.cylinder import Tube
 from ..trace.grid import Grid
 from ..trace.hit import Hit
+from ..trace.intersect import blocked
+from ..trace.skyline import skyline_slope
 from ..trace.triangle import triangle_corners
 from ..trace.walk_start import place_on_grid
 from ..trace.world import World, unblocked
 
 # A cosine below this is rounded off; 0.6 degrees from the horizon of the shading normal.
 GRAZING = 0.01
+# Vertical chords in which the sun's disc is seen.
+_CHORDS = 8
+# Altitude up to which slopes are told apart, radians.
+_STEEPEST = np.deg2rad(89.9)
 
 
 def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vector, Index]:
@@ -31,6 +42,10 @@ def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vecto
             if seen is not None:
                 share = jnp.where((hit.object == k) & (hit.side > 0), _seen_share(grid, seen, hit), share)
         return light.radiance * (jnp.pi * share), jnp.zeros((), jnp.int32)
+    if isinstance(light, Sun):
+        seen, exhausted = _disc(world, light, hit, active)
+        share = jnp.where(seen.share > 0, seen.share, 1)
+        return light.irradiance * seen.share * _cosine(world, seen.mean / share, hit), exhausted
     wi, arriving, distance = materialise(_towards(light, hit.p))
     lit, exhausted = _visible(number, world, wi, distance, hit, active)
     return jnp.where(lit, arriving * _cosine(world, wi, hit), 0), exhausted
@@ -62,6 +77,9 @@ def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:
     flags = []
     for number, light in enumerate(world.lights):
         if not isinstance(light, Sky):
+            if isinstance(light, Sun):
+                flags.append(met & ~(_disc(world, light, hit, met)[0].share > 0))
+                continue
             wi, _, distance = _towards(light, hit.p)
             flags.append(met & ~_visible(number, world, wi, distance, hit, met)[0])
     return jnp.stack(flags) if flags else jnp.zeros(0, bool)
@@ -90,6 +108,79 @@ def _visible(number: int, world: World, wi: Vector, distance: Scalar | None, hit
     if world.settings.shadows:
         return unblocked(world, Ray(hit.p, wi), hit, lit, distance, number)
     return lit, jnp.zeros((), jnp.int32)
+
+
+class _Seen(NamedTuple):
+    """Of the sun's disc: the share that is seen, and the integral of the directions towards it over the disc's area."""
+
+    share: Scalar
+    mean: Vector
+
+
+def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]:
+    """What is seen of the sun from the side of the surface that the ray came from, and how many walks ran out of steps.
+
+    The disc is cut into vertical chords, at the nodes of Gauss's and Chebyshev's quadrature of the second kind, whose weight is
+    the chords' length. In the plane of a chord all that is below the horizon is hidden: what is left of it, and its middle, are
+    known exactly.
+    """
+    dtype = hit.p.dtype
+    wi, radius = unit(sun.towards), jnp.deg2rad(sun.angular_diameter) / 2
+    below = jnp.sqrt(wi[0] * wi[0] + wi[1] * wi[1])
+    upright = below < 1e-6  # then any direction is that of its azimuth
+    along = jnp.where(upright, jnp.array([1, 0], dtype), wi[:2] / jnp.where(upright, 1, below))
+    aside = jnp.stack([along[1], -along[0]])
+    n = hit.n * hit.side.astype(dtype)
+    lit = active & _is_outside(world, hit)
+
+    def chord(total: tuple[_Seen, Index], node: tuple[Scalar, Scalar]) -> tuple[tuple[_Seen, Index], None]:
+        seen, exhausted = total
+        off, half = radius * node[0], radius * node[1]
+        level = below * along + off * aside
+        size = jnp.sqrt(level[0] * level[0] + level[1] * level[1])
+        level = jnp.stack([*(level / size), jnp.zeros((), dtype)])
+        middle = jnp.arctan2(wi[2], size)
+        bottom, top = (jnp.clip(middle + end, -_STEEPEST, _STEEPEST) for end in (-half, half))
+        lowest, highest = jnp.tan(bottom), jnp.tan(top)
+        slope = jnp.maximum(_own_slope(n, level, jnp.tan(jnp.clip(middle, -_STEEPEST, _STEEPEST))), lowest)
+        for number, surface in enumerate(world.surfaces):
+            if world.settings.shadows and isinstance(surface, Grid):
+                slope, more = skyline_slope(surface, number, hit.p, level, hit, lit, (slope, highest), world.settings.max_steps)
+                exhausted = exhausted + more.astype(jnp.int32)
+        horizon = jnp.clip(jnp.arctan(slope), bottom, top)
+        weight = 2 * node[1] * node[1] / (_CHORDS + 1) * ((top - horizon) / (top - bottom))
+        weight = jnp.where(lit, weight, 0)
+        height = (horizon + top) / 2
+        direction = jnp.cos(height) * level + jnp.stack([jnp.zeros((), dtype)] * 2 + [jnp.sin(height)])
+        return (_Seen(seen.share + weight, seen.mean + weight * direction), exhausted), None
+
+    turns = np.arange(1, _CHORDS + 1) * (np.pi / (_CHORDS + 1))
+    nodes = jnp.asarray(np.cos(turns), dtype), jnp.asarray(np.sin(turns), dtype)
+    none = _Seen(jnp.zeros((), dtype), jnp.zeros(3, dtype)), jnp.zeros((), jnp.int32)
+    (seen, exhausted), _ = lax.scan(chord, none, nodes)
+    for number, surface in enumerate(world.surfaces):
+        if world.settings.shadows and isinstance(surface, Tube):
+            fixed = lax.stop_gradient((surface, Ray(hit.p, wi), hit))
+            met, _ = blocked(*fixed, lit, None, number=number, max_steps=None)
+            seen = _Seen(*(jnp.where(met, 0, value) for value in seen))
+    return seen, exhausted
+
+
+def _is_outside(world: World, hit: Hit) -> Flag:
+    """Whether the hit is not on the lower side of a heightfield: the ground is solid."""
+    outside = hit.side > 0
+    for number, surface in enumerate(world.surfaces):
+        outside = outside if isinstance(surface, Grid) else outside | (hit.object == number)
+    return outside
+
+
+def _own_slope(n: Vector, level: Vector, middle: Scalar) -> Scalar:
+    """Above which slope, in the plane of a level direction, light reaches the upper side of a surface; +-inf: none and any.
+
+    On other sides the light at a `middle` slope stands for all of it.
+    """
+    along, up = dot(n, level), n[2] > 1e-6
+    return jnp.where(up, -along / jnp.where(up, n[2], 1), jnp.where(along + middle * n[2] > 0, -jnp.inf, jnp.inf))
 
 
 def rounded_abs(cosine: Scalar) -> Scalar:

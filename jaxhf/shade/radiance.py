@@ -11,7 +11,7 @@ from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import Flag, Index, Vector
 from ..core.vector import dot, unit
-from ..scene.light import Sky
+from ..scene.light import Sky, casts_sharp_shadows
 from ..scene.material import Material, Matte, Mirror
 from ..scene.texture import ImageTexture
 from ..trace.hit import Hit
@@ -42,7 +42,7 @@ def shadowed_radiance(world: World, number: Index, hit: Hit) -> Vector:
     albedo = _albedo(world, hit)
     if albedo is not None:
         for k, light in enumerate(world.lights):
-            if not isinstance(light, Sky):
+            if casts_sharp_shadows(light):
                 total = jnp.where(number == k, unshadowed_irradiance(world, light, hit), total)
         total = jnp.where(_has_material(world, hit, Matte), albedo / jnp.pi * total, 0)
     return total

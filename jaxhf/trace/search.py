@@ -71,7 +71,7 @@ def enough_steps(grid: Grid) -> int:
 Step = Callable[[jax.Array], jax.Array]
 
 # Blocks of cells that are looked at between two visits to cells.
-_SKIPS = 2
+SKIPS = 2
 
 
 def _search(walk: Walk, state: jax.Array, budget: int, count: bool, early_exit: bool) -> tuple[jax.Array, Index | None]:
@@ -107,7 +107,7 @@ def _steps(
     def advance(state, steps):
         if steps is not None:
             steps = steps + walking(state).astype(jnp.int32)
-        state = lax.fori_loop(0, _SKIPS, lambda _, state: skip(state), state)
+        state = lax.fori_loop(0, SKIPS, lambda _, state: skip(state), state)
         return visit(state), steps
 
     init = state, jnp.zeros(state.shape, jnp.int32) if count else None

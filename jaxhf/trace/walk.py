@@ -11,12 +11,15 @@ by the same expression from the plane's integer, so all blocks, of whatever size
 cannot change a hit in a single bit.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Bool, Float, UInt32
 
+from ..core.materialise import materialise
 from ..core.types import Flag, Index, Scalar
 from ..core.vector import greater, lesser
 from .pyramid import Pyramid
@@ -66,6 +69,35 @@ class WalkResult(eqx.Module):
 def walking(state: UInt32[jax.Array, "*batch"]) -> Bool[jax.Array, "*batch"]:
     """Whether the walk goes on; of one ray or of several."""
     return (state & 3) >= WALKING
+
+
+class _Cell(NamedTuple):
+    """What a walk finds in one cell.
+
+    Attributes:
+      whole: whether all of its vertices have heights.
+      near, out, out_x, out_y: distances at which the ray enters and leaves, and reaches its far planes in x and in y.
+      through_x: whether it leaves through that in x.
+      across, diagonal: see `Walk._diagonal`.
+      crosses: whether the ray crosses the diagonal there.
+      on_own: whether that crossing is on the triangle that the ray leaves.
+      skip_out: whether the exit is.
+      gap_out, gap_diagonal: heights of the ray above the surface at the exit and at the diagonal.
+    """
+
+    whole: Flag
+    near: Scalar
+    out: Scalar
+    out_x: Scalar
+    out_y: Scalar
+    through_x: Flag
+    across: Scalar
+    diagonal: Scalar
+    crosses: Flag
+    on_own: Flag
+    skip_out: Flag
+    gap_out: Scalar
+    gap_diagonal: Scalar
 
 
 class Walk(eqx.Module):
@@ -177,6 +209,19 @@ class Walk(eqx.Module):
     def visit(self, state: jax.Array) -> jax.Array:
         """One cell: looks for a change of sign at its diagonal and at its exit, else moves on; larger blocks are left alone."""
         above, ix, iy, size = self._unpack(state)
+        cell = self._cell(state, ix, iy, size)
+        met_first = cell.crosses & ~cell.on_own & _opposite(above, cell.gap_diagonal)
+        met = cell.whole & (met_first | (~cell.skip_out & _opposite(above, cell.gap_out)))
+        # A diagonal that is not crossed: which side of it the ray is on.
+        before = (cell.near + cell.out) / 2 * self.rate < cell.across
+        upper = jnp.where(cell.crosses, met_first == (self.rate > 0), before) != self.back_x
+
+        above = jnp.where(cell.whole, above, cell.gap_out >= 0)  # behind a hole the side is found anew
+        onwards = self._onwards(above, ix, iy, size, cell.out_x, cell.out_y)
+        hit = self.pack(HIT, above, 2 * ix + upper.astype(jnp.int32), iy)
+        return jnp.where(walking(state) & (size == 1), jnp.where(met, hit, onwards), state)
+
+    def _cell(self, state: jax.Array, ix: Index, iy: Index, size: Index) -> "_Cell":
         near, out_x, out_y = self._passage(ix, iy, size)
         flip_x, flip_y = self.flip
         z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ flip_x, iy ^ flip_y)
@@ -208,16 +253,51 @@ class Walk(eqx.Module):
         if self.noise is not None:
             gap_out, gap_diagonal = (jnp.where(jnp.abs(gap) <= self.noise, 0, gap) for gap in (gap_out, gap_diagonal))
         gap_out = jnp.where(last, self.dz, gap_out)  # below the lowest height or above the highest: no rounding can hide it
-        met_first = crosses & ~on_own & _opposite(above, gap_diagonal)
-        met = whole & (met_first | (~skip_out & _opposite(above, gap_out)))
-        # A diagonal that is not crossed: which side of it the ray is on.
-        before = (near + out) / 2 * self.rate < across
-        upper = jnp.where(crosses, met_first == (self.rate > 0), before) != self.back_x
+        return _Cell(
+            whole, near, out, out_x, out_y, through_x, across, diagonal, crosses, on_own, skip_out, gap_out, gap_diagonal
+        )
 
-        above = jnp.where(whole, above, gap_out >= 0)  # behind a hole the side is found anew
-        onwards = self._onwards(above, ix, iy, size, out_x, out_y)
-        hit = self.pack(HIT, above, 2 * ix + upper.astype(jnp.int32), iy)
-        return jnp.where(walking(state) & (size == 1), jnp.where(met, hit, onwards), state)
+    def above_cell(self, state: jax.Array, beyond: Scalar) -> tuple[jax.Array, Index]:
+        """One cell, for a ray above the surface that nothing stops: goes on, and says which edge stands highest over it.
+
+        Args:
+          state: of the walk.
+          beyond: up to which t no edge counts.
+
+        Returns:
+          The state in the next cell, and the edge that is seen from where t is 0 at the largest slope of those above the ray,
+          see `_edge`; -1 where none is, and in a larger block, which is left alone.
+        """
+        above, ix, iy, size = self._unpack(state)
+        visits = walking(state) & (size == 1)
+        cell = self._cell(state, ix, iy, size)
+        far, near = self.t_start + cell.out, self.t_start + cell.diagonal
+        on_diagonal = jnp.where(cell.crosses & ~cell.on_own & (near > beyond), -cell.gap_diagonal, 0)
+        on_exit = jnp.where(cell.skip_out | (far <= beyond), 0, -cell.gap_out)
+        kind = jnp.where(on_diagonal * far > on_exit * near, 2, cell.through_x.astype(jnp.int32))
+        rises = visits & cell.whole & (greater(on_diagonal, on_exit) > 0)
+        edge = materialise(jnp.where(rises, self._edge(ix, iy, kind, ahead=True), -1))
+        return jnp.where(visits, self._onwards(above, ix, iy, size, cell.out_x, cell.out_y), state), edge
+
+    def border(self, state: jax.Array) -> Index:
+        """The edge by which a ray comes into the grid, see `_edge`; -1 where the ray is above it."""
+        _, ix, iy, _ = self._unpack(state)
+        z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ self.flip[0], iy ^ self.flip[1])
+        u, v = self.x - ix.astype(self.x.dtype), self.y - iy.astype(self.y.dtype)
+        through_x = self.distance_x(ix) >= self.distance_y(iy)
+        low = jnp.where(through_x, jnp.where(self.back_x, z10, z00), jnp.where(self.back_y, z01, z00))
+        high = jnp.where(through_x, jnp.where(self.back_x, z11, z01), jnp.where(self.back_y, z11, z10))
+        along = jnp.where(through_x, jnp.where(self.back_y, 1 - v, v), jnp.where(self.back_x, 1 - u, u))
+        rises = walking(state) & (self._gap(jnp.zeros_like(u), low, high, along) < 0)
+        return jnp.where(rises, self._edge(ix, iy, through_x.astype(jnp.int32), ahead=False), -1)
+
+    def _edge(self, ix: Index, iy: Index, kind: Index, ahead: bool) -> Index:
+        """3 * its first vertex + its kind: of the sides by which the ray leaves or enters a cell that along x (0) or y (1), or
+        the diagonal (2)."""
+        flip_x, flip_y = self.flip
+        further_x, further_y = (kind == 1) & (self.back_x != ahead), (kind == 0) & (self.back_y != ahead)
+        x, y = (ix ^ flip_x) + further_x.astype(jnp.int32), (iy ^ flip_y) + further_y.astype(jnp.int32)
+        return 3 * (y * self.nx + x) + kind
 
     @property
     def begins_upper(self) -> Flag:

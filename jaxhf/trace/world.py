@@ -19,7 +19,7 @@ from ..core.settings import Settings
 from ..core.types import Flag, Index, MatrixLeaf, Scalar
 from ..core.vector import unit
 from ..scene.heightfield import Heightfield
-from ..scene.light import Directional, Light
+from ..scene.light import Directional, Light, Sun
 from ..scene.material import Material
 from ..scene.scene import Scene, Shape
 from ..scene.skirt import Skirt
@@ -94,7 +94,7 @@ def _visible_sky(surface: Surface, scene: Scene) -> Float[jax.Array, "_ 3"] | No
 
 
 def _make_ceiling(surface: Surface, light: Light, wanted: bool) -> Ceiling | None:
-    if not wanted or not isinstance(surface, Grid) or not isinstance(light, Directional):
+    if not wanted or not isinstance(surface, Grid) or not isinstance(light, Directional) or isinstance(light, Sun):
         return None
     return make_ceiling(surface, unit(light.towards))
 

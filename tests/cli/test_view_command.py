@@ -1,14 +1,22 @@
 """`jaxhf view`: pictures and films of terrain files."""
 
+import argparse
+import dataclasses
+
 import imageio.v3 as imageio
 import numpy as np
 import pytest
 
 import jaxhf
 from jaxhf.cli.main import main
+from jaxhf.cli.view import _sun, _sun_path
+from jaxhf.core.errors import UserError
+from jaxhf.io.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.terrain import Terrain
 
 SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
+MORNING, EVENING = "2026-06-21T05:00:00Z", "2026-06-21T18:00+01:00"
+BY_TIME = ["--sun-from", MORNING, "--sun-to", EVENING]
 
 
 @pytest.fixture(autouse=True)
@@ -58,6 +66,19 @@ def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch):
         assert (np.abs(np.diff(film, axis=0)).max(-1) > 15).mean() > 0.05
     shape = np.abs(lit - lit[:, :1, :1]).max(-1) > 60  # the terrain stands still
     assert (shape[0] == shape[2]).mean() > 0.9
+
+
+def test_the_sun_moves_as_it_does_over_the_terrain(terrain):
+    heights = dataclasses.replace(jaxhf.load_heights(terrain), georeference=Georeference(WGS84_DEGREES, offset=(7.0, 45.5)))
+    heights = dataclasses.replace(heights, dx=0.125, dy=1 / 6)  # its middle is at 46.5 degrees north, 8 east
+    options = argparse.Namespace(sun_from=_sun(MORNING), sun_to=_sun(EVENING), frames=13, latitude=None, longitude=None)
+    path = _sun_path(options, heights)
+    assert path is not None
+    hours = np.datetime64("2026-06-21T05") + np.arange(13).astype("timedelta64[h]")
+    np.testing.assert_allclose(path, np.stack(jaxhf.sun(hours, 46.5, 8.0), -1), atol=1e-6)
+    options.latitude, options.longitude = -33.0, 8.0
+    with pytest.raises(UserError, match=r"its altitude is -18.44 degrees at 2026-06-21T05:00:00Z"):
+        _sun_path(options, heights)
 
 
 def test_a_picture_is_draped_from_corner_to_corner(terrain, tmp_path):
@@ -120,6 +141,14 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
         (["--size", "48"], "--size must be two numbers of pixels, as 1280x800, it is '48'"),
         (["--sun-from", "90,10"], "--sun-from and --sun-to belong together"),
         (["--sun-from", "90,10", "--sun-to", "90,20"], "a moving sun makes a film"),
+        (["-o", "a.gif", "--sun-from", "90,10", "--sun-to", MORNING], "must both be angles or both be times"),
+        (["-o", "a.gif", *BY_TIME], "place must be given as latitude and longitude, it has no georeference"),
+        (["-o", "a.gif", *BY_TIME, "--latitude", "46.5"], "--latitude and --longitude belong together, one is missing"),
+        (
+            ["-o", "a.gif", *BY_TIME, "--latitude", "-80", "--longitude", "8"],
+            "the sun must be up all the time, its altitude is",
+        ),
+        (["--latitude", "46.5"], "--latitude and --longitude stand with times"),
         (["--altitude", "0"], "altitude of the sun must be above 0"),
         (["--above", "95"], "altitude must be from -90 to 90 degrees"),
         (["--water", "nan"], "--water must be finite"),

@@ -23,9 +23,13 @@ from jaxhf import (
     Point,
     SceneError,
     Sky,
+    Sun,
+    Terrain,
     load_heights,
     load_scene,
+    save_heights,
 )
+from jaxhf.io.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.procedural import grid
 from jaxhf.io.toml import tables
 from jaxhf.io.toml.fit import load_case
@@ -182,6 +186,27 @@ def test_directional_lights(tmp_path, text, towards):
     assert isinstance(light, Directional)
     np.testing.assert_allclose(light.towards, towards, atol=1e-15)
     np.testing.assert_array_equal(light.irradiance, (np.pi,) * 3)
+
+
+def test_a_sun_by_date_stands_over_the_terrain(tmp_path):
+    """At the place of its file's middle, whatever the file's coordinates."""
+    zone = pytest.importorskip("rasterio").crs.CRS.from_epsg(32632).to_wkt()
+    utm = Georeference(zone, (10, 10), (423258.310033, 5150079.103964))
+    text = (
+        f'{CAMERA}[[lights]]\ntype = "sun"\ntime = 2026-06-21T12:00:00Z\n[[objects]]\nshape = "heightfield"\nfile = "dem.npz"'
+    )
+    for place in (Georeference(WGS84_DEGREES, (0.01, 0.01), (7.99, 46.49)), utm):
+        save_heights(tmp_path / "dem.npz", Terrain(np.zeros((3, 3)), georeference=place))
+        (light,) = read(tmp_path, text).lights
+        assert isinstance(light, Sun)
+        assert light.angular_diameter == 0.53
+        noon = Directional.at(datetime(2026, 6, 21, 12, tzinfo=UTC), 46.5, 8)
+        np.testing.assert_allclose(light.towards, noon.towards, atol=1e-6)
+    save_heights(tmp_path / "dem.npz", Terrain(np.zeros((3, 3))))
+    with pytest.raises(
+        SceneError, match=r":6: lights\[0\]: Terrain: place must be given as latitude and longitude, it has no geo"
+    ):
+        read(tmp_path, text)
 
 
 def test_a_sky_that_terrain_hides(tmp_path):
@@ -354,7 +379,7 @@ MISTAKES = [
         6,
         "it is 'perspectiv'; did you mean 'perspective'?",
     ),
-    (light("type = 3"), 11, "lights[0].type must be one of directional, point, sky; it is 3"),
+    (light("type = 3"), 11, "lights[0].type must be one of directional, sun, point, sky; it is 3"),
     (f'{CAMERA}[[objects]]\nshape = "sphere"', 7, "objects[0].shape must be one of heightfield, cylinder; it is 'sphere'"),
     (surface('material = "glass"'), 10, "objects[0].material must be one of matte, mirror; it is 'glass'"),
     (surface('albedo = "gird"'), 10, "objects[0].albedo: there is no texture 'gird'; the scene has none"),
@@ -423,6 +448,12 @@ MISTAKES = [
     (light(f'type = "directional"\n{BY_DATE.replace("T12", "T23")}'), 12, "time must be one at which the sun is up, its al"),
     (light(f'type = "directional"\n{BY_DATE.replace("Z", "")}'), 12, "time must be a date and time with its offset from UTC"),
     (light('type = "directional"\nlatitude = 3'), 10, "time must be given with time, latitude and longitude, it is missing"),
+    (
+        light('type = "directional"\ntime = 2026-06-21T12:00:00Z'),
+        10,
+        "lights[0] must have latitude and longitude, there is no t",
+    ),
+    (light('type = "sun"\nangular_diameter = 0'), 12, "lights[0].angular_diameter must be above 0 and at most 10 degrees, it"),
     (light('type = "sky"\nradiance = 1\n[[lights]]\ntype = "sky"\nradiance = 1'), 10, "lights may hold one Sky"),
     (f'{CAMERA}[[objects]]\nshape = "cylinder"\nradius = -1', 8, "objects[0].radius must be positive, it is -1.0"),
     (f'{CAMERA}[[objects]]\nshape = "cylinder"\nz_min = 3', 8, "objects[0].z_min must lie below z_max, they are 3.0 and 1.0"),

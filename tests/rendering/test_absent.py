@@ -19,7 +19,7 @@ from jaxhf.core import affine, autodiff, masked
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import localise
 from jaxhf.shade import lighting, radiance
-from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, world as trace_world
+from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, skyline, world as trace_world
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
@@ -153,6 +153,11 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
         "plain",
         Case(scene(lights=(SUN, jaxhf.Sky(0.5, occlusion=4)))),
         [fails_everywhere(horizon.visible_sky), fails_everywhere(lighting._seen_share)],
+    ),
+    "sun with a size": (
+        "plain",
+        Case(scene(lights=(jaxhf.Sun((1, 2, 3)),)), jaxhf.Settings(shading="flat")),
+        [fails_everywhere(skyline.skyline_slope), fails_everywhere(lighting._disc)],
     ),
     "point light": (
         "plain",

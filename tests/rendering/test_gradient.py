@@ -58,8 +58,8 @@ def reflected() -> jaxhf.Scene:
 
 
 def parallel() -> jaxhf.Scene:
-    """Terrain with walls in the sun and under a sky, seen by parallel rays."""
-    place = matrix([[0.9, 0.1, 0.05], [-0.1, 0.9, 0.1], [0.05, 0.1, 0.8]], (0.1, 0, 0))
+    """Terrain with walls in two suns, one of them wide, and under a sky, seen by parallel rays."""
+    place = matrix([[0.9, 0.1, 0], [-0.1, 0.9, 0], [0, 0, 0.8]], (0.1, 0, 0))
     field = jaxhf.Heightfield(waves(9, 8, 5, 0.06))
     return jaxhf.Scene(
         [
@@ -67,7 +67,7 @@ def parallel() -> jaxhf.Scene:
             jaxhf.Object(jaxhf.Skirt.of(field, -0.4), jaxhf.Matte((0.6, 0.5, 0.4)), place),
         ],
         jaxhf.Orthographic.look_at((0.6, -0.7, 0.9), (0.5, 0.5, 0.0), extent=0.9, width=SIZE, height=SIZE),
-        [jaxhf.Directional((-0.7, 0.2, 0.4), (2, 3, 4)), jaxhf.Sky((0.1, 0.2, 0.4))],
+        [jaxhf.Directional((-0.7, -0.4, 0.4), (2, 3, 4)), jaxhf.Sky((0.1, 0.2, 0.4)), jaxhf.Sun((-0.3, 1, 0.1), (4, 3, 2), 9)],
     )
 
 
@@ -91,11 +91,13 @@ def nodes(tree: Any) -> list[Any]:
     return found
 
 
-def random_change(leaf: jax.Array) -> jax.Array:
-    """As large as the leaf."""
+def random_change(leaf: jax.Array, upright: bool) -> jax.Array:
+    """As large as the leaf; `upright` ones of a matrix do not tilt what stands."""
     change = np.random.default_rng(6).uniform(-1, 1, leaf.shape) * np.abs(leaf).max()
     if leaf.shape == (4, 4):
         change[3] = 0  # the last row of an affine matrix stays
+        if upright:
+            change[2, :2] = change[:2, 2] = 0
     return jnp.asarray(change)
 
 
@@ -149,10 +151,11 @@ def test_every_leaf_pixel_by_pixel(name):
     leaves, structure = jax.tree.flatten_with_path(scene)
     weights = np.random.default_rng(7).normal(size=(SIZE, SIZE, 3))
     gradients = jax.tree.leaves(reverse(scene, jnp.asarray(weights), SETTINGS))
+    upright = any(isinstance(light, jaxhf.Sun) for light in scene.lights)  # it is seen in upright planes
     borders = [f".objects[{k}].shape" for k, obj in enumerate(scene.objects) if isinstance(obj.shape, jaxhf.Skirt)]
     for k, (path, _) in enumerate(leaves):
         where = jax.tree_util.keystr(path)
-        changes = [random_change(leaf) if j == k else jnp.zeros_like(leaf) for j, (_, leaf) in enumerate(leaves)]
+        changes = [random_change(leaf, upright) if j == k else jnp.zeros_like(leaf) for j, (_, leaf) in enumerate(leaves)]
         change = jax.tree.unflatten(structure, changes)
         wide, narrow = (np.asarray(value) for value in differences(scene, change, SETTINGS))
         exact, numeric = np.asarray(forward(scene, change, SETTINGS)), (4 * narrow - wide) / 3

@@ -148,7 +148,7 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         picture = part.at("pictures", k, table=picture_table)
         given = picture.read(_PICTURE)
         target = _read(picture, "image", load_image, given["image"])
-        lights = base.lights if given["lights"] is None else read_lights(picture, given["lights"])
+        lights = base.lights if given["lights"] is None else read_lights(picture, given["lights"], base.sought.stored)
         camera = _camera(picture, given["camera"], base, target.shape[:2])
         scenes.append(picture.made(Scene, base.objects, camera, lights, base.samples))
         targets.append(target)
@@ -193,8 +193,8 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
 def _toml_base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     objects = read_objects(part, values, dtype)
     camera = None if values["camera"] is None else partial(_sized, part.at("camera", table=values["camera"]))
-    lights = read_lights(part, values["lights"])
     sought = _sought(part, values["objects"], objects)
+    lights = read_lights(part, values["lights"], sought.stored)
     return _Base(tuple(item for item, _ in objects), tuple(lights), values["samples"], camera, sought)
 
 

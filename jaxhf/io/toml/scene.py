@@ -44,12 +44,10 @@ def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
     """
     part = open_toml(path)
     values = read_scene(part)
-    parts = {
-        "camera": read_camera(part.at("camera", table=values["camera"])),
-        "lights": read_lights(part, values["lights"]),
-        "objects": [item for item, _ in read_objects(part, values, np.dtype(dtype))],
-    }
-    return part.made(Scene, samples=values["samples"], **parts)
+    camera = read_camera(part.at("camera", table=values["camera"]))
+    objects = read_objects(part, values, np.dtype(dtype))
+    lights = read_lights(part, values["lights"], next((stored for _, stored in objects if stored is not None), None))
+    return part.made(Scene, [item for item, _ in objects], camera, lights, samples=values["samples"])
 
 
 def open_toml(path: Path) -> Part:
@@ -79,12 +77,19 @@ def read_camera(part: Part) -> Camera:
     return _variant(part, "type", CAMERAS)
 
 
-def read_lights(part: Part, tables: list[dict[str, Any]]) -> list[Light]:
-    """The lights in the list `lights` of `part`."""
-    return [_light(part.at("lights", k, table=table)) for k, table in enumerate(tables)]
+def read_lights(part: Part, tables: list[dict[str, Any]], terrain: Terrain | None) -> list[Light]:
+    """The lights in the list `lights` of `part`; those by date alone stand where they do over the terrain."""
+    return [_light(part.at("lights", k, table=table), terrain) for k, table in enumerate(tables)]
 
 
-def _light(part: Part) -> Light:
+def _light(part: Part, terrain: Terrain | None) -> Light:
+    if "time" in part.table and part.table.keys().isdisjoint(("latitude", "longitude")):
+        if terrain is None:
+            raise part.error(
+                f"{part.name} must have latitude and longitude, there is no terrain file whose place they could be"
+            )
+        latitude, longitude = part.made(lambda: terrain.place)
+        part = part._replace(table={**part.table, "latitude": latitude, "longitude": longitude})
     light = _variant(part, "type", LIGHTS)
     if isinstance(light, Directional) and "radiance" in part.table:
         old = part.at("radiance")

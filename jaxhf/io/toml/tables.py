@@ -1,12 +1,13 @@
 """Which keys the tables of a TOML scene take, and what is made of them. `docs/scene-files.md` explains them all."""
 
+import functools
 import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from ...core.errors import ArgumentError
 from ...scene.camera import Camera, Orthographic, Perspective
-from ...scene.light import Directional, Light, Point, Sky
+from ...scene.light import Directional, Light, Point, Sky, Sun
 from ...scene.material import Material, Matte, Mirror
 from .. import procedural
 from .values import (
@@ -38,23 +39,23 @@ class Key(NamedTuple):
 Keys = Mapping[str, Key]
 
 
-def _directional(irradiance, radiance, **direction) -> Directional:
+def _directional(irradiance, radiance=None, kind: type[Directional] = Directional, **given) -> Directional:
     if irradiance is not None and radiance is not None:
         raise ArgumentError("", "radiance", "must stand without irradiance, whose old name it is")
     irradiance = radiance if irradiance is None else irradiance
-    given = {name: value for name, value in direction.items() if value is not None}
+    given = {name: value for name, value in given.items() if value is not None}
     ways = [keys for keys in (("towards",), ("azimuth", "altitude"), ("time", "latitude", "longitude")) if given.keys() & keys]
     if len(ways) > 1:
         first, *_ = given.keys() & ways[0]
         raise ArgumentError("", first, f"must stand without {' and '.join(ways[1])}, it says the same")
     if "towards" in given:
-        return Directional(given["towards"], irradiance)
+        return kind(**given, irradiance=irradiance)
     if "time" in given or "latitude" in given or "longitude" in given:
         for name in ("time", "latitude", "longitude"):
             if name not in given:
                 raise ArgumentError("", name, "must be given with time, latitude and longitude, it is missing")
-        return Directional.at(**given, irradiance=irradiance)
-    return Directional.from_angles(**given, irradiance=irradiance)
+        return kind.at(**given, irradiance=irradiance)
+    return kind.from_angles(**given, irradiance=irradiance)
 
 
 def _point(position, intensity) -> Point:
@@ -88,19 +89,17 @@ CAMERAS: dict[str, tuple[Callable[..., Camera], Keys]] = {
         },
     ),
 }
+_DIRECTION: Keys = {
+    "towards": Key(numbers(3), None),
+    "azimuth": Key(number, None),
+    "altitude": Key(angle_above_horizon, None),
+    "time": Key(instant, None),
+    **{name: Key(number, None) for name in ("latitude", "longitude")},
+    "irradiance": Key(colour, None),
+}
 LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
-    "directional": (
-        _directional,
-        {
-            "towards": Key(numbers(3), None),
-            "azimuth": Key(number, None),
-            "altitude": Key(angle_above_horizon, None),
-            "time": Key(instant, None),
-            **{name: Key(number, None) for name in ("latitude", "longitude")},
-            "irradiance": Key(colour, None),
-            "radiance": Key(colour, None),  # the old name of irradiance
-        },
-    ),
+    "directional": (_directional, {**_DIRECTION, "radiance": Key(colour, None)}),  # the old name of irradiance
+    "sun": (functools.partial(_directional, kind=Sun), {**_DIRECTION, "angular_diameter": Key(number, None)}),
     "point": (_point, {"position": Key(numbers(3)), "intensity": Key(colour)}),
     "sky": (Sky, {"radiance": Key(colour), "occlusion": Key(whole, None)}),
 }
