@@ -89,7 +89,11 @@ class LinearisedEdges(eqx.Module):
 
 
 def can_be_linearised(scene: Scene, settings: Settings) -> bool:
-    """Whether each sample depends on one triangle alone: where no mirror shows another one, and none makes a penumbra."""
+    """Whether each sample depends on one triangle alone: where no mirror shows another one, and none makes a penumbra.
+
+    How much of a `Sky` with `occlusion` the terrain hides is taken as it is at each step, without its derivative: it changes
+    slowly, and points on edges are worth more.
+    """
     if any(isinstance(light, Sun) for light in scene.lights):
         return False
     return not has_mirrors((obj.material for obj in scene.objects), settings)
