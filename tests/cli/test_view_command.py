@@ -8,6 +8,8 @@ import jaxhf
 from jaxhf.cli.main import main
 from jaxhf.io.terrain import Terrain
 
+pytestmark = pytest.mark.unoptimised
+
 SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
 
 

@@ -32,6 +32,8 @@ from jaxhf.fitting.view import differences
 from jaxhf.io.procedural import fractal
 from jaxhf.scene.localise import localise
 
+pytestmark = pytest.mark.unoptimised
+
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024, edge_samples=0)
 LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6))
 SIZE = 24
@@ -188,6 +190,7 @@ def test_as_many_heights_lie_within_their_deviations_as_should(targets):
     assert abs(np.mean(np.abs(ratio) < 2) - 0.954) < 0.05
 
 
+@pytest.mark.unoptimised(False)  # takes longer to run than to compile
 def test_sampled_deviations_are_the_exact_ones():
     """In the half that pictures show, and in the other, which only the prior knows."""
     measured = pictures(camera=HALF)

@@ -10,6 +10,8 @@ import pytest
 
 import jaxhf
 
+pytestmark = pytest.mark.unoptimised
+
 EYE, TARGET = (-0.25, -0.75, 1.25), (0.5, 0.5, 0.125)  # exact in binary, so that an offset takes nothing from them
 WIDTH, HEIGHT, FOV = 24, 16, 24.0
 SKY = np.array([0.1, 0.2, 0.4])

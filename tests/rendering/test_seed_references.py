@@ -16,6 +16,8 @@ import jaxhf
 from jaxhf.core.settings import Shading
 from jaxhf.rendering.cast import cast_camera
 
+pytestmark = pytest.mark.unoptimised
+
 SCENES = ("hftest", "landsea-0", "landsea-1", "texture", "landsea-big")
 LIT_BY_COLOUR = ("hftest", "landsea-0", "landsea-1", "landsea-big")
 CYLINDER, MATTE, MIRROR = 1, 2, 3
