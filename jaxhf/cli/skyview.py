@@ -26,6 +26,7 @@ def add(commands: Any) -> None:
 
 def add_terrain(command: argparse.ArgumentParser, output: str) -> None:
     """What `jaxhf skyview` and `jaxhf horizon` have in common."""
+    command.set_defaults(placed=True)
     command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("-o", "--output", required=True, metavar="OUT", help=output)
     command.add_argument("--azimuths", type=int, default=32, metavar="K", help="directions, at even steps from north on [32]")

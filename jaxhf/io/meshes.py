@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, require_kind
 from ..core.extras import import_extra
-from .files import PathLike, by_ending, reading, replacing, require_folder
+from ..scene.heightfield import Heightfield
+from .files import PathLike, by_ending, file_path, reading, replacing, require_folder
 from .images import linear_from_srgb
 from .terrain import Terrain
 
@@ -38,6 +39,7 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
       FileNotFoundError, PermissionError: the folder does not exist, or cannot be written to.
     """
     path = require_writable_mesh(path)
+    require_kind("save_mesh", "terrain", terrain, (Terrain, Heightfield), "a jaxhf.Terrain or a jaxhf.Heightfield")
     heights = terrain.heights.astype(np.float64)
     ny, nx = heights.shape
     if base is not None and not base < np.nanmin(heights, initial=np.inf):
@@ -67,7 +69,7 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
 
 def require_writable_mesh(path: PathLike) -> Path:
     """Checks that `save_mesh` can write to `path`; errors as there."""
-    path = Path(path)
+    path = file_path("save_mesh", path)
     by_ending(dict.fromkeys(MESHES), path, "write a mesh with")
     require_folder(path, "a mesh")
     with reading(path):

@@ -12,8 +12,8 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..core.compilation import compiled
-from ..core.devices import local_mesh, on_every_device
-from ..core.errors import ArgumentError
+from ..core.devices import chosen_mesh, on_every_device
+from ..core.errors import ArgumentError, require_progress
 from ..io.terrain import Terrain
 from ..scene.heightfield import Heightfield
 from ..trace.horizon import (
@@ -69,7 +69,9 @@ def horizon(
         raise ArgumentError("horizon", "azimuths", f"must be a whole number or a list of finite numbers, they are {azimuths}")
     if not -90 <= lowest < 90:
         raise ArgumentError("horizon", "lowest", f"must be from -90 to below 90 degrees, it is {lowest}")
-    return _mapped("degrees", field, azimuths, -np.inf if lowest == -90 else np.tan(np.deg2rad(lowest)), progress, mesh)
+    return _mapped(
+        "horizon", "degrees", field, azimuths, -np.inf if lowest == -90 else np.tan(np.deg2rad(lowest)), progress, mesh
+    )
 
 
 def sky_view(
@@ -106,7 +108,7 @@ def sky_view(
     field = _field("sky_view", terrain, dx, dy)
     if weighting not in _WEIGHTINGS:
         raise ArgumentError("sky_view", "weighting", f"must be among {', '.join(_WEIGHTINGS)}, it is {weighting!r}")
-    found = _mapped(weighting, field, even_azimuths(_count("sky_view", azimuths)), 0.0, progress, mesh)
+    found = _mapped("sky_view", weighting, field, even_azimuths(_count("sky_view", azimuths)), 0.0, progress, mesh)
     if weighting != "slope":
         return found
     normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
@@ -134,6 +136,7 @@ _SUMMARIES: dict[str, Summary] = dict(
 
 
 def _mapped(
+    owner: str,
     summary: str,
     field: Heightfield,
     azimuths: np.ndarray,
@@ -141,7 +144,8 @@ def _mapped(
     progress: Callable[[int, int], None] | None,
     mesh: Mesh | None,
 ) -> jax.Array:
-    dtype, mesh = field.heights.dtype, local_mesh() if mesh is None else mesh
+    require_progress(owner, progress)
+    dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh)
     heights, directions = on_every_device((field.heights, cell_directions(azimuths, field.dx, field.dy, dtype)), mesh)
     if progress is None:
         return _over(summary, mesh, heights, directions, np.asarray(lowest, dtype))
