@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.errors import ArgumentError, require_kind
+from ..core.errors import ArgumentError, kind_of
 from ..core.extras import import_extra
-from ..scene.heightfield import Heightfield
 from .files import PathLike, by_ending, file_path, reading, replacing, require_folder
 from .images import linear_from_srgb
 from .terrain import Terrain
@@ -39,7 +38,8 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
       FileNotFoundError, PermissionError: the folder does not exist, or cannot be written to.
     """
     path = require_writable_mesh(path)
-    require_kind("save_mesh", "terrain", terrain, (Terrain, Heightfield), "a jaxhf.Terrain or a jaxhf.Heightfield")
+    if not hasattr(terrain, "dx"):  # as of a Heightfield, which would import JAX here
+        raise ArgumentError("save_mesh", "terrain", f"must be a jaxhf.Terrain, it is {kind_of(terrain)}")
     heights = terrain.heights.astype(np.float64)
     ny, nx = heights.shape
     if base is not None and not base < np.nanmin(heights, initial=np.inf):

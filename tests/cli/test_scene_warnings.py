@@ -148,7 +148,7 @@ ANSWERS = {
     "jaxhf.render(scene, mesh=2)": "render: mesh must be a jax.sharding.Mesh, it is an int; jax.make_mesh makes one",
     "jaxhf.render(scene, progress=True)": "render: progress must be a function of (done, in all), it is True",
     "jaxhf.sky_view(field, progress=1)": "sky_view: progress must be a function of (done, in all), it is 1",
-    'jaxhf.save_mesh("a.ply", np.eye(3))': "save_mesh: terrain must be a jaxhf.Terrain or a jaxhf.Heightfield, it is a ndarray",
+    'jaxhf.save_mesh("a.ply", np.eye(3))': "save_mesh: terrain must be a jaxhf.Terrain, it is a ndarray",
     'jaxhf.save_heights(np.eye(3), "a.npy")': "save_heights: path must be the name of a file, it is a ndarray",
     'jaxhf.render(scene, "draft")': "settings must be a jaxhf.Settings, it is a str",
     "jaxhf.prepare(field)": "prepare: scene must be a jaxhf.Scene, it is a Heightfield; "
@@ -179,7 +179,8 @@ import numpy as np
 eye = (0, -3, 2), (0, 0, 0)
 camera = jaxhf.Perspective.look_at(*eye, fov=np.float32(40), width=np.int64(640), height=np.uint16(480))
 jaxhf.Orthographic.look_at(*eye, extent=np.float32(2), width=np.int64(8), height=np.int8(8))
-scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(np.eye(3)))], camera, [jaxhf.Sky(1.0, occlusion=np.int64(4))], samples=np.int64(4))
+field = jaxhf.Object(jaxhf.Heightfield(np.eye(3)))
+scene = jaxhf.Scene([field], camera, [jaxhf.Sky(1.0, occlusion=np.int64(4))], samples=np.int64(4))
 settings = jaxhf.Settings(samples=np.int32(9), max_depth=np.int64(2), chunk=np.int64(256))
 whole = camera.width, camera.height, scene.samples, scene.lights[0].occlusion, settings.samples, settings.chunk
 assert whole == (640, 480, 4, 4, 9, 256)
