@@ -1,5 +1,6 @@
 """Terrain as triangles for other programs, written through trimesh."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,9 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
         points, of = np.concatenate([points, points * (1, 1, 0) + (0, 0, base)]), np.tile(of, 2)
     used = np.zeros(len(points), bool)
     used[faces] = True
-    mesh = _mesh(path, points[used], (np.cumsum(used) - 1)[faces], terrain, of[used], colours, uv)
+    if not used.all():  # copies of the largest arrays
+        points, faces, of = points[used], (np.cumsum(used) - 1)[faces], of[used]
+    mesh = _mesh(path, points, faces, terrain, of, colours, uv)
     with replacing(path) as temporary:
         temporary.write_bytes(mesh)
 
@@ -125,4 +128,4 @@ def _mesh(
     data = trimesh.Trimesh(points, faces, process=False, visual=visual).export(file_type=ending[1:])
     if isinstance(data, bytes):
         return data
-    return "".join(line for line in data.splitlines(True) if not line.startswith(("mtllib", "usemtl"))).encode()
+    return re.sub(r"^(mtllib|usemtl).*\n?", "", data, flags=re.MULTILINE).encode()
