@@ -27,9 +27,20 @@ def pytest_configure(config: pytest.Config) -> None:
         config.add_cleanup(folder.cleanup)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name  # workers and other processes inherit it
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    # What tests compile themselves, gradients above all, is compiled as jaxhf compiles its own programs: in 0.8 of the time.
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
     for name, value in (("jax_persistent_cache_min_compile_time_secs", 0.1), ("jax_persistent_cache_min_entry_size_bytes", -1)):
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
+
+
+@pytest.hookimpl(tryfirst=True)  # before what fixtures compile
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """What `unoptimised` asks for, here and in processes that a test starts; `unoptimised(False)` excepts a test."""
+    marker = item.get_closest_marker("unoptimised")
+    unoptimised = marker is not None and marker.args != (False,)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(unoptimised)
+    jax.config.update("jax_disable_most_optimizations", unoptimised)
 
 
 @pytest.fixture(autouse=True, scope="module")

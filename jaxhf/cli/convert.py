@@ -15,6 +15,7 @@ def add(commands: Any) -> None:
         "jaxhf convert terrain.tif block.glb --base 0",
     )
     command = commands.add_parser("convert", help="write a terrain in another format", description=about, epilog=examples)
+    command.set_defaults(placed=True)
     command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("output", metavar="OUT", help=".tif, .npz, .npy, .asc, .png or .exr; a mesh: .glb, .obj or .ply")
     command.add_argument("--base", type=float, metavar="Z", help="close a mesh by walls down to this height [open]")

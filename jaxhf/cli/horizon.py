@@ -37,21 +37,27 @@ def run(options: argparse.Namespace) -> None:
     arguments.set_up_jax(options)
     from ..maps.skyview import horizon
     from ..trace.horizon import even_azimuths
+    from .progress import compiled_bar
 
     begin = time.perf_counter()
     azimuths = even_azimuths(options.azimuths) if options.azimuth is None else np.array([options.azimuth])
     whole = path.suffix.lower() == ".npy" and len(azimuths) > 1
     maps, highest = [], 0.0
-    for azimuth in azimuths:
-        (angles,) = np.asarray(horizon(terrain, [azimuth]))
-        highest = max(highest, float(np.nanmax(angles)))
-        if whole:
-            maps.append(angles)
-            continue
-        interruption.raise_from_now_on()
-        degrees = f"{azimuth:03.0f}" if azimuth == round(azimuth) else f"{azimuth:06.2f}"
-        one = path if options.azimuth is not None else path.with_name(f"{path.stem}_{degrees}{path.suffix}")
-        save_raster(one, angles, stored, nodata=np.nan)
+    with compiled_bar(unit=" angles", unit_scale=True) as advance:
+        for number, azimuth in enumerate(azimuths):
+
+            def grown(done: int, total: int, number: int = number) -> None:
+                advance(number * total + done, len(azimuths) * total)
+
+            (angles,) = np.asarray(horizon(terrain, [azimuth], progress=grown))
+            highest = max(highest, float(np.nanmax(angles)))
+            if whole:
+                maps.append(angles)
+                continue
+            interruption.raise_from_now_on()
+            degrees = f"{azimuth:03.0f}" if azimuth == round(azimuth) else f"{azimuth:06.2f}"
+            one = path if options.azimuth is not None else path.with_name(f"{path.stem}_{degrees}{path.suffix}")
+            save_raster(one, angles, stored, nodata=np.nan)
     if whole:
         interruption.raise_from_now_on()
         with replacing(path) as temporary:

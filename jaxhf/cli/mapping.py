@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 def add_files(command: argparse.ArgumentParser, written: str) -> None:
+    command.set_defaults(placed=True)
     command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("-o", "--output", required=True, metavar="OUT", help=f"the map: {written}")
     command.add_argument("--nodata", type=float, metavar="V", help="a stored value that means no height [as the file says]")

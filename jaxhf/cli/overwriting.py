@@ -8,6 +8,9 @@ from pathlib import Path
 from ..core.errors import UserError
 
 _SCENES = (".toml", ".pbrt")
+# Files of the same name that say where one of this ending lies: read with a terrain, and those of a map are written with it.
+_BESIDE = {".png": (".pgw", ".prj"), ".asc": (".prj",), ".tif": (".tfw",), ".tiff": (".tfw",)}
+_PLACED = (".png", ".asc")  # are written with what lies beside them
 
 
 def require_no_input(options: argparse.Namespace, *others: Path) -> None:
@@ -15,10 +18,13 @@ def require_no_input(options: argparse.Namespace, *others: Path) -> None:
 
     Args:
       options: of the command: `output` and `report` are written; every other string that names a file counts as read.
+        `placed`: files beside the output will say where it lies.
       others: what the command writes besides.
     """
     values = {name: value for name, value in vars(options).items() if isinstance(value, str)}
     outputs = [Path(values.pop(name)) for name in ("output", "report") if name in values] + list(others)
+    if getattr(options, "placed", False):
+        outputs += [beside for path in outputs if path.suffix.lower() in _PLACED for beside in _beside(path)]
     outputs = [path for path in outputs if path.is_file()]
     if not outputs:
         return
@@ -26,8 +32,15 @@ def require_no_input(options: argparse.Namespace, *others: Path) -> None:
         for path in _read(Path(value)):
             for output in outputs:
                 if path.samefile(output):
-                    place = "" if path == Path(value) else f", which {value} names"
+                    verb = "names" if Path(value).suffix.lower() in _SCENES else "comes with"
+                    place = "" if path == Path(value) else f", which {value} {verb}"
                     raise UserError(f"{output}: the output cannot replace an input of the same command{place}")
+
+
+def _beside(path: Path) -> list[Path]:
+    """The files that exist beside one of a terrain or a map, and say where it lies."""
+    beside = (path.with_suffix(ending) for ending in _BESIDE.get(path.suffix.lower(), ()))
+    return [path for path in beside if path.is_file()]
 
 
 def _read(path: Path, seen: frozenset[Path] = frozenset()) -> Iterator[Path]:
@@ -36,6 +49,7 @@ def _read(path: Path, seen: frozenset[Path] = frozenset()) -> Iterator[Path]:
         if path in seen or not path.is_file():
             return
         yield path
+        yield from _beside(path)
         if path.suffix.lower() in _SCENES:
             for name in re.findall(r'"([^"\n]+)"|\'([^\'\n]+)\'', path.read_text(encoding="utf-8", errors="replace")):
                 yield from _read(path.parent / "".join(name), seen | {path})

@@ -79,13 +79,13 @@ def _timed_render(
     from ..rendering.render import render
     from ..trace.world import resolve_settings
     from .limits import require_memory, worthwhile_devices
-    from .progress import compiled_bar
+    from .progress import CompileTime, compiled_bar
 
     samples = resolve_settings(settings, scene).samples or 1
     on_host = devices is None and jax.default_backend() == "cpu"
     mesh = local_mesh(worthwhile_devices(scene.camera.width * scene.camera.height * samples) if on_host else None)
     require_memory(scene, mesh.size)
-    compiling = _CompileTime()
+    compiling = CompileTime()
     begin = time.perf_counter()
     with compiled_bar(lambda: compiling.seconds, unit=" pixels", unit_scale=True) as advance:
         image, found = render(scene, settings, aovs=tuple(dict.fromkeys(("exhausted", *aovs))), progress=advance, mesh=mesh)
@@ -101,19 +101,3 @@ def _timed_render(
         f"compiling, {device}, {rays / seconds:.3g} rays/s, {exhausted} rays exhausted"
     )
     return image, asked, report
-
-
-class _CompileTime:
-    """Adds up the seconds that go to tracing and compiling programs, or to loading kept ones, from now on."""
-
-    def __init__(self) -> None:
-        import jax
-
-        from ..core.kept import LOADED
-
-        self.seconds, self.events = 0.0, ("/jax/core/compile/", LOADED)
-        jax.monitoring.register_event_duration_secs_listener(self._add)
-
-    def _add(self, event: str, duration_secs: float, **_: Any) -> None:
-        if event.startswith(self.events):
-            self.seconds += duration_secs

@@ -10,9 +10,11 @@ from jaxtyping import Float
 if TYPE_CHECKING:
     from ..scene.camera import Camera
     from ..scene.heightfield import Heightfield
+    from ..scene.material import Matte
     from ..scene.scene import Object, Scene
 
 _NARROW = 1.0  # degrees
+_WIDE = 170.0
 _MOST_HEIGHT = 1e18
 
 
@@ -26,16 +28,21 @@ def scene_warnings(scene: "Scene") -> Iterator[str]:
     """A line for each thing that makes a picture black or odd without being an error."""
     from ..scene.camera import Perspective
     from ..scene.heightfield import Heightfield
+    from ..scene.material import Matte
 
     if not scene.lights:
         yield "the scene has no lights: the picture is black"
     camera = scene.camera
     if isinstance(camera, Perspective) and float(camera.fov) < _NARROW:
         yield f"camera: fov is {float(camera.fov):.4g} degrees, less than {_NARROW:g}; it is not in radians"
+    if isinstance(camera, Perspective) and float(camera.fov) > _WIDE:
+        yield f"camera: fov is {float(camera.fov):.4g} degrees, more than {_WIDE:g}; what it looks at is a dot in the middle"
     corners = []
     for k, item in enumerate(scene.objects):
         if not isinstance(item.shape, Heightfield):
             return  # the rest asks whether anything can be seen
+        if isinstance(item.material, Matte) and (brightest := _brightest(item.material)) > 1:
+            yield f"objects[{k}]: albedo is {brightest:.4g}, more than 1: it sends out more light than it gets"
         heights = np.asarray(item.shape.heights)
         finite = heights[np.isfinite(heights)]
         if not finite.size:
@@ -56,6 +63,11 @@ def scene_warnings(scene: "Scene") -> Iterator[str]:
         low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
         spans = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high, strict=True))
         yield f"camera: none of the terrain is in the picture, it spans {spans}"
+
+
+def _brightest(material: "Matte") -> float:
+    """The largest number of its albedo."""
+    return float(np.max(np.asarray(getattr(material.albedo, "texels", material.albedo))))
 
 
 def _height_at(field: "Heightfield", heights: np.ndarray, x: float, y: float) -> float:

@@ -26,6 +26,7 @@ def add(commands: Any) -> None:
 
 def add_terrain(command: argparse.ArgumentParser, output: str) -> None:
     """What `jaxhf skyview` and `jaxhf horizon` have in common."""
+    command.set_defaults(placed=True)
     command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("-o", "--output", required=True, metavar="OUT", help=output)
     command.add_argument("--azimuths", type=int, default=32, metavar="K", help="directions, at even steps from north on [32]")
@@ -62,9 +63,11 @@ def run(options: argparse.Namespace) -> None:
     stored, terrain = read(options)
     arguments.set_up_jax(options)
     from ..maps.skyview import sky_view
+    from .progress import compiled_bar
 
     begin = time.perf_counter()
-    seen = np.asarray(sky_view(terrain, options.azimuths, weighting=options.weighting))
+    with compiled_bar(unit=" heights", unit_scale=True) as advance:
+        seen = np.asarray(sky_view(terrain, options.azimuths, weighting=options.weighting, progress=advance))
     took = time.perf_counter() - begin
     values = np.rint(255 * np.nan_to_num(np.clip(seen, 0, 1))).astype(np.uint8) if path.suffix.lower() == ".png" else seen
     interruption.raise_from_now_on()

@@ -12,12 +12,22 @@ from jax import lax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 
+from .errors import require_kind
+
 
 @functools.cache
 def local_mesh(most: int | None = None) -> Mesh:
     """All devices of this process, in a row, or so many of them."""
     devices = jax.local_devices()[:most]
     return jax.make_mesh((len(devices),), ("devices",), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def chosen_mesh(owner: str, mesh: Mesh | None) -> Mesh:
+    """The mesh that an argument gives, by default all devices of this process; ArgumentError where it is none."""
+    if mesh is None:
+        return local_mesh()
+    require_kind(owner, "mesh", mesh, Mesh, "a jax.sharding.Mesh", "jax.make_mesh makes one")
+    return mesh
 
 
 def on_every_device(tree: Any, mesh: Mesh) -> Any:

@@ -1,5 +1,6 @@
 """Errors that are not jaxhf's own: what a caller, or the author of a file, got wrong."""
 
+from numbers import Integral
 from typing import Any
 
 
@@ -38,6 +39,17 @@ def require_kind(owner: str, argument: str, value: Any, kind: type | tuple[type,
     """
     if not isinstance(value, kind):
         raise ArgumentError(owner, argument, f"must be {wanted}, it is {kind_of(value)}{hint and '; '}{hint}")
+
+
+def require_progress(owner: str, progress: Any) -> None:
+    """ArgumentError where an argument of this name is neither None nor a function."""
+    if progress is not None and not callable(progress):
+        raise ArgumentError(owner, "progress", f"must be a function of (done, in all), it is {progress!r}")
+
+
+def whole_number(value: Any) -> Any:
+    """Any kind of whole number, NumPy's above all, as Python's; all else as it is, for who asked for one to judge."""
+    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else value
 
 
 def kind_of(value: Any) -> str:

@@ -7,7 +7,7 @@ import textwrap
 from dataclasses import field
 from typing import Any, Literal, get_args
 
-from .errors import ArgumentError
+from .errors import ArgumentError, whole_number
 
 Traversal = Literal["pyramid", "dda"]
 Shading = Literal["smooth", "flat"]
@@ -112,7 +112,8 @@ class Settings:
             if not isinstance(getattr(self, name), bool):
                 raise ArgumentError("Settings", name, f"must be True or False, it is {getattr(self, name)!r}")
         for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("edge_samples", 0), ("chunk", 64)):
-            value = getattr(self, name)
+            value = whole_number(getattr(self, name))
+            object.__setattr__(self, name, value)
             if value is None and name in ("max_steps", "samples", "edge_samples"):
                 continue
             if not isinstance(value, int) or isinstance(value, bool) or value < least:

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jax.sharding import Mesh
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, whole_number
 from ..core.settings import Settings
 from .history import Draws, Step
 
@@ -60,8 +60,10 @@ class FitOptions:
             value = getattr(self, name)
             if value not in get_args(kind):
                 raise ArgumentError("fit", name, f"must be one of {', '.join(get_args(kind))}; it is {value!r}")
+        object.__setattr__(self, "uncertainty", whole_number(self.uncertainty))
         for name in ("max_steps", "inner_steps", "checkpoint_every"):
-            value = getattr(self, name)
+            value = whole_number(getattr(self, name))
+            object.__setattr__(self, name, value)
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise ArgumentError("fit", name, f"must be a whole number from 1 on, it is {value!r}")
         for name in (

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, require_kind
 from .errors import FileError, nearest
 
 MAX_PIXELS = 2**28  # 16384 x 16384, for images and for grids of heights
@@ -44,8 +44,14 @@ def _fitting(ending: str, known: Iterable[str], task: str) -> str:
     return f"known: {', '.join(known)}" + is_other * f"; this is {_KINDS[ending]}"
 
 
+def file_path(owner: str, path: Any) -> Path:
+    """A path of pathlib's; ArgumentError where something else stands in the place of a file's name."""
+    require_kind(owner, "path", path, (str, os.PathLike), "the name of a file")
+    return Path(path)
+
+
 def require_file(path: PathLike) -> Path:
-    path = Path(path)
+    path = file_path("", path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if not path.is_file():

@@ -20,7 +20,18 @@ from PIL import Image
 from ..core.errors import ArgumentError
 from ..core.extras import import_extra
 from .errors import FileError
-from .files import PathLike, by_ending, read_npy, reading, replacing, require_file, require_folder, require_pixels, write_npy
+from .files import (
+    PathLike,
+    by_ending,
+    file_path,
+    read_npy,
+    reading,
+    replacing,
+    require_file,
+    require_folder,
+    require_pixels,
+    write_npy,
+)
 from .png import require_whole
 
 
@@ -116,7 +127,7 @@ def require_writable(path: PathLike) -> Path:
       FileNotFoundError: the folder does not exist.
       PermissionError: the folder cannot be written to.
     """
-    path = Path(path)
+    path = file_path("save_image", path)
     by_ending(_WRITERS, path, "write an image with")
     require_folder(path, "an image")
     if path.suffix.lower() == ".exr":

@@ -1,14 +1,15 @@
 """Terrain as triangles for other programs, written through trimesh."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, kind_of
 from ..core.extras import import_extra
-from .files import PathLike, by_ending, reading, replacing, require_folder
+from .files import PathLike, by_ending, file_path, reading, replacing, require_folder
 from .images import linear_from_srgb
 from .terrain import Terrain
 
@@ -38,6 +39,8 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
       FileNotFoundError, PermissionError: the folder does not exist, or cannot be written to.
     """
     path = require_writable_mesh(path)
+    if not hasattr(terrain, "dx"):  # as of a Heightfield, which would import JAX here
+        raise ArgumentError("save_mesh", "terrain", f"must be a jaxhf.Terrain, it is {kind_of(terrain)}")
     heights = terrain.heights.astype(np.float64)
     ny, nx = heights.shape
     if base is not None and not base < np.nanmin(heights, initial=np.inf):
@@ -60,14 +63,16 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
         points, of = np.concatenate([points, points * (1, 1, 0) + (0, 0, base)]), np.tile(of, 2)
     used = np.zeros(len(points), bool)
     used[faces] = True
-    mesh = _mesh(path, points[used], (np.cumsum(used) - 1)[faces], terrain, of[used], colours, uv)
+    if not used.all():  # copies of the largest arrays
+        points, faces, of = points[used], (np.cumsum(used) - 1)[faces], of[used]
+    mesh = _mesh(path, points, faces, terrain, of, colours, uv)
     with replacing(path) as temporary:
         temporary.write_bytes(mesh)
 
 
 def require_writable_mesh(path: PathLike) -> Path:
     """Checks that `save_mesh` can write to `path`; errors as there."""
-    path = Path(path)
+    path = file_path("save_mesh", path)
     by_ending(dict.fromkeys(MESHES), path, "write a mesh with")
     require_folder(path, "a mesh")
     with reading(path):
@@ -123,4 +128,4 @@ def _mesh(
     data = trimesh.Trimesh(points, faces, process=False, visual=visual).export(file_type=ending[1:])
     if isinstance(data, bytes):
         return data
-    return "".join(line for line in data.splitlines(True) if not line.startswith(("mtllib", "usemtl"))).encode()
+    return re.sub(r"^(mtllib|usemtl).*\n?", "", data, flags=re.MULTILINE).encode()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .errors import FileError
-from .files import PathLike, by_ending, reading, replacing, require_file, require_folder, write_npy
+from .files import PathLike, by_ending, file_path, reading, replacing, require_file, require_folder, write_npy
 from .grids import write_asc
 from .images import write_exr, write_png
 from .rasters import georeference_of, geotiff, require_extras
@@ -83,7 +83,7 @@ def require_writable_heights(path: PathLike, endings: Iterable[str] | None = Non
       FileNotFoundError: the folder does not exist.
       PermissionError: the folder cannot be written to.
     """
-    path = Path(path)
+    path = file_path("save_heights", path)
     by_ending(dict.fromkeys(HEIGHTS if endings is None else endings), path, "write heights with")
     require_folder(path, "heights")
     require_extras(path)

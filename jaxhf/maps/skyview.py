@@ -1,6 +1,8 @@
 """How high the terrain stands round each of its points, and how much of the sky it leaves to see."""
 
 import functools
+import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,11 +12,21 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..core.compilation import compiled
-from ..core.devices import local_mesh, on_every_device
-from ..core.errors import ArgumentError
+from ..core.devices import chosen_mesh, on_every_device
+from ..core.errors import ArgumentError, require_progress
 from ..io.terrain import Terrain
 from ..scene.heightfield import Heightfield
-from ..trace.horizon import Summary, cell_directions, even_azimuths, over_horizon, sky_vector
+from ..trace.horizon import (
+    HorizonView,
+    Summary,
+    assemble,
+    cell_directions,
+    even_azimuths,
+    over_horizon,
+    over_tiles,
+    sky_vector,
+    tile_count,
+)
 from ..trace.normals import vertex_normals
 
 
@@ -25,6 +37,7 @@ def horizon(
     dx: float | None = None,
     dy: float | None = None,
     lowest: float = 0.0,
+    progress: Callable[[int, int], None] | None = None,
     mesh: Mesh | None = None,
 ) -> Float[jax.Array, "k ny nx"]:
     """The horizon angle at each vertex, in degrees: how high the terrain rises above the horizontal in a direction.
@@ -39,6 +52,7 @@ def horizon(
       dx, dy: cell size of heights given as an array, in the unit of the heights, 1 if not given; dx alone counts for both.
       lowest: the angle where nothing stands higher, degrees: 0, the horizontal; -90 shows terrain that falls away, and
         stays where there is none.
+      progress: called with (vertices done, vertices in all) as the map grows; not under a transformation.
       mesh: the devices that share the work, see `render`.
 
     Returns:
@@ -55,7 +69,9 @@ def horizon(
         raise ArgumentError("horizon", "azimuths", f"must be a whole number or a list of finite numbers, they are {azimuths}")
     if not -90 <= lowest < 90:
         raise ArgumentError("horizon", "lowest", f"must be from -90 to below 90 degrees, it is {lowest}")
-    return _mapped("degrees", field, azimuths, -np.inf if lowest == -90 else np.tan(np.deg2rad(lowest)), mesh)
+    return _mapped(
+        "horizon", "degrees", field, azimuths, -np.inf if lowest == -90 else np.tan(np.deg2rad(lowest)), progress, mesh
+    )
 
 
 def sky_view(
@@ -65,6 +81,7 @@ def sky_view(
     weighting: str = "solid-angle",
     dx: float | None = None,
     dy: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
     mesh: Mesh | None = None,
 ) -> Float[jax.Array, "ny nx"]:
     """The sky-view factor at each vertex: the share of the sky that the terrain leaves to see, 0 to 1.
@@ -80,7 +97,7 @@ def sky_view(
 
     Args:
       azimuths: how many directions, from north on at even steps.
-      terrain, dx, dy, mesh: as for `horizon`.
+      terrain, dx, dy, progress, mesh: as for `horizon`.
 
     Returns:
       Shape (ny, nx), nan where there is no height; differentiable in the heights.
@@ -91,7 +108,7 @@ def sky_view(
     field = _field("sky_view", terrain, dx, dy)
     if weighting not in _WEIGHTINGS:
         raise ArgumentError("sky_view", "weighting", f"must be among {', '.join(_WEIGHTINGS)}, it is {weighting!r}")
-    found = _mapped(weighting, field, even_azimuths(_count("sky_view", azimuths)), 0.0, mesh)
+    found = _mapped("sky_view", weighting, field, even_azimuths(_count("sky_view", azimuths)), 0.0, progress, mesh)
     if weighting != "slope":
         return found
     normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
@@ -111,21 +128,55 @@ def _horizontal(slopes: jax.Array) -> jax.Array:
     return jnp.mean(1 / (1 + slopes * slopes), 0)
 
 
+_PARTS = 64  # of a map that reports its progress
 _WEIGHTINGS = ("solid-angle", "horizontal", "slope")
 _SUMMARIES: dict[str, Summary] = dict(
     zip(("degrees", *_WEIGHTINGS), (_degrees, _solid_angle, _horizontal, sky_vector), strict=True)
 )
 
 
-def _mapped(summary: str, field: Heightfield, azimuths: np.ndarray, lowest: float, mesh: Mesh | None) -> jax.Array:
-    dtype, mesh = field.heights.dtype, local_mesh() if mesh is None else mesh
+def _mapped(
+    owner: str,
+    summary: str,
+    field: Heightfield,
+    azimuths: np.ndarray,
+    lowest: float,
+    progress: Callable[[int, int], None] | None,
+    mesh: Mesh | None,
+) -> jax.Array:
+    require_progress(owner, progress)
+    dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh)
     heights, directions = on_every_device((field.heights, cell_directions(azimuths, field.dx, field.dy, dtype)), mesh)
-    return _over(summary, mesh, heights, directions, np.asarray(lowest, dtype))
+    if progress is None:
+        return _over(summary, mesh, heights, directions, np.asarray(lowest, dtype))
+    count, parts = tile_count(heights.shape), []
+    size = mesh.size * math.ceil(count / mesh.size / _PARTS)
+    view = _view(heights, directions)
+    for first in range(0, count, size):
+        numbers = np.minimum(np.arange(first, first + size, dtype=np.int32), count - 1)
+        parts.append(jax.device_get(_over_tiles(summary, mesh, view, np.asarray(lowest, dtype), numbers)))
+        progress(heights.size * min(count, first + size) // count, heights.size)
+    found = assemble(np.concatenate(parts)[:count], heights.shape)
+    return jnp.asarray(np.where(np.isfinite(heights), found, np.asarray(np.nan, dtype)))
 
 
 @functools.partial(compiled, newer=True, static_argnames=("summary", "mesh"))
 def _over(summary: str, mesh: Mesh, heights: jax.Array, directions: jax.Array, lowest: jax.Array) -> jax.Array:
-    return over_horizon(_SUMMARIES[summary], mesh, jnp.where(jnp.isfinite(heights), heights, jnp.nan), directions, lowest)
+    return over_horizon(_SUMMARIES[summary], mesh, _holed(heights), directions, lowest)
+
+
+@functools.partial(compiled, newer=True)
+def _view(heights: jax.Array, directions: jax.Array) -> HorizonView:
+    return HorizonView.of(_holed(heights), directions)
+
+
+@functools.partial(compiled, newer=True, static_argnames=("summary", "mesh"))
+def _over_tiles(summary: str, mesh: Mesh, view: HorizonView, lowest: jax.Array, numbers: jax.Array) -> jax.Array:
+    return over_tiles(_SUMMARIES[summary], mesh, view, lowest, numbers)[0]
+
+
+def _holed(heights: jax.Array) -> jax.Array:
+    return jnp.where(jnp.isfinite(heights), heights, jnp.nan)
 
 
 def _field(owner: str, terrain: Any, dx: float | None, dy: float | None) -> Heightfield:

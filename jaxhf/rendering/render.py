@@ -19,8 +19,8 @@ from ..boundary.guiding import edge_sets
 from ..boundary.term import Boundaries, default_key, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
 from ..core.compilation import compiled, is_traced
-from ..core.devices import local_mesh, map_over, on_every_device
-from ..core.errors import UserError, require_kind
+from ..core.devices import chosen_mesh, map_over, on_every_device
+from ..core.errors import UserError, require_kind, require_progress
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.localise import localise, localise_camera
@@ -59,7 +59,7 @@ def prepare(scene: Scene, settings: Settings | None = None, *, mesh: Mesh | None
     The arguments are those of `render`.
     """
     _require_scene("prepare", scene, Scene)
-    settings, mesh = resolve_settings(settings or Settings(), scene), local_mesh() if mesh is None else mesh
+    settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("prepare", mesh)
     make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
     return Prepared(scene, mesh, make(on_every_device(localise(scene), mesh), settings=settings))
 
@@ -97,6 +97,8 @@ def render(
       ValueError: an unknown AOV, or settings or a mesh for a scene that was prepared with others.
     """
     _require_scene("render", scene, (Scene, Prepared))
+    require_progress("render", progress)
+    chosen_mesh("render", mesh)
     aovs = known_aovs("render", aovs)
     if not isinstance(scene, Prepared) and (progress is not None or scene.sky_occlusion is not None):
         scene, settings = prepare(scene, settings, mesh=mesh), None
@@ -112,7 +114,7 @@ def render(
         else:
             outputs = _trace_in_parts(world, camera, aovs, mesh, progress)
     else:
-        settings, mesh = resolve_settings(settings or Settings(), scene), local_mesh() if mesh is None else mesh
+        settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("render", mesh)
         local = on_every_device(localise(scene), mesh)
         outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh))
     image = outputs.pop("image")

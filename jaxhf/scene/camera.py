@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.affine import Affine, affine, require_invertible
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, whole_number
 from ..core.ray import Ray
 from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
 from ..core.vector import unit
@@ -56,8 +56,8 @@ class Perspective(eqx.Module):
 
     world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf)
     fov: ScalarLeaf = eqx.field(converter=float_leaf, default=45.0)
-    width: int = eqx.field(static=True, default=512, kw_only=True)
-    height: int = eqx.field(static=True, default=512, kw_only=True)
+    width: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
+    height: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
 
     def __check_init__(self):
         _check_camera(self)
@@ -189,8 +189,8 @@ class Orthographic(eqx.Module):
 
     world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf)
     extent: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
-    width: int = eqx.field(static=True, default=512, kw_only=True)
-    height: int = eqx.field(static=True, default=512, kw_only=True)
+    width: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
+    height: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
 
     def __check_init__(self):
         _check_camera(self)

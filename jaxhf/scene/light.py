@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, whole_number
 from ..core.types import ScalarLeaf, VectorLeaf, float_leaf, require_finite, require_number, rgb_leaf
 from .show import fields
 from .sun import sun
@@ -140,7 +140,7 @@ class Sky(eqx.Module):
     """
 
     radiance: VectorLeaf = eqx.field(converter=rgb_leaf)
-    occlusion: int | None = eqx.field(static=True, default=None)
+    occlusion: int | None = eqx.field(converter=whole_number, static=True, default=None)
 
     def __check_init__(self):
         _require_vector("Sky", "radiance", self.radiance)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.affine import require_invertible
-from ..core.errors import ArgumentError, UserError, kind_of
+from ..core.errors import ArgumentError, UserError, kind_of, whole_number
 from ..core.settings import MOST_SAMPLES
 from ..core.types import AnyArray, MatrixLeaf, float_leaf
 from .camera import Camera
@@ -72,7 +72,7 @@ class Scene(eqx.Module):
     objects: tuple[Object, ...] = eqx.field(converter=_listed)
     camera: Camera
     lights: tuple[Light, ...] = eqx.field(converter=_listed, default=())
-    samples: int = eqx.field(static=True, default=1)
+    samples: int = eqx.field(converter=whole_number, static=True, default=1)
 
     def __check_init__(self):
         if not self.objects:

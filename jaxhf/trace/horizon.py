@@ -168,30 +168,49 @@ def _searched(
     summary: Summary, mesh: Mesh, z: jax.Array, directions: jax.Array, lowest: Scalar, numbered: bool
 ) -> tuple[jax.Array, Int[jax.Array, "k ny nx"] | None]:
     """The summary, and if they are to be numbered, the entries of `_crossings` that were found; -1 for none."""
-    (ny, nx), bare = z.shape, jnp.isnan(z)
-    columns, rows = math.ceil(nx / _TILE), math.ceil(ny / _TILE)
-    view = _View.of(z, directions)
+    view = HorizonView.of(z, directions)
+    tiles = over_tiles(summary, mesh, view, lowest, jnp.arange(tile_count(z.shape), dtype=jnp.int32), numbered)
+    result, found = jax.tree.map(lambda values: assemble(values, z.shape), tiles)
+    return jnp.where(jnp.broadcast_to(jnp.isnan(z), result.shape), jnp.nan, result), found
 
-    def one_tile(shared: tuple["_View", Scalar], number: Index) -> tuple[jax.Array, jax.Array | None]:
+
+def tile_count(shape: tuple[int, ...]) -> int:
+    """Square tiles that cover a grid of this shape."""
+    return math.prod(math.ceil(n / _TILE) for n in shape)
+
+
+def over_tiles(
+    summary: Summary,
+    mesh: Mesh,
+    view: "HorizonView",
+    lowest: Scalar,
+    numbers: Int[Any, " tiles"],
+    numbered: bool = False,
+) -> tuple[jax.Array, jax.Array | None]:
+    """As `over_horizon`, for some of the tiles, without a derivative; also in holes. Besides, the entries that were found."""
+    columns = math.ceil((view.heights.shape[1] - 2 * _MARGIN - _TILE) / _TILE)
+
+    def one_tile(shared: tuple["HorizonView", Scalar], number: Index) -> tuple[jax.Array, jax.Array | None]:
         view, lowest = shared
         x, y = (number % columns) * _TILE, (number // columns) * _TILE
         ways = jnp.arange(view.end.shape[0], dtype=jnp.int32)
         slopes, found = lax.map(lambda way: _from_tile(view, way, x, y, lowest, numbered), ways)
         return summary(slopes), found
 
-    tiles = map_over(mesh, one_tile, (view, lowest), jnp.arange(rows * columns, dtype=jnp.int32))
-
-    def assembled(tiles: jax.Array) -> jax.Array:
-        tail = tiles.shape[1:-2]
-        grid = jnp.moveaxis(tiles.reshape(rows, columns, *tail, _TILE, _TILE), (0, 1), (-4, -2))
-        return grid.reshape(*tail, rows * _TILE, columns * _TILE)[..., :ny, :nx]
-
-    result, found = jax.tree.map(assembled, tiles)
-    return jnp.where(jnp.broadcast_to(bare, result.shape), jnp.nan, result), found
+    return map_over(mesh, one_tile, (view, lowest), numbers)
 
 
-class _View(eqx.Module):
-    """What all tiles share.
+def assemble(tiles: Any, shape: tuple[int, ...]) -> Any:
+    """An array over the grid from all its tiles, of JAX or NumPy: shape (tiles, ..., tile, tile) to (..., ny, nx)."""
+    rows, columns = (math.ceil(n / _TILE) for n in shape)
+    tail = tiles.shape[1:-2]
+    last = 2 + len(tail)
+    grid = tiles.reshape(rows, columns, *tail, _TILE, _TILE).transpose(*range(2, last), 0, last, 1, last + 1)
+    return grid.reshape(*tail, rows * _TILE, columns * _TILE)[..., : shape[0], : shape[1]]
+
+
+class HorizonView(eqx.Module):
+    """What all tiles of a search share.
 
     Attributes:
       heights: with a margin, nan beyond the grid.
@@ -214,7 +233,7 @@ class _View(eqx.Module):
     first_window: Int[jax.Array, "k stretches 2"]
 
     @staticmethod
-    def of(z: Float[jax.Array, "ny nx"], directions: Float[jax.Array, "k 2"]) -> "_View":
+    def of(z: Float[jax.Array, "ny nx"], directions: Float[jax.Array, "k 2"]) -> "HorizonView":
         (ny, nx), dtype = z.shape, z.dtype
         count = math.ceil((max(nx, ny) - 1) / _STRETCH)
         margin = ((_MARGIN, _MARGIN + _TILE), (_MARGIN, _MARGIN + _TILE))
@@ -230,11 +249,11 @@ class _View(eqx.Module):
 
         padded = jnp.pad(z, margin, constant_values=jnp.nan)
         edges = jnp.pad(_edges(z), ((0, 0), *margin), constant_values=jnp.nan)
-        return _View(padded, edges, _windows(z), *lax.map(along, directions))
+        return HorizonView(padded, edges, _windows(z), *lax.map(along, directions))
 
 
 def _from_tile(
-    view: _View, way: Index, x: Index, y: Index, lowest: Scalar, numbered: bool
+    view: HorizonView, way: Index, x: Index, y: Index, lowest: Scalar, numbered: bool
 ) -> tuple[Float[jax.Array, "tile tile"], Int[jax.Array, "tile tile"] | None]:
     """Slopes in one direction from the vertices of the tile that begins at (x, y), and the entries of what was found.
 

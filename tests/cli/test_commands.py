@@ -133,6 +133,18 @@ def test_an_input_is_never_replaced(folder, capsys, line, where):
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
+def test_nor_is_what_lies_beside_it(folder, capsys):
+    """The .prj that goes with hills.asc; a map that writes none may stand there."""
+    (folder / "hills.asc").write_text("ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n3 4\n")
+    (folder / "hills.prj").write_text('LOCAL_CS["here"]')
+    for line in ("hillshade hills.asc -o hills.png", "convert hills.asc hills.png"):
+        where = "hills.prj: the output cannot replace an input of the same command, which hills.asc comes with"
+        assert said(capsys, *line.split()) == (2, f"jaxhf: error: {where}\n")
+    assert not (folder / "hills.png").exists()
+    assert said(capsys, "convert", "hills.asc", "hills.npy")[0] == 0
+    assert (folder / "hills.prj").read_text() == 'LOCAL_CS["here"]'
+
+
 def test_the_deviations_of_a_fit_replace_no_input(folder, capsys):
     (folder / "case.toml").write_text((folder / "case.toml").read_text() + 'prior_std = "found_std.npz"\n')
     code, text = said(capsys, "fit", "case.toml", "-o", "found.npz")

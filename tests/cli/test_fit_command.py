@@ -21,6 +21,8 @@ from jaxhf.cli.main import main
 from jaxhf.core.affine import rotate
 from jaxhf.io.toml.fit import load_case
 
+pytestmark = pytest.mark.unoptimised
+
 CASE = """
 [camera]
 type = "perspective"

@@ -18,10 +18,10 @@ SCENES = Path(__file__).parents[2] / "scenes"
 SUN = jaxhf.Directional.from_angles()
 
 
-def scene(eye=(1.0, -4.0, 3.0), target=(1.0, 1.0, 0.0), heights=HILLS, lights=(SUN,), fov=45.0, turn=None, width=8):
+def scene(eye=(1.0, -4.0, 3.0), target=(1.0, 1.0, 0.0), heights=HILLS, lights=(SUN,), fov=45.0, turn=None, width=8, albedo=0.7):
     field = jaxhf.Heightfield(heights, 1.0, 1.0)
     camera = jaxhf.Perspective.look_at(eye, target, fov=fov, width=width, height=8)
-    return jaxhf.Scene([jaxhf.Object(field, world_from_object=turn)], camera, lights)
+    return jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(albedo), turn)], camera, lights)
 
 
 @pytest.mark.parametrize(
@@ -31,6 +31,10 @@ def scene(eye=(1.0, -4.0, 3.0), target=(1.0, 1.0, 0.0), heights=HILLS, lights=(S
         ({"lights": ()}, "no lights"),
         ({"fov": 0.7}, "camera: fov is 0.7 degrees"),
         ({"fov": 1.0}, None),
+        ({"fov": 175.0}, "camera: fov is 175 degrees, more than 170; what it looks at is a dot"),
+        ({"albedo": (0.5, 1.25, 1.0)}, r"objects\[0\]: albedo is 1.25, more than 1: it sends out more light than it gets"),
+        ({"albedo": jaxhf.ImageTexture(np.full((2, 2, 3), 1.5))}, r"objects\[0\]: albedo is 1.5"),
+        ({"albedo": 1.0}, None),
         ({"heights": HILLS * np.nan}, r"objects\[0\]: none of its heights is finite"),
         ({"heights": np.where(HILLS == 3, -3.4e38, HILLS)}, r"heights reach -3.4e\+38; is that a value that means no height"),
         # A point of the triangle (1, 1), (2, 1), (2, 2), at (1.5, 1.25): 3 - 0.5 - 0.25.
@@ -51,6 +55,7 @@ def test_what_is_hardly_meant(given, said):
 
 
 def test_scenes_that_come_along_are_meant():
+    """In landsea, the albedo of a cylinder that stands for the sky reaches 2.5."""
     for path in ("debug4x4", "landsea", "texture", "hillshade"):
         assert not list(scene_warnings(jaxhf.load_scene(SCENES / f"{path}.toml")))
 
@@ -140,6 +145,11 @@ ANSWERS = {
     'jaxhf.render("x.toml")': "render: scene must be a jaxhf.Scene, it is a str; jaxhf.load_scene reads one from a file",
     "jaxhf.render([scene, scene])": "render: scene must be a jaxhf.Scene, it is a list; render takes one at a time",
     'jaxhf.render(scene, aovs="depth")': "render: aovs must be a list of names, as in aovs=('depth',); it is 'depth'",
+    "jaxhf.render(scene, mesh=2)": "render: mesh must be a jax.sharding.Mesh, it is an int; jax.make_mesh makes one",
+    "jaxhf.render(scene, progress=True)": "render: progress must be a function of (done, in all), it is True",
+    "jaxhf.sky_view(field, progress=1)": "sky_view: progress must be a function of (done, in all), it is 1",
+    'jaxhf.save_mesh("a.ply", np.eye(3))': "save_mesh: terrain must be a jaxhf.Terrain, it is a ndarray",
+    'jaxhf.save_heights(np.eye(3), "a.npy")': "save_heights: path must be the name of a file, it is a ndarray",
     'jaxhf.render(scene, "draft")': "settings must be a jaxhf.Settings, it is a str",
     "jaxhf.prepare(field)": "prepare: scene must be a jaxhf.Scene, it is a Heightfield; "
     "which has a camera and lights besides: jaxhf.Scene([jaxhf.Object(heightfield)], camera, lights)",
@@ -161,6 +171,26 @@ def test_misuse_says_what_was_wanted():
     """In a process of its own: in that of the tests jaxtyping refuses most of it first."""
     run = subprocess.run([sys.executable, "-c", MISUSE], input="\n".join(ANSWERS), capture_output=True, text=True, timeout=120)
     assert run.stdout.splitlines() == list(ANSWERS.values()), run.stderr
+
+
+NUMPY = """
+import jaxhf
+import numpy as np
+eye = (0, -3, 2), (0, 0, 0)
+camera = jaxhf.Perspective.look_at(*eye, fov=np.float32(40), width=np.int64(640), height=np.uint16(480))
+jaxhf.Orthographic.look_at(*eye, extent=np.float32(2), width=np.int64(8), height=np.int8(8))
+field = jaxhf.Object(jaxhf.Heightfield(np.eye(3)))
+scene = jaxhf.Scene([field], camera, [jaxhf.Sky(1.0, occlusion=np.int64(4))], samples=np.int64(4))
+settings = jaxhf.Settings(samples=np.int32(9), max_depth=np.int64(2), chunk=np.int64(256))
+whole = camera.width, camera.height, scene.samples, scene.lights[0].occlusion, settings.samples, settings.chunk
+assert whole == (640, 480, 4, 4, 9, 256)
+assert {type(number) for number in whole} == {int}
+"""
+
+
+def test_numpys_whole_numbers_are_whole_numbers():
+    """In such a process, too; warnings, as of arrays in static fields, are errors."""
+    subprocess.run([sys.executable, "-W", "error", "-c", NUMPY], check=True, timeout=120)
 
 
 def test_what_is_no_number_is_the_users_mistake():

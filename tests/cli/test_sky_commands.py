@@ -1,5 +1,7 @@
 """`jaxhf skyview` and `jaxhf horizon`: the values of the functions of those names, where the terrain lies."""
 
+import sys
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -26,7 +28,10 @@ def run(monkeypatch, tmp_path, capsys):
 
 
 def test_skyview(run, tmp_path):
-    expected = np.asarray(jaxhf.sky_view(Z, 4, dx=2.0, dy=3.0))
+    reports = []
+    expected = np.asarray(jaxhf.sky_view(Z, 4, dx=2.0, dy=3.0, progress=lambda *report: reports.append(report)))
+    assert reports == [(35, 35)]
+    np.testing.assert_allclose(jaxhf.sky_view(Z, 4, dx=2.0, dy=3.0), expected, rtol=1e-14)
     code, said = run("skyview", "sky.npy", "--azimuths", "4")
     assert code == 0
     assert f": sky-view factor {np.nanmin(expected):.3f} .. {np.nanmax(expected):.3f}, 4 azimuths, " in said
@@ -37,7 +42,10 @@ def test_skyview(run, tmp_path):
 
 
 def test_horizon(run, tmp_path):
-    expected = [np.asarray(jaxhf.horizon(Z, [azimuth], dx=2.0, dy=3.0))[0] for azimuth in (0.0, 90.0, 180.0, 270.0)]
+    expected = [
+        np.asarray(jaxhf.horizon(Z, [azimuth], dx=2.0, dy=3.0, progress=lambda done, total: None))[0]
+        for azimuth in (0.0, 90.0, 180.0, 270.0)
+    ]
     assert run("horizon", "all.npy", "--azimuths", "4")[0] == 0
     np.testing.assert_array_equal(np.load(tmp_path / "all.npy"), expected)
     pytest.importorskip("rasterio")
@@ -48,6 +56,32 @@ def test_horizon(run, tmp_path):
     assert run("horizon", "each.tif", "--azimuths", "4")[0] == 0
     names = sorted(path.name for path in tmp_path.glob("each*"))
     assert names == [f"each_{degrees}.tif" for degrees in ("000", "090", "180", "270")]
+
+
+@pytest.mark.parametrize(("name", "heights"), [("skyview", 35), ("horizon", 4 * 35)])
+def test_a_bar_tells_what_is_done_until_ctrl_c(run, name, heights, tmp_path, monkeypatch):
+    """Which comes after the last tile, or azimuth: the old file is kept."""
+    (tmp_path / "old.npy").write_bytes(b"old")
+    files = sorted(tmp_path.iterdir())
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    shown = []
+
+    def update(bar, increment):
+        bar.n += increment
+        shown.append((bar.n, bar.total))
+        if bar.n == heights:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("tqdm.std.tqdm.update", update)
+    code, said = run(name, "old.npy", "--azimuths", "4")
+    assert code == 130
+    assert "compiling" in said
+    assert shown[-1] == (heights, heights)
+    assert len(shown) == heights // 35
+    assert sorted(tmp_path.iterdir()) == files
+    assert (tmp_path / "old.npy").read_bytes() == b"old"
+    code, said = run(name, "old.npy", "--azimuths", "4", "--quiet")
+    assert (code, said) == (0, "")
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,8 @@ from jaxhf.core.errors import UserError
 from jaxhf.io.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.terrain import Terrain
 
+pytestmark = pytest.mark.unoptimised
+
 SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
 MORNING, EVENING = "2026-06-21T05:00:00Z", "2026-06-21T18:00+01:00"
 BY_TIME = ["--sun-from", MORNING, "--sun-to", EVENING]

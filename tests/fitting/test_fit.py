@@ -32,6 +32,8 @@ from jaxhf.fitting.view import differences
 from jaxhf.io.procedural import fractal
 from jaxhf.scene.localise import localise
 
+pytestmark = pytest.mark.unoptimised
+
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024, edge_samples=0)
 LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6))
 SIZE = 24

@@ -20,6 +20,8 @@ from jaxhf.fitting.robust import influence_function, soften
 from jaxhf.fitting.uncertainty import with_unexplained
 from jaxhf.scene.localise import localise
 
+pytestmark = pytest.mark.unoptimised
+
 
 def test_noise_that_is_not_given_is_estimated():
     """To a tenth, of each picture its own, in spite of a robust loss and of pixels that are far off."""

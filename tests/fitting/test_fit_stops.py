@@ -4,8 +4,11 @@ import math
 from typing import Any
 
 import numpy as np
+import pytest
 
 import jaxhf
+
+pytestmark = pytest.mark.unoptimised
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
 # Slopes up to 3, seen from above in one picture of one light; the prior is the terrain smoothed, and says little.

@@ -21,6 +21,8 @@ from jaxhf.scene.localise import localise
 from jaxhf.trace.grid import Grid
 from jaxhf.trace.world import make_world
 
+pytestmark = pytest.mark.unoptimised
+
 PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])
 
 CAMERA = jaxhf.Perspective.look_at((0.6, -0.8, 0.9), (0.5, 0.5, 0.1), fov=50.0, width=37, height=22)

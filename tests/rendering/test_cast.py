@@ -9,6 +9,7 @@ import pytest
 from compare import COUNT, DOWN, DTYPES, ROUGH, SLACK, assert_none, compare_with_oracle, every_family, heightfield, numpied
 
 import jaxhf
+from jaxhf.core.compilation import compiler_options
 from jaxhf.rendering.cast import cast_camera
 
 SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
@@ -295,7 +296,7 @@ def test_under_jit_and_vmap():
     """The same answers inside of a compiled function, over a batch of heights, and ray by ray."""
     o, d = (jnp.asarray(value) for value in slanted(MILD, 48, seed=20))
     plain = jaxhf.cast(heightfield(MILD), o, d)
-    compiled = jax.jit(jaxhf.cast)(heightfield(MILD), o, d)
+    compiled = jax.jit(jaxhf.cast, compiler_options=compiler_options(newer=True))(heightfield(MILD), o, d)  # as users do
     single = jax.vmap(lambda o, d: jaxhf.cast(heightfield(MILD), o, d))(o, d)
     stack = jnp.stack([jnp.asarray(MILD.heights), 2 * jnp.asarray(MILD.heights)])
     fields = jax.vmap(lambda z: jaxhf.cast(jaxhf.Heightfield(z, *MILD[1:]), o, d))(stack)

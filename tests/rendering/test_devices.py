@@ -44,6 +44,7 @@ mesh = meshes.get("all")
 results["in parts"] = jaxhf.render(scene, settings, progress=lambda done, total: None, mesh=mesh)
 prepared = jaxhf.prepare(scene, settings, mesh=mesh)
 results["prepared"] = jaxhf.render(prepared)
+jax.config.update("jax_disable_most_optimizations", True)  # pictures alone are compared bit by bit
 for name, edge_samples in (("slope", 0), ("slope with edges", 600)):
     if name in parts:
         settings = jaxhf.Settings(chunk=64, edge_samples=edge_samples, shadows=False)  # a smaller program

@@ -10,6 +10,8 @@ import pytest
 
 import jaxhf
 
+pytestmark = pytest.mark.unoptimised
+
 EYE, TARGET = (-0.25, -0.75, 1.25), (0.5, 0.5, 0.125)  # exact in binary, so that an offset takes nothing from them
 WIDTH, HEIGHT, FOV = 24, 16, 24.0
 SKY = np.array([0.1, 0.2, 0.4])
@@ -173,6 +175,7 @@ def test_single_precision_agrees_with_double():
     assert np.abs(single - double)[inside].max() < 1e-4
 
 
+@pytest.mark.unoptimised(False)  # two programs, whose bits are the same as users compile them
 def test_progress_gives_the_same_bits():
     camera = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=70, height=67)
     settings = jaxhf.Settings(chunk=64)  # 9 x 9 tiles, the last of each row and column partly outside
