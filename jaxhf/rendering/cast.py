@@ -1,17 +1,14 @@
 """Rays of the caller's own, on one heightfield or through a camera."""
 
 import functools
-import math
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Float
 
-from ..core.autodiff import recomputed
 from ..core.compilation import compiled
 from ..core.errors import ArgumentError, UserError, require_kind
 from ..core.ray import Ray
@@ -24,6 +21,7 @@ from ..trace.grid import Grid
 from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
 from ..trace.world import first_hit, make_surface, make_world
+from .chunks import trace_chunks
 
 
 def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings | None = None) -> Hit:
@@ -122,13 +120,4 @@ def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, 
         ray, leaving = leave(surface, 0, start, d) if isinstance(start, Hit) else (Ray(start, d), None)
         return intersect(surface, 0, ray, max_steps=settings.max_steps, leaving=leaving)
 
-    chunk = settings.chunk
-    rays = d.shape[0]
-    count = math.ceil(rays / chunk)
-
-    def chunked(leaf: jax.Array) -> jax.Array:
-        tail = leaf.shape[1:]
-        return jnp.pad(leaf, ((0, count * chunk - rays), *((0, 0) for _ in tail))).reshape(count, chunk, *tail)
-
-    hits = lax.map(recomputed(jax.vmap(one)), jax.tree.map(chunked, (start, d)))
-    return jax.tree.map(lambda leaf: leaf.reshape(count * chunk, *leaf.shape[2:])[:rays], hits)
+    return trace_chunks(one, (start, d), settings.chunk)

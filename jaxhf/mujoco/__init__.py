@@ -1,0 +1,4 @@
+"""Height fields of MuJoCo: rays, height scans, depth images and lidars, in MuJoCo's own terms and without MuJoCo."""
+
+from .hfield import HField as HField
+from .ray import ray as ray

@@ -1,0 +1,163 @@
+"""Where rays meet MuJoCo's height field, as `mj_ray` has it."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float
+
+from ..core.affine import Affine
+from ..core.autodiff import stored
+from ..core.compilation import compiled
+from ..core.errors import ArgumentError, require_kind
+from ..core.materialise import materialise
+from ..core.ray import Ray
+from ..core.types import Scalar, Vector
+from ..core.vector import finite, unit
+from ..rendering.chunks import trace_batch
+from ..scene.heightfield import Heightfield
+from ..trace.grid import Grid, make_grid
+from ..trace.intersect import plane_distance, ray_in_grid
+from ..trace.search import first_triangle
+from ..trace.status import Status
+from ..trace.triangle import plane_through, triangle_corners
+from ..trace.walk import WalkResult
+from .hfield import HField
+from .pose import pose
+from .solid import Side, base_faces, column, walls
+
+CHUNK = 1024  # rays traced together
+
+
+class Met(eqx.Module):
+    """What a ray met.
+
+    Attributes:
+      t: in units of the ray's direction; -1: nothing.
+      p: where; the ray's origin where it met nothing.
+      n: the unit normal; zero where it met nothing.
+    """
+
+    t: Scalar
+    p: Vector
+    n: Vector
+
+
+def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], Float[jax.Array, "*rays 3"]]:
+    """The distances at which rays pnt + x vec, x >= 0, first meet a height field, in units of |vec|, and the normals there.
+
+    What `mujoco.mj_ray` and `mj_rayHfield` return: -1 and a zero normal for a ray that meets nothing; a ray that starts below
+    the surface meets the base and the walls from within; the normal is the triangle's own, upwards, or points out of the
+    solid, from whichever side the ray came. Unlike there no ray slips through between two triangles or two walls; one that
+    starts on the surface, to the last bit, leaves it; and a `vec` that is zero or not finite meets nothing. Both results
+    are differentiable in all numbers of the height field and of the rays; at a miss the derivative is zero.
+
+    Args:
+      hfield: one height field, or a batch.
+      pnt, vec: origins and directions, world frame, shapes (..., 3), broadcast against each other. For a batch of height
+        fields they begin with its axes: each has rays of its own.
+
+    Returns:
+      Distances (...) and normals (..., 3).
+
+    Raises:
+      ValueError: `pnt` or `vec` does not end in an axis of length 3, or does not begin with the axes of the batch.
+    """
+    require_kind("ray", "hfield", hfield, HField, "a jaxhf.mujoco.HField")
+    dtype = hfield.data.dtype
+    pnt, vec = jnp.asarray(pnt, dtype), jnp.asarray(vec, dtype)
+    for name, value in (("pnt", pnt), ("vec", vec)):
+        if value.shape[-1:] != (3,):
+            raise ArgumentError("ray", name, f"must have shape (..., 3), its shape is {value.shape}")
+    try:
+        shape = np.broadcast_shapes(pnt.shape, vec.shape)
+    except ValueError as error:
+        raise ArgumentError("ray", "vec", f"must fit pnt of shape {pnt.shape}, its shape is {vec.shape}") from error
+    if shape[: len(hfield.batch)] != hfield.batch or len(shape) <= len(hfield.batch):
+        rule = f"must begin with the axes {hfield.batch} of the height fields, the rays have shape {shape}"
+        raise ArgumentError("ray", "pnt", rule)
+    met = _rays(hfield, jnp.broadcast_to(pnt, shape), jnp.broadcast_to(vec, shape))
+    return met.t, met.n
+
+
+@compiled
+def _rays(hfield: HField, pnt: Float[jax.Array, "*rays 3"], vec: Float[jax.Array, "*rays 3"]) -> Met:
+    return first_met(hfield, pnt, vec)
+
+
+def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Met:
+    """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them."""
+    axes, batch = o.shape[:-1], len(hfield.batch)
+    count = math.prod(hfield.batch)
+    fields = jax.tree.map(lambda leaf: jnp.asarray(leaf, hfield.data.dtype), hfield)
+    fields = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[batch:]), fields)
+    rays = o.reshape(count, -1, 3), d.reshape(count, -1, 3)
+    met = trace_batch(
+        lambda field: (field, _grid(field)), lambda ready, ray: _one(*ready, Ray(ray[0], ray[1])), fields, rays, CHUNK
+    )
+    return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[2:]), met)
+
+
+def _grid(hfield: HField) -> Grid:
+    """For the search alone: cells by cells by data."""
+    return make_grid(Heightfield(lax.stop_gradient(hfield.data), 1.0, 1.0), None, None)
+
+
+def _one(hfield: HField, grid: Grid, ray: Ray) -> Met:
+    """What one ray in the world's frame meets, after a walk over the surface."""
+    frame = pose(hfield.pos, hfield.quat)
+    local = in_hfield(frame, ray)
+    within = column(hfield, local)
+    faces = base_faces(hfield, local, within)
+    limit = lax.stop_gradient(jnp.where(faces[0].met, faces[0].t, jnp.where(faces[1].met, faces[1].t, jnp.inf)))
+    scaled, scale = ray_in_grid(grid, in_cells(hfield, local))
+    found = first_triangle(grid, scaled, max_steps=None, t_max=limit * scale)
+    found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
+    found = stored(materialise(found))
+    surface = surface_side(hfield, local, found)
+    return nearest(frame, ray, [*faces, *walls(hfield, local, within, faces[1], found.side < 0), surface])
+
+
+def in_hfield(frame: Affine, ray: Ray) -> Ray:
+    """A ray of the world's in the height field's frame; one that is not finite gets a direction of zero."""
+    valid = finite(ray.o) & finite(ray.d)
+    o, d = jnp.where(valid, ray.o, frame.offset), jnp.where(valid, ray.d, 0)
+    return Ray(frame.covector(o - frame.offset), frame.covector(d))
+
+
+def in_cells(hfield: HField, local: Ray) -> Ray:
+    """A ray of the height field's frame in cells by cells by data, such that the border is at whole numbers to the last bit."""
+    nrow, ncol = hfield.data.shape
+    half = jnp.array([(ncol - 1) / 2, (nrow - 1) / 2, 1], local.o.dtype)
+    centre = jnp.array([1, 1, 0], local.o.dtype)
+    size = hfield.size[:3]
+    return Ray((local.o / size + centre) * half, local.d / size * half)
+
+
+def surface_side(hfield: HField, local: Ray, found: WalkResult) -> Side:
+    """The triangle that a search found, in the height field's frame."""
+    nrow, ncol = hfield.data.shape
+    corners = triangle_corners(hfield.data.reshape(-1), ncol, found.ix, found.iy, found.upper)
+    plane = a, b, _ = plane_through(corners, found.upper)
+    # A ray straight down is over one place, wherever on it the search began.
+    down = (local.d[0] == 0) & (local.d[1] == 0)
+    near, far = jnp.where(down, 0, found.t_near), jnp.where(down, jnp.inf, found.t_far)
+    found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (near, far))
+    t = plane_distance(plane, in_cells(hfield, local), found)
+    per_cell = jnp.stack([(ncol - 1) / 2 / hfield.size[0], (nrow - 1) / 2 / hfield.size[1]]) * hfield.size[2]
+    n = unit(jnp.stack([-a * per_cell[0], -b * per_cell[1], jnp.ones_like(a)]))
+    return Side(t, found.status == int(Status.HIT), n)
+
+
+def nearest(frame: Affine, ray: Ray, sides: list[Side]) -> Met:
+    """The nearest of the sides that are met; of two at the same distance the first."""
+    best = Side(jnp.full_like(sides[0].t, jnp.inf), jnp.zeros((), bool), jnp.zeros_like(sides[0].n))
+    for side in sides:
+        closer = side.met & (side.t < best.t)
+        best = Side(jnp.where(closer, side.t, best.t), best.met | side.met, jnp.where(closer, side.n, best.n))
+    t = jnp.where(best.met, best.t, 0)
+    return Met(jnp.where(best.met, t, -1), ray(t), frame.vector(best.n))
