@@ -69,6 +69,7 @@ def test_rays_are_batched_and_compiled_in_few_places():
         "rendering/chunks",
         "boundary/term",
         "fitting/linearise",
+        "mujoco/scan",
     }
     rules = {"core/masked", "trace/search"}
     for path in MODULES:

@@ -2,3 +2,4 @@
 
 from .hfield import HField as HField
 from .ray import ray as ray
+from .scan import Scan as Scan, grid_pattern as grid_pattern, height_scan as height_scan

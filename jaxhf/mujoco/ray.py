@@ -14,9 +14,9 @@ from ..core.affine import Affine
 from ..core.autodiff import stored
 from ..core.compilation import compiled
 from ..core.errors import ArgumentError, require_kind
-from ..core.materialise import materialise
+from ..core.materialise import apart, materialise
 from ..core.ray import Ray
-from ..core.types import Scalar, Vector
+from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import finite, unit
 from ..rendering.chunks import trace_batch
 from ..scene.heightfield import Heightfield
@@ -24,7 +24,7 @@ from ..trace.grid import Grid, make_grid
 from ..trace.intersect import plane_distance, ray_in_grid
 from ..trace.search import first_triangle
 from ..trace.status import Status
-from ..trace.triangle import plane_through, triangle_corners
+from ..trace.triangle import plane_through, triangle_vertices
 from ..trace.walk import WalkResult
 from .hfield import HField
 from .pose import pose
@@ -40,11 +40,13 @@ class Met(eqx.Module):
       t: in units of the ray's direction; -1: nothing.
       p: where; the ray's origin where it met nothing.
       n: the unit normal; zero where it met nothing.
+      valid: whether it met anything.
     """
 
     t: Scalar
     p: Vector
     n: Vector
+    valid: Flag
 
 
 def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], Float[jax.Array, "*rays 3"]]:
@@ -80,26 +82,30 @@ def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], 
     if shape[: len(hfield.batch)] != hfield.batch or len(shape) <= len(hfield.batch):
         rule = f"must begin with the axes {hfield.batch} of the height fields, the rays have shape {shape}"
         raise ArgumentError("ray", "pnt", rule)
-    met = _rays(hfield, jnp.broadcast_to(pnt, shape), jnp.broadcast_to(vec, shape))
+    met = first_met(hfield, jnp.broadcast_to(pnt, shape), jnp.broadcast_to(vec, shape))
     return met.t, met.n
 
 
 @compiled
-def _rays(hfield: HField, pnt: Float[jax.Array, "*rays 3"], vec: Float[jax.Array, "*rays 3"]) -> Met:
-    return first_met(hfield, pnt, vec)
-
-
 def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Met:
     """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them."""
-    axes, batch = o.shape[:-1], len(hfield.batch)
-    count = math.prod(hfield.batch)
-    fields = jax.tree.map(lambda leaf: jnp.asarray(leaf, hfield.data.dtype), hfield)
-    fields = jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[batch:]), fields)
+    axes, fields = o.shape[:-1], one_axis(hfield)
+    count = len(fields.data)
     rays = o.reshape(count, -1, 3), d.reshape(count, -1, 3)
     met = trace_batch(
-        lambda field: (field, _grid(field)), lambda ready, ray: _one(*ready, Ray(ray[0], ray[1])), fields, rays, CHUNK
+        lambda field: (field, _grid(field)),
+        lambda ready, ray: _one(ready[0], ready[1], Ray(ray[0], ray[1])),
+        fields,
+        rays,
+        CHUNK,
     )
     return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[2:]), met)
+
+
+def one_axis(hfield: HField) -> HField:
+    """A batch, or a single one, as a batch with one axis, its numbers in the precision of the heights."""
+    axes, count = len(hfield.batch), math.prod(hfield.batch)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, hfield.data.dtype).reshape(count, *leaf.shape[axes:]), hfield)
 
 
 def _grid(hfield: HField) -> Grid:
@@ -118,8 +124,7 @@ def _one(hfield: HField, grid: Grid, ray: Ray) -> Met:
     found = first_triangle(grid, scaled, max_steps=None, t_max=limit * scale)
     found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
     found = stored(materialise(found))
-    surface = surface_side(hfield, local, found)
-    return nearest(frame, ray, [*faces, *walls(hfield, local, within, faces[1], found.side < 0), surface])
+    return _nearest(hfield, local, frame, found, [*faces, *walls(hfield, local, within, faces[1], found.side < 0)])
 
 
 def in_hfield(frame: Affine, ray: Ray) -> Ray:
@@ -138,26 +143,44 @@ def in_cells(hfield: HField, local: Ray) -> Ray:
     return Ray((local.o / size + centre) * half, local.d / size * half)
 
 
-def surface_side(hfield: HField, local: Ray, found: WalkResult) -> Side:
-    """The triangle that a search found, in the height field's frame."""
+def triangle_heights(hfield: HField, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
+    """The data at the vertices of a triangle, see `triangle_corners`."""
+    ncol = hfield.data.shape[1]
+
+    def heights(data, first, between, last):
+        rows = data.reshape(-1)
+        return tuple(rows.at[at].get(mode="promise_in_bounds", wrap_negative_indices=False) for at in (first, between, last))
+
+    return apart(heights, hfield.data, *triangle_vertices(ncol, ix, iy, upper))
+
+
+def _nearest(hfield: HField, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Met:
+    """The nearest of the triangle that a search found and of the solid's sides; of two at the same distance the first side.
+
+    Args:
+      hfield: one.
+      local: the ray in its frame.
+      frame: world from that frame.
+      found: the triangle; t counts as the ray's does. Of a ray straight down only its cell is used, so that what is met has
+        the same bits by whatever search.
+      solid: the sides.
+    """
     nrow, ncol = hfield.data.shape
-    corners = triangle_corners(hfield.data.reshape(-1), ncol, found.ix, found.iy, found.upper)
-    plane = a, b, _ = plane_through(corners, found.upper)
-    # A ray straight down is over one place, wherever on it the search began.
+    plane = a, b, c = plane_through(triangle_heights(hfield, found.ix, found.iy, found.upper), found.upper)
     down = (local.d[0] == 0) & (local.d[1] == 0)
     near, far = jnp.where(down, 0, found.t_near), jnp.where(down, jnp.inf, found.t_far)
     found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (near, far))
-    t = plane_distance(plane, in_cells(hfield, local), found)
-    per_cell = jnp.stack([(ncol - 1) / 2 / hfield.size[0], (nrow - 1) / 2 / hfield.size[1]]) * hfield.size[2]
-    n = unit(jnp.stack([-a * per_cell[0], -b * per_cell[1], jnp.ones_like(a)]))
-    return Side(t, found.status == int(Status.HIT), n)
-
-
-def nearest(frame: Affine, ray: Ray, sides: list[Side]) -> Met:
-    """The nearest of the sides that are met; of two at the same distance the first."""
-    best = Side(jnp.full_like(sides[0].t, jnp.inf), jnp.zeros((), bool), jnp.zeros_like(sides[0].n))
-    for side in sides:
+    cells = in_cells(hfield, local)
+    t = plane_distance(plane, cells, found)
+    at, size = cells(t), hfield.size
+    u, v = at[0] - found.ix.astype(t.dtype), at[1] - found.iy.astype(t.dtype)
+    per_x, per_y = a * size[2] * ((ncol - 1) / 2) / size[0], b * size[2] * ((nrow - 1) / 2) / size[1]
+    surface = Side(t, found.status == int(Status.HIT), unit(jnp.stack([-per_x, -per_y, jnp.ones_like(a)])))
+    best = Side(jnp.full_like(t, jnp.inf), jnp.zeros((), bool), jnp.zeros_like(surface.n))
+    for side in (*solid, surface):
         closer = side.met & (side.t < best.t)
         best = Side(jnp.where(closer, side.t, best.t), best.met | side.met, jnp.where(closer, side.n, best.n))
     t = jnp.where(best.met, best.t, 0)
-    return Met(jnp.where(best.met, t, -1), ray(t), frame.vector(best.n))
+    p = local(t)
+    z = jnp.where(surface.met & (surface.t == best.t), (c + a * u + b * v) * size[2], p[2])  # free of the ray's own rounding
+    return Met(jnp.where(best.met, t, -1), frame.point(jnp.stack([p[0], p[1], z])), frame.vector(best.n), best.met)
