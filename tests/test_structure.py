@@ -70,6 +70,7 @@ def test_rays_are_batched_and_compiled_in_few_places():
         "boundary/term",
         "fitting/linearise",
         "mujoco/scan",
+        "mujoco/sensors",
     }
     rules = {"core/masked", "trace/search"}
     for path in MODULES:

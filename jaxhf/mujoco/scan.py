@@ -82,18 +82,8 @@ def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, of
     if align not in get_args(Align):
         raise ArgumentError("height_scan", "align", f"must be one of {', '.join(get_args(Align))}; it is {align!r}")
     dtype = hfields.data.dtype
-    pos, quat, places = (
-        jnp.asarray(pos, dtype),
-        jnp.asarray(quat, dtype),
-        np.asarray(grid_pattern()) if pattern is None else pattern,
-    )
-    places = jnp.asarray(places, dtype)
-    batch = hfields.batch
-    for name, value, length in (("pos", pos, 3), ("quat", quat, 4)):
-        if value.shape[-1:] != (length,) or value.shape[: len(batch)] != batch or value.shape[:-1] != pos.shape[:-1]:
-            wanted = ", ".join(map(str, (*batch, "..."))) if batch else "..."
-            rule = f"must have shape ({wanted}, {length}), pos and quat alike, its shape is {value.shape}"
-            raise ArgumentError("height_scan", name, rule)
+    pos, quat = poses_for("height_scan", hfields, pos, quat)
+    places = jnp.asarray(grid_pattern() if pattern is None else pattern, dtype)
     if places.ndim != 2 or places.shape[1] != 2:
         raise ArgumentError("height_scan", "pattern", f"must have shape (n, 2), its shape is {places.shape}")
     starts = _starts(pos, quat, jnp.asarray(offset, dtype), align=align)
@@ -101,6 +91,20 @@ def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, of
         return _look_up(hfields, starts, places)
     met = first_met(hfields, *_rays(starts, places))
     return Scan(met.p, met.n, met.t, met.valid)
+
+
+def poses_for(owner: str, hfields: HField, pos: Any, quat: Any) -> tuple[jax.Array, jax.Array]:
+    """Positions (..., 3) and orientations (..., 4) of robots in the precision of the height fields, whose axes they begin with.
+
+    Raises:
+      ValueError: their shapes are others; `owner` is who says so.
+    """
+    pos, quat, batch = jnp.asarray(pos, hfields.data.dtype), jnp.asarray(quat, hfields.data.dtype), hfields.batch
+    for name, value, length in (("pos", pos, 3), ("quat", quat, 4)):
+        if value.shape != (*pos.shape[:-1], length) or value.shape[: len(batch)] != batch or value.ndim <= len(batch):
+            wanted = ", ".join(map(str, (*batch, "...", length)))
+            raise ArgumentError(owner, name, f"must have shape ({wanted}), pos and quat alike, its shape is {value.shape}")
+    return pos, quat
 
 
 @functools.partial(compiled, static_argnames=("align",))
