@@ -8,6 +8,7 @@ ours alternate, and the best of each counts.
 
 import argparse
 import functools
+import importlib
 import resource
 import sys
 import threading
@@ -24,7 +25,8 @@ import jaxhf
 from jaxhf.mujoco import HField, grid_pattern, height_scan, ray
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from hfields import KINDS, Reference, heights, mujoco, rays
+hfields: Any = importlib.import_module("hfields")
+KINDS, Reference, heights, rays, mujoco = hfields.KINDS, hfields.Reference, hfields.heights, hfields.rays, hfields.mujoco
 
 # Rows, columns, size, and where: geom and body. The last two took no part while `ray` was made.
 CASES = {
@@ -173,6 +175,7 @@ def speed(robots: int, cores: int = 2) -> None:
         print(f"{value / 1e6:8.2f} million rays a second, {value / base:6.1f} times mj_ray's in threads: {name}")
 
     compiled = jax.jit(height_scan).lower(fields, pos, quat).compile().memory_analysis()
+    assert compiled is not None
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     results_mib, further = compiled.output_size_in_bytes / 2**20, compiled.temp_size_in_bytes / 2**20
     print(f"MiB: heights {data.nbytes / 2**20:.0f}, results {results_mib:.0f}, further {further:.0f}; the process {most:.0f}")
@@ -232,8 +235,7 @@ def gradient() -> None:
 @functools.cache
 def _mjx_model(path: str | None, side: int):
     """A ball that rolls over a terrain."""
-    from mujoco import mjx
-
+    mjx: Any = importlib.import_module("mujoco.mjx")
     if path is None:
         random = np.random.default_rng(0)
         noise = np.fft.rfft2(random.normal(size=(side, side)))
