@@ -86,10 +86,15 @@ def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], 
     return met.t, met.n
 
 
-@compiled
 def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Met:
     """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them."""
-    axes, fields = o.shape[:-1], one_axis(hfield)
+    return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, o, d)
+
+
+@compiled
+def _first_met(data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, o: jax.Array, d: jax.Array) -> Met:
+    """From the numbers alone: whether they stand upright makes no other program."""
+    axes, fields = o.shape[:-1], one_axis(HField(data, size, pos, quat))
     count = len(fields.data)
     rays = o.reshape(count, -1, 3), d.reshape(count, -1, 3)
     met = trace_batch(

@@ -124,7 +124,7 @@ def cast(
     if isinstance(surface, Prepared):
         hit = _cast_prepared(surface._world, *rays)
     elif isinstance(surface, Scene):
-        hit = _cast_scene(localise(surface.with_lights(())), *rays, settings or Settings())
+        hit = _cast_prepared(_make_world(localise(surface.with_lights(())), settings=settings or Settings()), *rays)
     elif batch:
         heights = field.heights.reshape(-1, *field.heights.shape[-2:])
         hit = _cast_batch(heights, *rays, field.dx, field.dy, settings or Settings())
@@ -172,13 +172,9 @@ def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Sett
     return intersect(surface, 0, begin, max_steps=settings.max_steps, leaving=leaving)
 
 
-@functools.partial(compiled, static_argnames=("settings",))
-def _cast_scene(scene: Scene, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
-    return _cast_world(make_world(scene, settings), o, d)
+_make_world = compiled(make_world, static_argnames=("settings",))
 
 
-def _cast_world(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
+@compiled
+def _cast_prepared(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
     return trace_chunks(lambda ray: first_hit(world, Ray(ray[0], ray[1])), (o, d), world.settings.chunk)
-
-
-_cast_prepared = compiled(_cast_world)

@@ -68,7 +68,7 @@ def test_look_up_equals_walk_and_mujoco():
 
 
 def test_gradient_matches_central_differences():
-    """In the heights, size and place of the height fields and in the robots' poses; in a program with a scan over time."""
+    """In the heights, size and place of the height fields and in the robots' poses."""
     pos, quat = robots(3)
     numbers = tuple(map(jnp.asarray, (GROUNDS, np.tile(SIZE, (2, 1)), PLACE, np.tile(TURN, (2, 1)), pos, quat)))
     weights = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3, 187)))
@@ -76,16 +76,12 @@ def test_gradient_matches_central_differences():
     def weighted(numbers):
         fields = jax.tree.unflatten(jax.tree.structure(FIELDS), numbers[:4])
         assert fields.upright
-
-        def step(total, shift):
-            scan = height_scan(fields, numbers[4] + shift[None, None], numbers[5])
-            return total + (weights * (scan.heights + scan.n.sum(-1) - scan.dist)).sum(), scan.mask.mean()
-
-        return jax.lax.scan(step, 0.0, jnp.asarray([[0.0, 0, 0], [0.3, 0.2, 0]]))
+        scan = height_scan(fields, numbers[4], numbers[5])
+        return (weights * (scan.heights + scan.n.sum(-1) - scan.dist)).sum(), scan.mask.mean()
 
     program = jax.jit(jax.value_and_grad(weighted, has_aux=True), compiler_options=jaxhf.compiler_options())
     (_, seen), slopes = program(numbers)
-    assert 0.1 < seen.min() < seen.max() < 0.9
+    assert 0.1 < seen < 0.95
     random, eps = np.random.default_rng(2), 1e-7
     tangents = [jnp.asarray(random.normal(size=value.shape)) for value in numbers]
     tangents[3] = tangents[3].at[:, 1:3].set(0)  # else the field is upright no longer; its tilt is in the test of rays
