@@ -26,7 +26,8 @@ class HField(eqx.Module):
       data: shape (..., nrow, ncol), at least 2x2, 0 to 1, row 0 at -y. Its dtype, float32 or float64, is the precision of rays.
       size: shape (..., 4): half of the extent in x and in y, the height of data = 1, the depth of the base; all positive.
       pos, quat: where it stands in the world, shapes (..., 3) and (..., 4), quat as (w, x, y, z).
-      upright: whether `quat` was known to be a rotation about z when this was made. Rays straight down then need no search.
+      upright: whether `quat` was known to be a rotation about z when this was made. Rays straight down then need no search. One
+        that is to be tilted must be made anew, as this is not looked at again.
     """
 
     data: Float[AnyArray, "*batch nrow ncol"]
@@ -37,7 +38,7 @@ class HField(eqx.Module):
 
     def __init__(self, data: Any, size: Any, pos: Any = (0, 0, 0), quat: Any = (1, 0, 0, 0)):
         data = jnp.asarray(data)
-        self.data = data if jnp.issubdtype(data.dtype, jnp.floating) else data.astype(jnp.float32)
+        self.data = data if data.dtype in (jnp.float32, jnp.float64) else data.astype(jnp.float32)
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
             rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"
             raise ArgumentError("HField", "data", rule)
@@ -73,7 +74,7 @@ class HField(eqx.Module):
 
         Args:
           model: a `mujoco.MjModel`, or what has its arrays, as MJX's model.
-          geom: its name or its number.
+          geom: its number; or its name, where the model knows names.
 
         Raises:
           ValueError: the geom is no height field.
@@ -82,8 +83,9 @@ class HField(eqx.Module):
         if isinstance(geom, str):
             try:
                 geom = int(model.geom(geom).id)
-            except KeyError as error:
-                raise ArgumentError("HField.from_model", "geom", f"must be the name of a geom, it is {name!r}") from error
+            except (KeyError, AttributeError) as error:  # MJX's model has no names
+                rule = f"must be a geom's number, or its name in a mujoco.MjModel; it is {name!r}"
+                raise ArgumentError("HField.from_model", "geom", rule) from error
         if not 0 <= geom < model.ngeom or int(model.geom_type[geom]) != _MJGEOM_HFIELD:
             raise ArgumentError("HField.from_model", "geom", f"must be a height field, {name!r} is none")
         number = int(model.geom_dataid[geom])
