@@ -166,8 +166,8 @@ def _nearest(hfield: HField, local: Ray, frame: Affine, found: WalkResult, solid
       hfield: one.
       local: the ray in its frame.
       frame: world from that frame.
-      found: the triangle; t counts as the ray's does. Of a ray straight down only its cell is used, so that what is met has
-        the same bits by whatever search.
+      found: the triangle; t counts as the ray's does. Of a ray straight down only its cell is used, as it is over one place
+        wherever on it the search began.
       solid: the sides.
     """
     nrow, ncol = hfield.data.shape
