@@ -1,3 +1,4 @@
+from . import mujoco as mujoco
 from .core.compilation import compiler_options as compiler_options
 from .core.errors import ArgumentError as ArgumentError
 from .core.settings import Settings as Settings

@@ -1,5 +1,6 @@
 """Keeping XLA on the CPU from computing a value anew for each of its users."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,5 +19,20 @@ def materialise(tree: Any) -> Any:
     """
     if jax.default_backend() != "cpu":  # `lax.platform_dependent` would have both forms traced and differentiated
         return tree
-    opaque_true = lax.optimization_barrier(jnp.ones((), bool))
-    return lax.cond(opaque_true, lambda tree: tree, lambda tree: jax.tree.map(jnp.zeros_like, tree), tree)
+    return lax.cond(_opaque_true(), lambda tree: tree, lambda tree: jax.tree.map(jnp.zeros_like, tree), tree)
+
+
+def apart(fun: Callable[..., Any], *args: Any) -> Any:
+    """`fun(*args)` between two such borders: `args` are in memory before, and the result afterwards.
+
+    For gathers. XLA on the CPU fuses one into its only user; one with several users becomes a loop over its elements, some
+    twenty times as slow.
+    """
+    if jax.default_backend() != "cpu":
+        return fun(*args)
+    shapes = jax.eval_shape(fun, *args)
+    return lax.cond(_opaque_true(), fun, lambda *_: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes), *args)
+
+
+def _opaque_true() -> jax.Array:
+    return lax.optimization_barrier(jnp.ones((), bool))

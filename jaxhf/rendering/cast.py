@@ -1,4 +1,4 @@
-"""Rays of the caller's own, on one heightfield or through a camera."""
+"""Rays of the caller's own, on heightfields, into a scene or through a camera."""
 
 import functools
 import math
@@ -8,10 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Float
 
-from ..core.autodiff import recomputed
 from ..core.compilation import compiled
 from ..core.errors import ArgumentError, UserError, require_kind
 from ..core.ray import Ray
@@ -23,7 +21,9 @@ from ..scene.scene import Scene
 from ..trace.grid import Grid
 from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
-from ..trace.world import first_hit, make_surface, make_world
+from ..trace.world import World, first_hit, make_surface, make_world, resolve_settings
+from .chunks import trace_batch, trace_chunks
+from .render import Prepared
 
 
 def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings | None = None) -> Hit:
@@ -48,15 +48,20 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
     return jax.vmap(one)(x, y)
 
 
-def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings | None = None, *, leaving: Hit | None = None) -> Hit:
-    """Where rays meet a heightfield; differentiable in the heights, in `o`, in `d` and in `leaving`.
+def cast(
+    surface: Heightfield | Scene | Prepared, o: Any, d: Any, settings: Settings | None = None, *, leaving: Hit | None = None
+) -> Hit:
+    """Where rays first meet a heightfield or a scene; differentiable in the heights, in `o`, in `d` and in `leaving`.
 
     Args:
-      heightfield: the surface, in the frame of the rays.
+      surface: a heightfield in the frame of the rays; a scene, of which all objects count; or one that `prepare` made ready,
+        for which nothing is prepared again. Or a batch of heightfields that differ in their heights only, shape (..., ny, nx),
+        as `jax.vmap(lambda z: jaxhf.Heightfield(z, dx=2.0))(heights)` makes them: each has rays of its own, so that the
+        axes of `o` and `d` begin with those of the batch.
       o, d: origins and directions, shape (..., 3) each, broadcast against each other; a direction need not be unit. NumPy
         and Python numbers keep double precision until the grid's x0 and y0 have been subtracted.
-      settings: max_steps, shading, normals and chunk count here.
-      leaving: for rays that start on the surface: hits of an earlier `cast` on the same heightfield, whose leading axes are
+      settings: max_steps, shading, normals and chunk count here; those of a prepared scene are its own.
+      leaving: for rays that start on a heightfield: hits of an earlier `cast` on it, whose leading axes are
         broadcast against those of `d`; `o` must then be None. A ray leaves on the side of its triangle to which `d` points
         and cannot meet that triangle again, so that no offset by an epsilon is needed.
 
@@ -65,16 +70,27 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings | None = N
       INVALID.
 
     Raises:
-      ValueError: `o` or `d` does not end in an axis of length 3, or not exactly one of `o` and `leaving` is None.
+      ValueError: `o` or `d` does not end in an axis of length 3, or not exactly one of `o` and `leaving` is None, or the
+        axes do not begin with those of a batch; `leaving` or other settings with a scene that is prepared.
     """
-    if not all(hasattr(heightfield, name) for name in ("heights", "dx", "dy", "x0", "y0")):
-        hint = "a scene has .heightfields" if isinstance(heightfield, Scene) else "jaxhf.Heightfield(heights, dx, dy) makes one"
-        require_kind("cast", "heightfield", heightfield, Heightfield, "a jaxhf.Heightfield", hint)
+    scene = surface.scene if isinstance(surface, Prepared) else surface if isinstance(surface, Scene) else None
+    field: Any = surface if scene is None else None
+    if scene is None and not all(hasattr(field, name) for name in ("heights", "dx", "dy", "x0", "y0")):
+        hint = "jaxhf.Heightfield(heights, dx, dy) makes one"
+        require_kind("cast", "surface", surface, Heightfield, "a jaxhf.Heightfield or a Scene", hint)
     require_kind("cast", "settings", settings or Settings(), Settings, "a jaxhf.Settings")
     if leaving is not None:
         require_kind("cast", "leaving", leaving, Hit, "the Hit that an earlier cast returned")
-    dtype = heightfield.heights.dtype
-    corner = np.array([heightfield.x0, heightfield.y0, 0.0])
+        if scene is not None:
+            raise UserError("cast: leaving needs a heightfield alone, rays that meet a scene start at o")
+    if isinstance(surface, Prepared) and settings is not None and resolve_settings(settings, surface.scene) != surface.settings:
+        raise UserError(f"cast: the scene was prepared with {surface.settings}, it cannot be cast into with {settings}")
+    if scene is not None:
+        dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
+        corner, batch = anchor(scene), ()
+    else:
+        dtype, batch = field.heights.dtype, field.heights.shape[:-2]
+        corner = np.array([field.x0, field.y0, 0.0])
     if (o is None) == (leaving is None):
         raise UserError("cast: rays start at o or at the hits that they are leaving, and one of the two must be None")
     for name, value in (("o", o), ("d", d)):
@@ -91,19 +107,30 @@ def cast(heightfield: Heightfield, o: Any, d: Any, settings: Settings | None = N
     d = jnp.asarray(d, dtype)
     starting = jax.tree.leaves(start)[0].shape[:axes]
     try:
-        batch = np.broadcast_shapes(starting, d.shape[:-1])
+        many = np.broadcast_shapes(starting, d.shape[:-1])
     except ValueError as error:
         raise ArgumentError(
             "cast", "d", f"must fit the {starting} rays that start, its leading axes are {d.shape[:-1]}"
         ) from error
+    if many[: len(batch)] != batch:
+        raise ArgumentError("cast", "d", f"must begin with the axes {batch} of the heightfields, its leading axes are {many}")
 
     def in_a_row(leaf: jax.Array, tail: tuple[int, ...]) -> jax.Array:
-        return jnp.broadcast_to(leaf, (*batch, *tail)).reshape(-1, *tail)
+        lead = (math.prod(batch),) if batch else ()
+        return jnp.broadcast_to(leaf, (*many, *tail)).reshape(*lead, -1, *tail)
 
     starts = jax.tree.map(lambda leaf: in_a_row(leaf, leaf.shape[axes:]), start)
-    field = Heightfield(heightfield.heights, heightfield.dx, heightfield.dy)
-    hit = _cast(field, starts, in_a_row(d, (3,)), settings or Settings())
-    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), _moved(hit, corner))
+    rays = starts, in_a_row(d, (3,))
+    if isinstance(surface, Prepared):
+        hit = _cast_prepared(surface._world, *rays)
+    elif isinstance(surface, Scene):
+        hit = _cast_prepared(_make_world(localise(surface.with_lights(())), settings=settings or Settings()), *rays)
+    elif batch:
+        heights = field.heights.reshape(-1, *field.heights.shape[-2:])
+        hit = _cast_batch(heights, *rays, field.dx, field.dy, settings or Settings())
+    else:
+        hit = _cast(Heightfield(field.heights, field.dx, field.dy), *rays, settings or Settings())
+    return jax.tree.map(lambda leaf: leaf.reshape(*many, *leaf.shape[rays[1].ndim - 1 :]), _moved(hit, corner))
 
 
 def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
@@ -114,21 +141,40 @@ def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
 @functools.partial(compiled, static_argnames=("settings",))
 def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
     """Rays from points (n, 3), or from hits with a leading axis n; chunk after chunk of one fixed size."""
+    surface = _surface(heightfield, settings)
+    return trace_chunks(lambda ray: _first(surface, ray, settings), (start, d), settings.chunk)
+
+
+@functools.partial(compiled, static_argnames=("dx", "dy", "settings"))
+def _cast_batch(
+    heights: Float[jax.Array, "m ny nx"],
+    start: jax.Array | Hit,
+    d: Float[jax.Array, "m n 3"],
+    dx: float,
+    dy: float,
+    settings: Settings,
+) -> Hit:
+    def made(heights: jax.Array) -> Grid:
+        return _surface(Heightfield(heights, dx, dy), settings)
+
+    return trace_batch(made, lambda surface, ray: _first(surface, ray, settings), heights, (start, d), settings.chunk)
+
+
+def _surface(heightfield: Heightfield, settings: Settings) -> Grid:
     surface = make_surface(heightfield, None, settings)
     assert isinstance(surface, Grid)
+    return surface
 
-    def one(rays: tuple[jax.Array | Hit, jax.Array]) -> Hit:
-        start, d = rays
-        ray, leaving = leave(surface, 0, start, d) if isinstance(start, Hit) else (Ray(start, d), None)
-        return intersect(surface, 0, ray, max_steps=settings.max_steps, leaving=leaving)
 
-    chunk = settings.chunk
-    rays = d.shape[0]
-    count = math.ceil(rays / chunk)
+def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Settings) -> Hit:
+    start, d = ray
+    begin, leaving = leave(surface, 0, start, d) if isinstance(start, Hit) else (Ray(start, d), None)
+    return intersect(surface, 0, begin, max_steps=settings.max_steps, leaving=leaving)
 
-    def chunked(leaf: jax.Array) -> jax.Array:
-        tail = leaf.shape[1:]
-        return jnp.pad(leaf, ((0, count * chunk - rays), *((0, 0) for _ in tail))).reshape(count, chunk, *tail)
 
-    hits = lax.map(recomputed(jax.vmap(one)), jax.tree.map(chunked, (start, d)))
-    return jax.tree.map(lambda leaf: leaf.reshape(count * chunk, *leaf.shape[2:])[:rays], hits)
+_make_world = compiled(make_world, static_argnames=("settings",))
+
+
+@compiled
+def _cast_prepared(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
+    return trace_chunks(lambda ray: first_hit(world, Ray(ray[0], ray[1])), (o, d), world.settings.chunk)

@@ -61,7 +61,7 @@ def intersect(
         return materialise(cylinder_hit(surface, ray, left, number, active, count_steps))
     if isinstance(surface, Walls):
         return materialise(wall_hit(surface, ray, leaving, number, active, count_steps))
-    local, scale = _in_grid(surface, ray)
+    local, scale = ray_in_grid(surface, ray)
     found = first_triangle(
         surface,
         local,
@@ -77,7 +77,7 @@ def intersect(
 
 def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
     """The hit of a world-frame ray that starts on the triangle of `at`, where it starts; also where it grazes the triangle."""
-    local, scale = _in_grid(grid, ray)
+    local, scale = ray_in_grid(grid, ray)
     ix, iy, _, _ = place_on_grid(grid, at)
     met, zero = jnp.full((), int(Status.HIT), jnp.int32), jnp.zeros_like(scale)
     return surface_hit(grid, number, local, scale, WalkResult(met, ix, iy, at.triangle == 1, at.side, zero, zero, None))
@@ -96,7 +96,7 @@ def blocked(
     if isinstance(surface, Walls):
         t, found, _ = wall_distance(surface, ray, leaving.object == number, leaving.cell[0])
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
-    local, scale = _in_grid(surface, ray)
+    local, scale = ray_in_grid(surface, ray)
     t_max = None if t_max is None else t_max * scale
     found = first_triangle(surface, local, max_steps=max_steps, active=active, leaving=leaving, number=number, t_max=t_max)
     met = found.status == int(Status.HIT)
@@ -123,7 +123,7 @@ def leave(grid: Grid, number: int, hit: Hit, d: Vector) -> tuple[Ray, Hit]:
     return Ray(p, jnp.where(hit.status == int(Status.HIT), d, 0)), leaving
 
 
-def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
+def ray_in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
     """The ray in the grid's frame, with a `d` of length around 1, and by how much its t is longer there.
 
     The factor is a power of two, so that no bit changes; without it t would leave the range in which the walk's
@@ -138,7 +138,7 @@ def _in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
 def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkResult) -> Hit:
     """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray.
 
-    The ray is one of `_in_grid`, where t is longer by `scale`; `number` is that of the grid's object. Heights and normals at
+    The ray is one of `ray_in_grid`, where t is longer by `scale`; `number` is that of the grid's object. Heights and normals at
     the vertices are fetched before the conditional, which in a reverse derivative would return the derivative of all heights
     and normals once a tile. What the walk itself says passes by both conditionals, as they would copy it (frames took
     up to a tenth longer).

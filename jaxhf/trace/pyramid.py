@@ -25,19 +25,23 @@ class Pyramid(eqx.Module):
       bounds: level after level, each row padded to the finest's width; first for rays above, then for rays below.
       width, height: of the finest level, cells, rounded up to powers of two.
       levels: how many levels stand above the finest.
+      first: where the first bound stands; None: at 0, else `bounds` holds those of several grids, one after the other.
     """
 
     bounds: Float[jax.Array, " n"]
     width: int = eqx.field(static=True)
     height: int = eqx.field(static=True)
     levels: int = eqx.field(static=True)
+    first: Index | None = None
 
     def bound(self, above: Flag, level: Index, ix: Index, iy: Index) -> Scalar:
         """That of the block of `level` which holds the cell (ix, iy), for a ray above or below the surface."""
         first_row = 2 * self.height - lax.shift_right_logical(jnp.full_like(level, 2 * self.height), level)
         row = first_row + lax.shift_right_logical(iy, level)
         index = row * self.width + lax.shift_right_logical(ix, level)
-        index = index + jnp.where(above, 0, self.bounds.shape[0] // 2)
+        of_one = self.width * (2 * self.height - (self.height >> self.levels))
+        index = index + jnp.where(above, 0, of_one)
+        index = index if self.first is None else index + self.first
         return self.bounds.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 

@@ -2,7 +2,9 @@
 
 import functools
 import math
+import operator
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -88,15 +90,77 @@ def _search(walk: Walk, state: jax.Array, budget: int, count: bool, early_exit: 
 
     @run.def_vmap
     def run_many(axis_size: int, in_batched, walk: Walk, state: jax.Array):
-        batched, shared = eqx.partition(walk, in_batched[0])
         state = state if in_batched[1] else jnp.broadcast_to(state, (axis_size,))
-        skip = jax.vmap(lambda batched, state: eqx.combine(batched, shared).skip(state))
-        visit = jax.vmap(lambda batched, state: eqx.combine(batched, shared).visit(state))
-        skip_all, visit_all = (functools.partial(step, batched) for step in (skip, visit))
-        ended = _steps(skip_all, visit_all, state, budget, count, early_exit)
+        ended = _search_many(in_batched[0], budget, count, early_exit)(walk, state)
         return ended, jax.tree.map(lambda _: True, ended)
 
     return run(walk, state)
+
+
+def _search_many(of_ray: Walk, budget: int, count: bool, early_exit: bool) -> Callable[[Walk, jax.Array], Any]:
+    """`_search` for a batch of walks, of which `of_ray` says which leaves differ from one to the other.
+
+    Under a further `vmap`, as over heightfields each with rays of its own, all become one batch, and grids one array: a loop
+    in a loop's batch took three times as long.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def run(walk: Walk, state: jax.Array):
+        batched, shared = eqx.partition(walk, of_ray)
+        skip = jax.vmap(lambda batched, state: eqx.combine(batched, shared).skip(state))
+        visit = jax.vmap(lambda batched, state: eqx.combine(batched, shared).visit(state))
+        skip_all, visit_all = (functools.partial(step, batched) for step in (skip, visit))
+        return _steps(skip_all, visit_all, state, budget, count, early_exit)
+
+    @run.def_vmap
+    def run_more(axis_size: int, in_batched, walk: Walk, state: jax.Array):
+        rays = state.shape[-1]
+        flat, differs = _one_batch(walk, of_ray, in_batched[0], axis_size, rays)
+        state = jnp.broadcast_to(state, (axis_size, rays)).reshape(-1)
+        ended = _search_many(differs, budget, count, early_exit)(flat, state)
+        return jax.tree.map(lambda leaf: leaf.reshape(axis_size, rays), ended), jax.tree.map(lambda _: True, ended)
+
+    return run
+
+
+def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: int) -> tuple[Walk, Walk]:
+    """The walks of several batches as those of one, and which leaves differ from walk to walk.
+
+    Args:
+      walk: a leaf has an axis for the batch, where `of_batch` says so, and then one for the ray, where `of_ray` does.
+      of_ray, of_batch: walks whose leaves are bool.
+      axis_size: batches.
+      rays: in each.
+    """
+
+    def flattened(leaf: jax.Array, per_ray: Any, per_batch: Any) -> jax.Array:
+        if not (per_ray or per_batch):
+            return leaf
+        leaf = leaf if per_batch else leaf[None]
+        leaf = leaf if per_ray else leaf[:, None]
+        return jnp.broadcast_to(leaf, (axis_size, rays, *leaf.shape[2:])).reshape(-1, *leaf.shape[2:])
+
+    def joined(values: jax.Array, per_ray: Any, per_batch: Any, first: jax.Array | None) -> tuple[Any, Any, Any]:
+        """The values of all batches, whether they differ from walk to walk, and where those of a walk begin."""
+        if per_ray or not per_batch:
+            return flattened(values, per_ray, per_batch), per_ray, first
+        begin = jnp.repeat(jnp.arange(axis_size, dtype=jnp.int32), rays) * values.shape[1]
+        return values.reshape(-1), False, begin if first is None else begin + first
+
+    flat, differs = jax.tree.map(flattened, walk, of_ray, of_batch), jax.tree.map(operator.or_, of_ray, of_batch)
+    rows, differ, first = joined(walk.rows, of_ray.rows, of_batch.rows, flat.first)
+    of_blocks = of_ray.pyramid.bounds, of_batch.pyramid.bounds
+    bounds, bounds_differ, first_bound = joined(walk.pyramid.bounds, of_blocks[0], of_blocks[1], flat.pyramid.first)
+
+    def with_places(walk: Walk, *values: Any) -> Walk:
+        def parts(walk: Walk) -> tuple[Any, ...]:
+            return walk.rows, walk.first, walk.pyramid.bounds, walk.pyramid.first
+
+        return eqx.tree_at(parts, walk, values, is_leaf=lambda leaf: leaf is None)
+
+    given = (None if place is None else True for place in (first, first_bound))
+    flat = with_places(flat, rows, first, bounds, first_bound)
+    return flat, with_places(differs, differ, next(given), bounds_differ, next(given))
 
 
 def _steps(

@@ -17,9 +17,15 @@ class Corners(eqx.Module):
     normals: Float[jax.Array, "3 3"] | None
 
 
-def corners(rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index) -> tuple[jax.Array, ...]:
-    """The values at the vertices 00, 10, 01, 11 of a cell that is in range, from a flat array whose rows have nx vertices."""
+def corners(
+    rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index, grid: Index | None
+) -> tuple[jax.Array, ...]:
+    """The values at the vertices 00, 10, 01, 11 of a cell that is in range, from a flat array whose rows have nx vertices.
+
+    Where that holds several grids, `grid` is the place of the grid's first vertex.
+    """
     first = iy * nx + ix
+    first = first if grid is None else first + grid
     return tuple(_at(rows, first + further) for further in (0, 1, nx, nx + 1))
 
 

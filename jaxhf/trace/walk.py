@@ -108,6 +108,7 @@ class Walk(eqx.Module):
 
     Attributes:
       rows, nx, pyramid: the grid's heights, how many are in a row, its bounds.
+      first: its first height in `rows`, where those hold several grids, one after the other; None: 0.
       x, y, z_ray: where the walk begins.
       dx, dy, dz: the ray's direction.
       inv_x, inv_y: 1 / dx and 1 / dy, see `reciprocal`.
@@ -143,6 +144,7 @@ class Walk(eqx.Module):
     t_stop: Scalar
     ahead: Flag | None
     noise: Scalar | None
+    first: Index | None = None
 
     @property
     def bits_x(self) -> int:
@@ -224,7 +226,7 @@ class Walk(eqx.Module):
     def _cell(self, state: jax.Array, ix: Index, iy: Index, size: Index) -> "_Cell":
         near, out_x, out_y = self._passage(ix, iy, size)
         flip_x, flip_y = self.flip
-        z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ flip_x, iy ^ flip_y)
+        z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ flip_x, iy ^ flip_y, self.first)
         whole = jnp.isfinite(z00 + z10 + z01 + z11)
         through_x = out_x <= out_y
         out = lesser(out_x, out_y)

@@ -153,7 +153,8 @@ ANSWERS = {
     'jaxhf.render(scene, "draft")': "settings must be a jaxhf.Settings, it is a str",
     "jaxhf.prepare(field)": "prepare: scene must be a jaxhf.Scene, it is a Heightfield; "
     "which has a camera and lights besides: jaxhf.Scene([jaxhf.Object(heightfield)], camera, lights)",
-    "jaxhf.cast(scene, *ray)": "cast: heightfield must be a jaxhf.Heightfield, it is a Scene; a scene has .heightfields",
+    'jaxhf.cast("t.tif", *ray)': "cast: surface must be a jaxhf.Heightfield or a Scene, it is a str; "
+    "jaxhf.Heightfield(heights, dx, dy) makes one",
     'jaxhf.cast(field, *ray, "flat")': "cast: settings must be a jaxhf.Settings, it is a str",
     "jaxhf.cast(field, (0, 0, 1), None)": "cast: d must have shape (..., 3), its shape is ()",
     "jaxhf.fit(scene, [1.0])": "fit: scenes must be a list, one for each picture, it is a Scene",

@@ -9,6 +9,7 @@ import pytest
 from compare import COUNT, DOWN, DTYPES, ROUGH, SLACK, assert_none, compare_with_oracle, every_family, heightfield, numpied
 
 import jaxhf
+from jaxhf.core.affine import translate
 from jaxhf.core.compilation import compiler_options
 from jaxhf.rendering.cast import cast_camera
 
@@ -311,3 +312,38 @@ def test_under_jit_and_vmap():
         for name in one:  # another program may round elsewhere; t at grazing angles is the most sensitive
             np.testing.assert_allclose(one[name], other[name], rtol=1e-9, atol=1e-9, err_msg=name)
     assert np.any(np.asarray(plain.t) != np.asarray(double.t))
+
+
+def test_into_a_scene():
+    """At the vertices of a terrain far from the origin, whose object is moved; the same bits where it was prepared."""
+    field = jaxhf.Heightfield(MILD.heights, 0.5, 2.0, x0=5e5, y0=4.5e6)
+    camera = jaxhf.Perspective.look_at((5e5 + 1, 4.5e6 - 3, 6), (5e5 + 2, 4.5e6 + 6, 0), width=8, height=8)
+    scene = jaxhf.Scene([jaxhf.Object(field, None, translate(10.0, 0.0, 3.0))], camera)
+    x, y = np.meshgrid(np.arange(1, 8), np.arange(1, 6))
+    o, d = np.stack([5e5 + 10 + 0.5 * x, 4.5e6 + 2.0 * y, 9.0 + 0 * x], -1), DOWN
+    hit = jaxhf.cast(scene, o, d)
+    assert (np.asarray(hit.status) == jaxhf.Status.HIT).all()
+    np.testing.assert_allclose(hit.p[..., 2], MILD.heights[1:6, 1:8] + 3, atol=1e-12)
+    prepared = jaxhf.prepare(scene)
+    np.testing.assert_array_equal(jaxhf.cast(prepared, o, d).p, hit.p)
+    with pytest.raises(ValueError, match="leaving needs a heightfield alone"):
+        jaxhf.cast(scene, None, d, leaving=hit)
+    with pytest.raises(ValueError, match="it cannot be cast into with"):
+        jaxhf.cast(prepared, o, d, jaxhf.Settings(shading="flat"))
+
+
+def test_batch_of_heightfields():
+    """Each with rays of its own, several or only a part of them in one chunk: what they meet alone."""
+    o, d = slanted(MILD, 144, seed=21)
+    o, d = o.reshape(3, 48, 3), d.reshape(3, 48, 3)
+    heights = np.stack([MILD.heights * scale for scale in (1.0, 0.8, -1.2)])
+    fields = jax.vmap(lambda z: jaxhf.Heightfield(z, *MILD[1:]))(jnp.asarray(heights))
+    together = jaxhf.cast(fields, o, d, jaxhf.Settings(chunk=100))
+    assert together.p.shape == (3, 48, 3)
+    for k in range(3):
+        alone, one = numpied(jaxhf.cast(jaxhf.Heightfield(heights[k], *MILD[1:]), o[k], d[k])), numpied(together)
+        assert (alone["status"] == jaxhf.Status.HIT).mean() > 0.5
+        for name in alone:
+            np.testing.assert_allclose(one[name][k], alone[name], rtol=1e-9, atol=1e-9, err_msg=name)
+    with pytest.raises(ValueError, match=r"must begin with the axes \(3,\) of the heightfields"):
+        jaxhf.cast(fields, o[0], d[0])

@@ -1,0 +1,320 @@
+"""Rays on MuJoCo's height fields beside MuJoCo's own: what they meet, how many a second, and how that moves.
+
+    python benchmarks/robots.py [parity] [speed] [gradient] [mjx] [--rays 100000] [--robots 4096] [--steps 500]
+
+Without a part all but mjx are run, which needs `pip install mujoco-mjx`. Times are of the machine as it is: MuJoCo's and
+ours alternate, and the best of each counts.
+"""
+
+import argparse
+import functools
+import importlib
+import resource
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxhf
+from jaxhf.mujoco import HField, grid_pattern, height_scan, ray
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+hfields: Any = importlib.import_module("hfields")
+KINDS, Reference, heights, rays, mujoco = hfields.KINDS, hfields.Reference, hfields.heights, hfields.rays, hfields.mujoco
+
+# Rows, columns, size, and where: geom and body. The last two took no part while `ray` was made.
+CASES = {
+    "square": (64, 64, (4, 4, 1, 0.5), "", ""),
+    "oblong": (33, 17, (3, 5, 0.7, 0.2), 'pos="1 -2 .5"', ""),
+    "one cell": (2, 2, (1, 2, 0.5, 1), "", ""),
+    "tilted, in a body": (17, 33, (3, 5, 0.7, 0.2), 'pos="1 -2 .5" quat=".9 .1 -.2 .4"', 'pos="-3 1 2" euler="20 -30 140"'),
+    "flat on top": (9, 12, (2, 3, 0.01, 2), 'euler="0 0 33"', ""),
+    "held out: odd, upside down": (7, 41, (6, 0.5, 2, 0.03), 'pos="20 30 -4" euler="170 25 61"', 'pos="1 1 1" euler="5 0 0"'),
+    "held out: steep": (40, 3, (0.2, 9, 30, 4), 'quat=".3 -.8 .5 .1"', ""),
+}
+
+
+def parity(count: int) -> None:
+    """Differences of distances, over the half diagonal of the footprint, and of normals."""
+    for name, (nrow, ncol, size, geom, body) in CASES.items():
+        data, extent = heights(nrow, ncol, seed=nrow), np.array(size, np.float64)
+        reference = Reference(data, extent, geom, body)
+        field = HField.from_model(reference.model, "ground")
+        parts = [rays(kind, data, extent, count // len(KINDS), seed) for seed, kind in enumerate(KINDS)]
+        kinds = np.repeat(KINDS, count // len(KINDS))
+        o, d = reference.in_world(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        # With numbers that single precision can hold too.
+        o, d = (value.astype(np.float32).astype(np.float64) for value in (o, d))
+        t, n = reference(o, d)
+        length, unit = np.linalg.norm(d, axis=1), np.hypot(*size[:2])
+        for dtype, tolerance in ((np.float64, 1e-10), (np.float32, 1e-5)):
+            ours, normals = ray(HField(np.asarray(field.data, dtype), field.size, field.pos, field.quat), o, d)
+            ours, normals = np.asarray(ours, np.float64), np.asarray(normals, np.float64)
+            flips = (ours < 0) != (t < 0)
+            off = np.where(flips, np.inf, np.abs(ours - t) * length / unit)
+            across = np.where(flips, np.inf, np.abs(ours - t) * np.abs((d * n).sum(1)) / unit)
+            apart = (off if dtype == np.float64 else across) > tolerance
+            turned = ~apart & (np.abs(normals - n).max(1) > 1e3 * tolerance)
+            where = np.flatnonzero(apart | turned)[:2000]
+            shift = np.random.default_rng(1).normal(size=(200, 1, 3)) * tolerance * 100 * unit
+            beside = np.array([reference(o[where] + by, d[where])[0] for by in shift]) if len(where) else np.zeros((1, 0))
+            close = 1e4 * tolerance * np.maximum(1, length[where])
+            like_ours, like_theirs = ((np.abs(beside - value[where]) <= close).any(0).sum() for value in (ours, t))
+            counts = {str(kind): int(np.sum(apart & (kinds == kind))) for kind in KINDS if np.any(apart & (kinds == kind))}
+            print(
+                f"{name} {nrow}x{ncol}, {np.dtype(dtype)}: {len(t)} rays, {np.mean(t >= 0):.0%} hit; largest difference",
+                f"along the ray {off[~apart].max():.1e}, across {across[~apart].max():.1e}; beyond {tolerance:g}:",
+                f"{counts or 0}, normals of another triangle {turned.sum()}; of these {len(where)} rays a hair beside",
+                f"answer as ours {like_ours}, as MuJoCo's {like_theirs}",
+                flush=True,
+            )
+
+
+def closed_forms(count: int) -> None:
+    """Rays whose answer is known, in numbers that are exact: whom it is that MuJoCo's misses, and ours."""
+    random, extent = np.random.default_rng(0), np.array([2.0, 2.0, 1.0, 0.5])
+    data = np.round(heights(9, 9) * 64) / 64
+    reference, field = Reference(data, extent), HField(data.astype(np.float64), extent)
+    # In the plane of the wall x = 2, whose rim is a line of eight pieces: the first of them that is met from above.
+    o = np.column_stack([np.full(count, 2.0), random.uniform(-2, 2, count), np.full(count, 1.5)])
+    end = np.column_stack([np.full(count, 2.0), random.uniform(-2, 2, count), np.zeros(count)])
+    y, z = np.linspace(-2, 2, 9), data[:, -1].astype(np.float64)
+    d = end - o
+    slope = np.diff(z) / np.diff(y)
+    along = (z[:-1] + slope * (o[:, 1:2] - y[:-1]) - o[:, 2:]) / (d[:, 2:] - slope * d[:, 1:2])
+    at = o[:, 1:2] + along * d[:, 1:2]
+    on_it = (at >= y[:-1] - 1e-12) & (at <= y[1:] + 1e-12) & (along >= 0)
+    walls = o, d, np.where(on_it, along, np.inf).min(1)
+    # Steep at vertices from above, where no other part of so flat a surface stands before them: t = 1.
+    low, size = heights(9, 6, 3) * 0.02, np.array([3.0, 5.0, 0.7, 0.2])
+    r, c = random.integers(1, 8, count), random.integers(1, 5, count)
+    end = np.column_stack([size[0] * (2 * c / 5 - 1), size[1] * (2 * r / 8 - 1), low[r, c] * size[2]])
+    by = random.uniform([-0.02, -0.02, 1], [0.02, 0.02, 2], (count, 3))
+    vertices = end + by, -by, np.ones(count)
+    sets = {
+        "along a wall": (field, reference, walls),
+        "at vertices": (HField(low.astype(np.float64), size), Reference(low, size), vertices),
+    }
+    for name, (ours, theirs, (o, d, t)) in sets.items():
+        wrong = [np.abs(found - t) > 1e-9 for found in (np.asarray(ray(ours, o, d)[0]), theirs(o, d)[0])]
+        print(f"closed form, {name}: of {count} rays ours misses {wrong[0].sum()}, MuJoCo's {wrong[1].sum()}", flush=True)
+
+
+def rate(run: Callable[[], Any], count: int, repeats: int = 7) -> float:
+    """The most results a second."""
+    jax.block_until_ready(run())
+    best = np.inf
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        jax.block_until_ready(run())
+        best = min(best, time.perf_counter() - begin)
+    return count / best
+
+
+def threads(work: Callable[[int], None], many: int) -> None:
+    running = [threading.Thread(target=work, args=(k,)) for k in range(many)]
+    for thread in running:
+        thread.start()
+    for thread in running:
+        thread.join()
+
+
+def speed(robots: int, cores: int = 2) -> None:
+    """Height scans of robots on height fields of their own, and slanted rays, in millions of rays a second."""
+    random, places, size = np.random.default_rng(0), grid_pattern(), (4, 4, 0.3, 0.5)
+    data = jnp.asarray(random.uniform(size=(robots, 64, 64)), jnp.float32)
+    fields, many = HField(data, size), robots * len(places)
+    pos = jnp.asarray(random.uniform([-3, -3, 0.4], [3, 3, 0.8], (robots, 3)), jnp.float32)
+    quat = jnp.asarray(random.normal(size=(robots, 4)) * [1, 0.1, 0.1, 1], jnp.float32)
+
+    references = [Reference(np.asarray(data[k]), np.array(size, np.float64)) for k in range(cores)]
+    o = random.uniform([-3, -3, 20], [3, 3, 20.5], (20_000, 3))
+    down, fan = np.array([0.0, 0.0, -1.0]), np.column_stack([places, np.full(len(places), -20.0)]).ravel()
+
+    def one_by_one(k: int) -> None:
+        model, state = references[k].model, references[k].data
+        for start in o:
+            mujoco.mj_ray(model, state, start, down, None, 1, -1, None)
+
+    def from_a_point(k: int) -> None:
+        model, state = references[k].model, references[k].data
+        number, dist = np.zeros(len(places), np.int32), np.zeros(len(places))
+        for start in o[:500]:
+            mujoco.mj_multiRay(model, state, start, fan, None, 1, -1, number, dist, None, len(places), 1e10)
+
+    begin = time.perf_counter()
+    jax.block_until_ready(height_scan(fields, pos, quat))
+    print(f"{robots} x {len(places)} rays, heights 64x64 of each robot's own; first call {time.perf_counter() - begin:.1f} s")
+    results = {}
+    heights_only = jax.jit(lambda fields, pos, quat: height_scan(fields, pos, quat).heights)
+    aimed = jnp.asarray(random.normal(size=(robots, len(places), 3)) * [1, 1, 0.3] - [0, 0, 0.3], jnp.float32)
+    starts = jnp.broadcast_to(pos[:, None], aimed.shape)
+    one = HField(data[0], size)
+    runs: dict[str, tuple[Callable[[], Any], int]] = {
+        "mj_ray, one thread": (lambda: one_by_one(0), len(o)),
+        f"mj_ray, {cores} threads": (lambda: threads(one_by_one, cores), cores * len(o)),
+        f"mj_multiRay of {len(places)} from a point, {cores} threads": (
+            lambda: threads(from_a_point, cores), cores * 500 * len(places)),
+        "height_scan: places, normals, distances, mask": (lambda: height_scan(fields, pos, quat), many),
+        "height_scan: heights alone": (lambda: heights_only(fields, pos, quat), many),
+        "height_scan, tilted with the robot (walks)": (lambda: height_scan(fields, pos, quat, align="base"), many),
+        "ray, slanted, each robot on its own": (lambda: ray(fields, starts, aimed), many),
+        "ray, slanted, all on one": (lambda: ray(one, starts.reshape(-1, 3), aimed.reshape(-1, 3)), many),
+    }  # fmt: skip
+    for _ in range(2):
+        for name, (run, count) in runs.items():
+            results[name] = max(results.get(name, 0), rate(run, count, 5))
+    base = results[f"mj_ray, {cores} threads"]
+    for name, value in results.items():
+        print(f"{value / 1e6:8.2f} million rays a second, {value / base:6.1f} times mj_ray's in threads: {name}")
+
+    compiled = jax.jit(height_scan).lower(fields, pos, quat).compile().memory_analysis()
+    assert compiled is not None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+    results_mib, further = compiled.output_size_in_bytes / 2**20, compiled.temp_size_in_bytes / 2**20
+    print(f"MiB: heights {data.nbytes / 2**20:.0f}, results {results_mib:.0f}, further {further:.0f}; the process {most:.0f}")
+    events = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, duration_secs, **_: events.append(event) if event.startswith("/jax/core/compile/backend") else None
+    )
+    for k in range(3):
+        other = HField(jnp.asarray(random.uniform(size=data.shape), jnp.float32), size, (0, 0, k))
+        jax.block_until_ready((height_scan(other, pos, quat), ray(other, starts, aimed)))
+    print(f"programs compiled for three times other heights: {len(events)}")
+
+
+def gradient() -> None:
+    """Derivatives of a height scan along random directions against differences, one ray at a time."""
+    random = np.random.default_rng(0)
+    data, size = random.uniform(size=(16, 64, 64)), (4.0, 4.0, 0.3, 0.5)
+    pos, quat = random.uniform([-3, -3, 0.4], [3, 3, 0.8], (16, 3)), random.normal(size=(16, 4)) * [1, 0.1, 0.1, 1]
+    numbers = tuple(map(jnp.asarray, (data, np.array(size), np.zeros(3), pos, quat)))
+    names = "heights", "size", "place of the field", "robots' positions", "robots' orientations"
+    for align in ("yaw", "base"):
+
+        def scan(numbers, align=align):
+            data, size, place, pos, quat = numbers
+            return height_scan(HField(data, size, place), pos, quat, align=align)
+
+        def values(numbers):
+            found = scan(numbers)
+            return jnp.concatenate([found.p, found.n, found.dist[..., None]], -1)
+
+        program, cells = jax.jit(values), 63
+        forward = jax.jit(lambda numbers, tangents: jax.jvp(values, (numbers,), (tangents,))[1])
+        # A step must not carry a ray into another triangle: leave out those that are within 1e-4 cells of an edge.
+        at = (np.asarray(scan(numbers).p)[..., :2] / 4 + 1) / 2 * cells
+        part = at - np.floor(at)
+        whole = (np.minimum(part, 1 - part).min(-1) > 1e-4) & (np.abs(part[..., 0] - part[..., 1]) > 1e-4)
+        for k, name in enumerate(names):
+            tangents = tuple(jnp.asarray(random.normal(size=value.shape)) * (j == k) for j, value in enumerate(numbers))
+            exact = np.asarray(forward(numbers, tangents))
+            ahead, behind = (
+                np.asarray(program(tuple(value + by * tangent for value, tangent in zip(numbers, tangents, strict=True))))
+                for by in (1e-6, -1e-6)
+            )
+            numeric = (ahead - behind) / 2e-6
+            error = np.abs(exact - numeric)[whole].max() / np.abs(exact)[whole].max()
+            weights = jnp.asarray(random.normal(size=exact.shape))
+            back = jax.jit(jax.grad(lambda numbers, weights: jnp.vdot(weights, values(numbers))))(numbers, weights)
+            along = sum(float(jnp.vdot(slope, tangent)) for slope, tangent in zip(back, tangents, strict=True))
+            both = abs(along - float(jnp.vdot(weights, exact))) / abs(along)
+            print(
+                f"{align}, {name}: {whole.sum()} of {whole.size} rays, largest derivative {np.abs(exact).max():.3g}, largest "
+                f"difference {error:.1e} of it; reverse against forward {both:.1e}",
+                flush=True,
+            )
+
+
+@functools.cache
+def _mjx_model(path: str | None, side: int):
+    """A ball that rolls over a terrain."""
+    mjx: Any = importlib.import_module("mujoco.mjx")
+    if path is None:
+        random = np.random.default_rng(0)
+        noise = np.fft.rfft2(random.normal(size=(side, side)))
+        frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.rfftfreq(side))
+        frequency[0, 0] = 1
+        terrain = np.fft.irfft2(noise * frequency**-1.6, (side, side))
+    else:
+        terrain = np.asarray(jaxhf.load_image(path)).mean(-1)[::-1]
+    terrain = (terrain - terrain.min()) / np.ptp(terrain)
+    (nrow, ncol), height = terrain.shape, 1.0 if path is None else 0.05  # as in playground's scenes of rough terrain
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.004" iterations="4" ls_iterations="6"/>
+        <asset><hfield name="h" nrow="{nrow}" ncol="{ncol}" size="10 10 {height} 1"/></asset>
+        <worldbody><geom name="ground" type="hfield" hfield="h"/>
+        <body pos="0 0 {height + 0.3}"><freejoint/><geom type="sphere" size="0.15"/></body></worldbody></mujoco>"""
+    )
+    model.hfield_data[:] = terrain.astype(np.float32).ravel()
+    return model, mjx
+
+
+def in_mjx(path: str | None, steps: int, robots: int) -> None:
+    """Steps a second of balls on a terrain, with a height scan in every step and without."""
+    model, mjx = _mjx_model(path, 32)
+    ground = HField.from_model(model, "ground")
+    on_device = mjx.put_model(model)
+    print(f"terrain {ground.data.shape}, {robots} balls, {steps} steps")
+
+    def rolled(scans: bool, data, ground):
+        def step(carry, _):
+            data, total = carry
+            data = jax.vmap(mjx.step, (None, 0))(on_device, data)
+            if scans:
+                scan = height_scan(ground, data.qpos[:, :3], data.qpos[:, 3:7])
+                clearance = jnp.where(scan.mask, data.qpos[:, 2:3] - scan.heights, 0)
+                total = total + clearance.mean()
+            return (data, total), None
+
+        return jax.lax.scan(step, (data, jnp.zeros(())), None, steps)[0]
+
+    def begun(place: jax.Array):
+        data = mjx.make_data(model)
+        return data.replace(qpos=data.qpos.at[:2].set(place))
+
+    data = jax.vmap(begun)(jnp.asarray(np.random.default_rng(1).uniform(-6, 6, (robots, 2)), jnp.float32))
+    found = {}
+    for scans in (False, True, False, True):
+        program = found.setdefault(scans, [jax.jit(functools.partial(rolled, scans)), 0.0])
+        found[scans][1] = max(found[scans][1], rate(lambda program=program: program[0](data, ground), steps * robots, 5))
+    state, total = found[True][0](data, ground)
+    print(f"without scans {found[False][1]:.0f} steps a second, with 187 rays in each {found[True][1]:.0f}")
+    here = height_scan(ground, state.qpos[:, :3], state.qpos[:, 3:7], np.zeros((1, 2))).heights[:, 0]
+    above = np.asarray(state.qpos[:, 2] - here)
+    print(f"mean clearance {float(total) / steps:.3f} m; balls of 0.15 m end {above.min():.3f} to {above.max():.3f} m high")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", help="parity, speed, gradient, mjx")
+    parser.add_argument("--rays", type=int, default=100_000, help="of each case of parity")
+    parser.add_argument("--robots", type=int, default=4096, help="of speed")
+    parser.add_argument("--steps", type=int, default=100, help="of mjx")
+    parser.add_argument("--balls", type=int, default=16, help="of mjx")
+    parser.add_argument("--terrain", help="a picture for mjx, as MuJoCo playground's hfield.png; else one of 32 x 32 is made")
+    given = parser.parse_args()
+    parts = given.parts or ["parity", "speed", "gradient"]
+    for part in parts:
+        jax.config.update("jax_enable_x64", part in ("parity", "gradient"))
+        if part == "parity":
+            parity(given.rays)
+            closed_forms(given.rays // 10)
+        elif part == "speed":
+            speed(given.robots)
+        elif part == "gradient":
+            gradient()
+        elif part == "mjx":
+            in_mjx(given.terrain, given.steps, given.balls)
+        else:
+            parser.error(f"unknown part {part}")
+
+
+if __name__ == "__main__":
+    main()

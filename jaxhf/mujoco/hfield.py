@@ -1,0 +1,112 @@
+"""MuJoCo's height field: heights on a grid over a solid base, somewhere in the world."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Float
+
+from ..core.errors import ArgumentError
+from ..core.types import AnyArray, float_leaf, require_finite
+
+
+class HField(eqx.Module):
+    """A height field as MuJoCo has it, or a batch of them: a surface, four walls under its border and a base.
+
+    In its own frame vertex (r, c) stands at x = -size[0] + 2 size[0] c / (ncol - 1), y = -size[1] + 2 size[1] r / (nrow - 1),
+    z = data[r, c] size[2]; each cell is split along (r, c)-(r+1, c+1). The base is a box from z = -size[3] to 0. All of it can
+    be hit from either side, the base's upper face from within the solid too, as in MuJoCo.
+
+    A batch has leading axes; `size`, `pos` and `quat` may be given without them, for all alike. Nothing is compiled again for
+    other numbers in the same shapes.
+
+    Attributes:
+      data: shape (..., nrow, ncol), at least 2x2, 0 to 1, row 0 at -y. Its dtype, float32 or float64, is the precision of rays.
+      size: shape (..., 4): half of the extent in x and in y, the height of data = 1, the depth of the base; all positive.
+      pos, quat: where it stands in the world, shapes (..., 3) and (..., 4), quat as (w, x, y, z).
+      upright: whether `quat` was known to be a rotation about z when this was made. Rays straight down then need no search. One
+        that is to be tilted must be made anew, as this is not looked at again.
+    """
+
+    data: Float[AnyArray, "*batch nrow ncol"]
+    size: Float[AnyArray, "*batch 4"]
+    pos: Float[AnyArray, "*batch 3"]
+    quat: Float[AnyArray, "*batch 4"]
+    upright: bool = eqx.field(static=True)
+
+    def __init__(self, data: Any, size: Any, pos: Any = (0, 0, 0), quat: Any = (1, 0, 0, 0)):
+        data = jnp.asarray(data)
+        self.data = data if data.dtype in (jnp.float32, jnp.float64) else data.astype(jnp.float32)
+        if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
+            rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"
+            raise ArgumentError("HField", "data", rule)
+        self.size, self.pos, self.quat = (
+            self._numbers(name, value, length)
+            for name, value, length in (("size", size, 4), ("pos", pos, 3), ("quat", quat, 4))
+        )
+        if isinstance(self.size, np.ndarray) and not (self.size > 0).all():
+            raise ArgumentError("HField", "size", f"must be positive, it is {self.size.tolist()}")
+        if isinstance(self.quat, np.ndarray) and not np.abs(self.quat).max(-1).all():
+            raise ArgumentError("HField", "quat", "must not be zero, it is")
+        self.upright = not isinstance(self.quat, Tracer) and not np.asarray(self.quat)[..., 1:3].any()
+
+    def _numbers(self, name: str, value: Any, length: int) -> Any:
+        """That many numbers for each height field of the batch, from as many or from those for all alike."""
+        leaf, wanted = float_leaf(value), (*self.batch, length)
+        require_finite("HField", name, leaf)
+        if leaf.shape == wanted:
+            return leaf
+        if leaf.shape != (length,):
+            either = f"{(length,)} or {wanted}" if self.batch else f"{wanted}"
+            raise ArgumentError("HField", name, f"must have shape {either}, its shape is {leaf.shape}")
+        return (np if isinstance(leaf, np.ndarray) else jnp).broadcast_to(leaf, wanted)
+
+    @property
+    def batch(self) -> tuple[int, ...]:
+        """The leading axes of a batch; () for one."""
+        return self.data.shape[:-2]
+
+    @classmethod
+    def from_model(cls, model: Any, geom: int | str) -> "HField":
+        """The height field of a geom, where it stands while no joint has moved.
+
+        Args:
+          model: a `mujoco.MjModel`, or what has its arrays, as MJX's model.
+          geom: its number; or its name, where the model knows names.
+
+        Raises:
+          ValueError: the geom is no height field.
+        """
+        name = geom
+        if isinstance(geom, str):
+            try:
+                geom = int(model.geom(geom).id)
+            except (KeyError, AttributeError) as error:  # MJX's model has no names
+                rule = f"must be a geom's number, or its name in a mujoco.MjModel; it is {name!r}"
+                raise ArgumentError("HField.from_model", "geom", rule) from error
+        if not 0 <= geom < model.ngeom or int(model.geom_type[geom]) != _MJGEOM_HFIELD:
+            raise ArgumentError("HField.from_model", "geom", f"must be a height field, {name!r} is none")
+        number = int(model.geom_dataid[geom])
+        nrow, ncol, first = (int(array[number]) for array in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+        data = np.array(model.hfield_data[first : first + nrow * ncol]).reshape(nrow, ncol)
+        pos, quat = np.array(model.geom_pos[geom], np.float64), np.array(model.geom_quat[geom], np.float64)
+        body = int(model.geom_bodyid[geom])
+        while body:
+            parent = np.array(model.body_quat[body], np.float64)
+            pos, quat = np.array(model.body_pos[body]) + _rotated(parent, pos), _product(parent, quat)
+            body = int(model.body_parentid[body])
+        return cls(data, np.array(model.hfield_size[number], np.float64), pos, quat)
+
+
+_MJGEOM_HFIELD = 1  # mjtGeom's number of a height field
+
+
+def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The quaternion of `b` followed by `a`."""
+    return np.r_[a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])]
+
+
+def _rotated(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
+    return v + 2 * np.cross(quat[1:], np.cross(quat[1:], v) + quat[0] * v)

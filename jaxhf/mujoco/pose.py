@@ -1,0 +1,35 @@
+"""Places and rotations as MuJoCo writes them: a position, and a quaternion (w, x, y, z) that need not be unit."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Float
+
+from ..core.affine import Affine
+from ..core.types import Vector
+
+Quaternion = Float[jax.Array, "4"]
+
+
+def rotation(quat: Quaternion) -> Float[jax.Array, "3 3"]:
+    """The matrix of a quaternion; exactly the identity's rows and columns where a component is zero."""
+    w, x, y, z = quat / jnp.sqrt((quat * quat).sum())
+    xx, yy, zz = x * x, y * y, z * z
+    rows = [
+        [1 - 2 * (yy + zz), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (xx + zz), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (xx + yy)],
+    ]
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def pose(pos: Vector, quat: Quaternion) -> Affine:
+    """world_from_local."""
+    return Affine(rotation(quat), pos)
+
+
+def yaw(quat: Quaternion) -> Quaternion:
+    """The rotation about z alone that a rotation holds, of its angles yaw, pitch, roll (z-y'-x'')."""
+    w, x, y, z = quat / jnp.sqrt((quat * quat).sum())
+    half = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
+    zero = jnp.zeros_like(half)
+    return jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])

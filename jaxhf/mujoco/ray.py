@@ -1,0 +1,191 @@
+"""Where rays meet MuJoCo's height field, as `mj_ray` has it."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float
+
+from ..core.affine import Affine
+from ..core.autodiff import stored
+from ..core.compilation import compiled
+from ..core.errors import ArgumentError, require_kind
+from ..core.materialise import apart, materialise
+from ..core.ray import Ray
+from ..core.types import Flag, Index, Scalar, Vector
+from ..core.vector import finite, unit
+from ..rendering.chunks import trace_batch
+from ..scene.heightfield import Heightfield
+from ..trace.grid import Grid, make_grid
+from ..trace.intersect import plane_distance, ray_in_grid
+from ..trace.search import first_triangle
+from ..trace.status import Status
+from ..trace.triangle import plane_through, triangle_vertices
+from ..trace.walk import WalkResult
+from .hfield import HField
+from .pose import pose
+from .solid import Side, base_faces, column, walls
+
+CHUNK = 1024  # rays traced together
+
+
+class Met(eqx.Module):
+    """What a ray met.
+
+    Attributes:
+      t: in units of the ray's direction; -1: nothing.
+      p: where; the ray's origin where it met nothing.
+      n: the unit normal; zero where it met nothing.
+      valid: whether it met anything.
+    """
+
+    t: Scalar
+    p: Vector
+    n: Vector
+    valid: Flag
+
+
+def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], Float[jax.Array, "*rays 3"]]:
+    """The distances at which rays pnt + x vec, x >= 0, first meet a height field, in units of |vec|, and the normals there.
+
+    What `mujoco.mj_ray` and `mj_rayHfield` return: -1 and a zero normal for a ray that meets nothing; a ray that starts below
+    the surface meets the base and the walls from within; the normal is the triangle's own, upwards, or points out of the
+    solid, from whichever side the ray came. Unlike there no ray slips through between two triangles or two walls; one that
+    starts on the surface, to the last bit, leaves it; and a `vec` that is zero or not finite meets nothing. Both results
+    are differentiable in all numbers of the height field and of the rays; at a miss the derivative is zero.
+
+    Args:
+      hfield: one height field, or a batch.
+      pnt, vec: origins and directions, world frame, shapes (..., 3), broadcast against each other. For a batch of height
+        fields they begin with its axes: each has rays of its own.
+
+    Returns:
+      Distances (...) and normals (..., 3).
+
+    Raises:
+      ValueError: `pnt` or `vec` does not end in an axis of length 3, or does not begin with the axes of the batch.
+    """
+    require_kind("ray", "hfield", hfield, HField, "a jaxhf.mujoco.HField")
+    dtype = hfield.data.dtype
+    pnt, vec = jnp.asarray(pnt, dtype), jnp.asarray(vec, dtype)
+    for name, value in (("pnt", pnt), ("vec", vec)):
+        if value.shape[-1:] != (3,):
+            raise ArgumentError("ray", name, f"must have shape (..., 3), its shape is {value.shape}")
+    try:
+        shape = np.broadcast_shapes(pnt.shape, vec.shape)
+    except ValueError as error:
+        raise ArgumentError("ray", "vec", f"must fit pnt of shape {pnt.shape}, its shape is {vec.shape}") from error
+    if shape[: len(hfield.batch)] != hfield.batch or len(shape) <= len(hfield.batch):
+        rule = f"must begin with the axes {hfield.batch} of the height fields, the rays have shape {shape}"
+        raise ArgumentError("ray", "pnt", rule)
+    met = first_met(hfield, jnp.broadcast_to(pnt, shape), jnp.broadcast_to(vec, shape))
+    return met.t, met.n
+
+
+def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Met:
+    """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them."""
+    return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, o, d)
+
+
+@compiled
+def _first_met(data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, o: jax.Array, d: jax.Array) -> Met:
+    """From the numbers alone: whether they stand upright makes no other program."""
+    axes, fields = o.shape[:-1], one_axis(HField(data, size, pos, quat))
+    count = len(fields.data)
+    rays = o.reshape(count, -1, 3), d.reshape(count, -1, 3)
+    met = trace_batch(
+        lambda field: (field, _grid(field)),
+        lambda ready, ray: _one(ready[0], ready[1], Ray(ray[0], ray[1])),
+        fields,
+        rays,
+        CHUNK,
+    )
+    return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[2:]), met)
+
+
+def one_axis(hfield: HField) -> HField:
+    """A batch, or a single one, as a batch with one axis, its numbers in the precision of the heights."""
+    axes, count = len(hfield.batch), math.prod(hfield.batch)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, hfield.data.dtype).reshape(count, *leaf.shape[axes:]), hfield)
+
+
+def _grid(hfield: HField) -> Grid:
+    """For the search alone: cells by cells by data."""
+    return make_grid(Heightfield(lax.stop_gradient(hfield.data), 1.0, 1.0), None, None)
+
+
+def _one(hfield: HField, grid: Grid, ray: Ray) -> Met:
+    """What one ray in the world's frame meets, after a walk over the surface."""
+    frame = pose(hfield.pos, hfield.quat)
+    local = in_hfield(frame, ray)
+    within = column(hfield, local)
+    faces = base_faces(hfield, local, within)
+    limit = lax.stop_gradient(jnp.where(faces[0].met, faces[0].t, jnp.where(faces[1].met, faces[1].t, jnp.inf)))
+    scaled, scale = ray_in_grid(grid, in_cells(hfield, local))
+    found = first_triangle(grid, scaled, max_steps=None, t_max=limit * scale)
+    found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
+    found = stored(materialise(found))
+    return _nearest(hfield, local, frame, found, [*faces, *walls(hfield, local, within, faces[1], found.side < 0)])
+
+
+def in_hfield(frame: Affine, ray: Ray) -> Ray:
+    """A ray of the world's in the height field's frame; one that is not finite gets a direction of zero."""
+    valid = finite(ray.o) & finite(ray.d)
+    o, d = jnp.where(valid, ray.o, frame.offset), jnp.where(valid, ray.d, 0)
+    return Ray(frame.covector(o - frame.offset), frame.covector(d))
+
+
+def in_cells(hfield: HField, local: Ray) -> Ray:
+    """A ray of the height field's frame in cells by cells by data, such that the border is at whole numbers to the last bit."""
+    nrow, ncol = hfield.data.shape
+    half = jnp.array([(ncol - 1) / 2, (nrow - 1) / 2, 1], local.o.dtype)
+    centre = jnp.array([1, 1, 0], local.o.dtype)
+    size = hfield.size[:3]
+    return Ray((local.o / size + centre) * half, local.d / size * half)
+
+
+def triangle_heights(hfield: HField, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
+    """The data at the vertices of a triangle, see `triangle_corners`."""
+    ncol = hfield.data.shape[1]
+
+    def heights(data, first, between, last):
+        rows = data.reshape(-1)
+        return tuple(rows.at[at].get(mode="promise_in_bounds", wrap_negative_indices=False) for at in (first, between, last))
+
+    return apart(heights, hfield.data, *triangle_vertices(ncol, ix, iy, upper))
+
+
+def _nearest(hfield: HField, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Met:
+    """The nearest of the triangle that a search found and of the solid's sides; of two at the same distance the first side.
+
+    Args:
+      hfield: one.
+      local: the ray in its frame.
+      frame: world from that frame.
+      found: the triangle; t counts as the ray's does. Of a ray straight down only its cell is used, as it is over one place
+        wherever on it the search began.
+      solid: the sides.
+    """
+    nrow, ncol = hfield.data.shape
+    plane = a, b, c = plane_through(triangle_heights(hfield, found.ix, found.iy, found.upper), found.upper)
+    down = (local.d[0] == 0) & (local.d[1] == 0)
+    near, far = jnp.where(down, 0, found.t_near), jnp.where(down, jnp.inf, found.t_far)
+    found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (near, far))
+    cells = in_cells(hfield, local)
+    t = plane_distance(plane, cells, found)
+    at, size = cells(t), hfield.size
+    u, v = at[0] - found.ix.astype(t.dtype), at[1] - found.iy.astype(t.dtype)
+    per_x, per_y = a * size[2] * ((ncol - 1) / 2) / size[0], b * size[2] * ((nrow - 1) / 2) / size[1]
+    surface = Side(t, found.status == int(Status.HIT), unit(jnp.stack([-per_x, -per_y, jnp.ones_like(a)])))
+    best = Side(jnp.full_like(t, jnp.inf), jnp.zeros((), bool), jnp.zeros_like(surface.n))
+    for side in (*solid, surface):
+        closer = side.met & (side.t < best.t)
+        best = Side(jnp.where(closer, side.t, best.t), best.met | side.met, jnp.where(closer, side.n, best.n))
+    t = jnp.where(best.met, best.t, 0)
+    p = local(t)
+    z = jnp.where(surface.met & (surface.t == best.t), (c + a * u + b * v) * size[2], p[2])  # free of the ray's own rounding
+    return Met(jnp.where(best.met, t, -1), frame.point(jnp.stack([p[0], p[1], z])), frame.vector(best.n), best.met)

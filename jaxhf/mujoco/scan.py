@@ -1,0 +1,185 @@
+"""Height scans: the heights of the ground round a robot, at places that move with it."""
+
+import functools
+from typing import Any, Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Bool, Float
+
+from ..core.autodiff import with_tangent
+from ..core.compilation import compiled
+from ..core.errors import ArgumentError, require_kind
+from ..core.materialise import materialise
+from ..core.types import Point2, Scalar, Vector
+from ..trace.triangle import plane_through
+from .hfield import HField
+from .pose import Quaternion, pose, rotation, yaw
+from .ray import first_met, one_axis, triangle_heights
+
+Align = Literal["yaw", "base", "world"]
+
+
+class Scan(eqx.Module):
+    """What the rays of a scan met, with the scan's axes: of the robots, then of the pattern.
+
+    Attributes:
+      p: where in the world; the ray's start where it met nothing.
+      n: unit normals; zero where nothing was met.
+      dist: distances from the rays' starts; -1 where nothing was met.
+      mask: where something was met.
+    """
+
+    p: Float[jax.Array, "*rays 3"]
+    n: Float[jax.Array, "*rays 3"]
+    dist: Float[jax.Array, "*rays"]
+    mask: Bool[jax.Array, "*rays"]
+
+    @property
+    def heights(self) -> Float[jax.Array, "*rays"]:
+        """z of what was met, in the world."""
+        return self.p[..., 2]
+
+
+def grid_pattern(size: tuple[float, float] = (1.6, 1.0), resolution: float = 0.1) -> Float[np.ndarray, "n 2"]:
+    """Places (x, y) on a grid about the origin, x fastest, as Isaac Lab's `GridPatternCfg` has them: 17 x 11 by default.
+
+    Args:
+      size: extent in x (ahead) and in y, which the grid reaches on both sides where it is a multiple of the resolution.
+      resolution: from place to place.
+    """
+    x, y = (np.arange(-length / 2, length / 2 + 1e-9, resolution) for length in size)
+    return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+
+
+def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, offset: Any = 20.0, align: str = "yaw") -> Scan:
+    """What rays meet that start above each place of a pattern, which moves and turns with a robot, and go down.
+
+    Straight down over a height field that is upright (see `HField`) there is nothing to search: the triangle is looked up, by
+    the rules of the walk where a place lies between two. Results are the walk's up to rounding, as its rays are rounded in
+    the world's frame first. Differentiable in all numbers of the height fields, the robots and the pattern. Beyond arguments
+    and results a look-up needs about 60 bytes a ray, in single precision.
+
+    Args:
+      hfields: one height field, or a batch.
+      pos, quat: the robots' positions and orientations (w, x, y, z), shapes (..., 3) and (..., 4). For a batch of
+        height fields they begin with its axes: each has robots of its own.
+      pattern: places (n, 2) in the robot's frame; None: `grid_pattern()`.
+      offset: how far above the robot rays start; rays that start below the surface meet the base from within.
+      align: yaw: the pattern follows the robot's heading, and rays go straight down; base: the pattern and the rays are
+        tilted with the robot; world: neither turns.
+
+    Returns:
+      A `Scan` with the axes (..., n).
+
+    Raises:
+      ValueError: shapes that do not fit, or an unknown `align`.
+    """
+    require_kind("height_scan", "hfields", hfields, HField, "a jaxhf.mujoco.HField")
+    if align not in get_args(Align):
+        raise ArgumentError("height_scan", "align", f"must be one of {', '.join(get_args(Align))}; it is {align!r}")
+    dtype = hfields.data.dtype
+    pos, quat = poses_for("height_scan", hfields, pos, quat)
+    places = jnp.asarray(grid_pattern() if pattern is None else pattern, dtype)
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise ArgumentError("height_scan", "pattern", f"must have shape (n, 2), its shape is {places.shape}")
+    starts = _starts(pos, quat, jnp.asarray(offset, dtype), align=align)
+    if hfields.upright and align != "base":
+        return _look_up(hfields, starts, places)
+    met = first_met(hfields, *_rays(starts, places))
+    return Scan(met.p, met.n, met.t, met.valid)
+
+
+def poses_for(owner: str, hfields: HField, pos: Any, quat: Any) -> tuple[jax.Array, jax.Array]:
+    """Positions (..., 3) and orientations (..., 4) of robots in the precision of the height fields, whose axes they begin with.
+
+    Raises:
+      ValueError: their shapes are others; `owner` is who says so.
+    """
+    pos, quat, batch = jnp.asarray(pos, hfields.data.dtype), jnp.asarray(quat, hfields.data.dtype), hfields.batch
+    for name, value, length in (("pos", pos, 3), ("quat", quat, 4)):
+        if value.shape != (*pos.shape[:-1], length) or value.shape[: len(batch)] != batch or value.ndim <= len(batch):
+            wanted = ", ".join(map(str, (*batch, "...", length)))
+            raise ArgumentError(owner, name, f"must have shape ({wanted}), pos and quat alike, its shape is {value.shape}")
+    return pos, quat
+
+
+@functools.partial(compiled, static_argnames=("align",))
+def _starts(pos: jax.Array, quat: jax.Array, offset: Scalar, align: str) -> "_Start":
+    def one(pos: Vector, quat: Quaternion) -> _Start:
+        x, y, z = jnp.eye(3, dtype=pos.dtype) if align == "world" else rotation(yaw(quat) if align == "yaw" else quat).T
+        return _Start(pos + offset * z, x, y, -z)
+
+    starts = jax.vmap(one)(pos.reshape(-1, 3), quat.reshape(-1, 4))
+    return jax.tree.map(lambda leaf: leaf.reshape(pos.shape), starts)
+
+
+@compiled
+def _rays(starts: "_Start", places: Float[jax.Array, "n 2"]) -> tuple[jax.Array, jax.Array]:
+    """Origins and directions, with the places as a further axis."""
+    o, along_x, along_y, d = (leaf[..., None, :] for leaf in jax.tree.leaves(starts))
+    x, y = (jnp.broadcast_to(places[:, k : k + 1], (*o.shape[:-2], len(places), 1)) for k in (0, 1))
+    o = o + x * along_x + y * along_y
+    return o, jnp.broadcast_to(d, o.shape)
+
+
+@functools.partial(compiled, newer=True)
+def _look_up(hfields: HField, starts: "_Start", places: Float[jax.Array, "n 2"]) -> Scan:
+    axes, fields = starts.o.shape[:-1], one_axis(hfields)
+    starts = jax.tree.map(lambda leaf: leaf.reshape(len(fields.data), -1, 3), starts)
+    each = jax.vmap(jax.vmap(jax.vmap(_under, (None, None, 0)), (None, 0, None)), (0, 0, None))
+    return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[2:]), each(fields, starts, places))
+
+
+class _Start(eqx.Module):
+    """Where a robot's rays start, for the place (x, y) at o + x along_x + y along_y, and their direction; of one or several."""
+
+    o: Float[jax.Array, "*robots 3"]
+    along_x: Float[jax.Array, "*robots 3"]
+    along_y: Float[jax.Array, "*robots 3"]
+    d: Float[jax.Array, "*robots 3"]
+
+
+def _under(hfield: HField, start: _Start, place: Point2) -> Scan:
+    """What the ray straight down from one place meets, without a search, by the rules of the walk and of the solid.
+
+    It is over the footprint all along, and no wall stands in its way. Where it is over the border of two triangles, the
+    triangle is the walk's. Numbers stand alone, as arrays of three would have XLA compute each fused value three times.
+    """
+    frame, (nrow, ncol), size = pose(hfield.pos, hfield.quat), hfield.data.shape, hfield.size
+    o, d = frame.covector(start.o - frame.offset), frame.covector(start.d)  # of the robot, in the height field's frame
+    per_x, per_y = frame.covector(start.along_x), frame.covector(start.along_y)
+    at = [o[k] + place[0] * per_x[k] + place[1] * per_y[k] for k in range(3)]
+    half_x, half_y = (ncol - 1) / 2, (nrow - 1) / 2
+    x, y, z = (at[0] / size[0] + 1) * half_x, (at[1] / size[1] + 1) * half_y, at[2] / size[2]
+    ix = jnp.clip(jnp.floor(lax.stop_gradient(x)).astype(jnp.int32), 0, ncol - 2)
+    iy = jnp.clip(jnp.ceil(lax.stop_gradient(y)).astype(jnp.int32) - 1, 0, nrow - 2)
+    u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
+    upper = v > u
+    corners = triangle_heights(hfield, ix, iy, upper)
+    a, b, c = plane_through(corners, upper)
+    level = c + a * u + b * v
+    inside = (jnp.abs(at[0]) <= size[0]) & (jnp.abs(at[1]) <= size[1])
+    on_surface, on_base = inside & (z > level), inside & (at[2] >= 0)
+    valid = inside & (at[2] >= -size[3])
+    rise_x, rise_y = a * (half_x / size[0]), b * (half_y / size[1])
+    below = jnp.where(on_base, 0, -size[3])
+    t = jnp.where(on_surface, (level - z) / (d[2] / size[2] - rise_x * d[0] - rise_y * d[1]), (below - at[2]) / d[2])
+    # In the world the ray goes straight down, from wherever: so z changes as -t does.
+    x, y, z = (start.o[k] + place[0] * start.along_x[k] + place[1] * start.along_y[k] for k in range(3))
+    height = lax.stop_gradient(jnp.where(on_surface, level * size[2], below) + frame.offset[2])
+    rise_x, rise_y = rise_x * size[2], rise_y * size[2]
+    up = 1 / jnp.sqrt(1 + rise_x * rise_x + rise_y * rise_y)
+    flat = jnp.where(on_base, 1, jnp.where(valid, -1, 0)).astype(up.dtype)
+    n = [jnp.where(on_surface, slope, level) for slope, level in ((-rise_x * up, 0), (-rise_y * up, 0), (up, flat))]
+    n = materialise(n)
+    turn = frame.linear
+    return Scan(
+        p=jnp.stack([x, y, jnp.where(valid, with_tangent(height, z - t), z)]),
+        n=jnp.stack([turn[k, 0] * n[0] + turn[k, 1] * n[1] + turn[k, 2] * n[2] for k in range(3)]),
+        dist=jnp.where(valid, t, -1),
+        mask=valid,
+    )

@@ -1,0 +1,100 @@
+"""The solid below a height field: a base and four walls, met from outside or from within.
+
+All of it lies in the column over the footprint. A ray is in the column between two distances, at each of which it may meet a
+wall; between them it may meet the base's two horizontal faces. Whether it is over the floor where it meets a wall is asked
+of the very distances at which it meets the floor, so that no rounding opens an edge.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..core.ray import Ray
+from ..core.types import Flag, Index, Scalar, Vector
+from .hfield import HField
+
+_ROUNDING = 16  # units in the last place by which the height of a wall's rim may be off
+
+
+class Side(eqx.Module):
+    """Where a ray meets the plane of a side: its t, whether the side is there, and the normal, out of the solid."""
+
+    t: Scalar
+    met: Flag
+    n: Vector
+
+
+class Column(eqx.Module):
+    """Where a ray is over the footprint: from `enters.t` to `leaves.t`, which may be infinite, in the planes of two walls."""
+
+    enters: Side
+    leaves: Side
+
+
+def column(hfield: HField, ray: Ray) -> Column:
+    """The column of a ray in the height field's frame; both of its walls are `met` where the ray comes through it."""
+    near, far = [], []
+    for axis in (0, 1):
+        d, half = ray.d[axis], hfield.size[axis]
+        still, inside = d == 0, jnp.abs(ray.o[axis]) <= half
+        ahead, rate = jnp.where(d > 0, 1, -1).astype(d.dtype), jnp.where(still, 1, d)
+        always, never = jnp.where(inside, -jnp.inf, jnp.inf), jnp.where(inside, jnp.inf, -jnp.inf)
+        n = jnp.zeros(3, d.dtype).at[axis].set(ahead)
+        near.append((jnp.where(still, always, (-ahead * half - ray.o[axis]) / rate), -n))
+        far.append((jnp.where(still, never, (ahead * half - ray.o[axis]) / rate), n))
+    (near_x, in_x), (near_y, in_y), (far_x, out_x), (far_y, out_y) = *near, *far
+    first, last = near_x < near_y, far_x > far_y
+    t_in, t_out = jnp.where(first, near_y, near_x), jnp.where(last, far_y, far_x)
+    through = t_in <= t_out
+    return Column(Side(t_in, through, jnp.where(first, in_y, in_x)), Side(t_out, through, jnp.where(last, out_y, out_x)))
+
+
+def base_faces(hfield: HField, ray: Ray, within: Column) -> list[Side]:
+    """The upper face of the base, and the floor."""
+    still = ray.d[2] == 0
+    rate = jnp.where(still, 1, ray.d[2])
+    up = jnp.array([0, 0, 1], rate.dtype)
+    faces = []
+    for level, n in ((jnp.zeros_like(rate), up), (-hfield.size[3], -up)):
+        t = (level - ray.o[2]) / rate
+        faces.append(Side(t, ~still & (t >= 0) & (within.enters.t <= t) & (t <= within.leaves.t), n))
+    return faces
+
+
+def walls(hfield: HField, ray: Ray, within: Column, floor: Side, below: Flag) -> list[Side]:
+    """The walls where the ray enters the column and where it leaves it.
+
+    Args:
+      hfield: one.
+      ray: in its frame.
+      within: the ray's column.
+      floor: of `base_faces`.
+      below: whether the ray is below the surface, for where rounding cannot tell at the rim: so nothing gets in between a
+        wall and the surface.
+    """
+    return [_wall(hfield, ray, side, floor.t, below) for side in (within.enters, within.leaves)]
+
+
+def _wall(hfield: HField, ray: Ray, side: Side, t_floor: Scalar, below: Flag) -> Side:
+    """The side where it lies over the floor and below the rim."""
+    t = jnp.where(side.met & jnp.isfinite(side.t), side.t, 0)
+    p, up = ray(t), ray.d[2]
+    over_floor = jnp.where(up > 0, t >= t_floor, jnp.where(up < 0, t <= t_floor, ray.o[2] >= -hfield.size[3]))
+    nrow, ncol = hfield.data.shape
+    along_x = side.n[1] != 0
+    c, u = _cell(p[0] / hfield.size[0], ncol)
+    r, v = _cell(p[1] / hfield.size[1], nrow)
+    last = jnp.where(along_x, side.n[1], side.n[0]) > 0
+    r, c = jnp.where(along_x, jnp.where(last, nrow - 1, 0), r), jnp.where(along_x, c, jnp.where(last, ncol - 1, 0))
+    low = hfield.data[r, c]
+    high = hfield.data[r + jnp.where(along_x, 0, 1), c + jnp.where(along_x, 1, 0)]
+    rim = (low + jnp.where(along_x, u, v) * (high - low)) * hfield.size[2]
+    gap, noise = p[2] - rim, _ROUNDING * jnp.finfo(rim.dtype).eps * (hfield.size[2] + jnp.abs(ray.o[2]) + jnp.abs(t * up))
+    under = (gap < -noise) | ((gap <= noise) & below)
+    return Side(t, side.met & jnp.isfinite(side.t) & (t >= 0) & over_floor & under, side.n)
+
+
+def _cell(place: Scalar, vertices: int) -> tuple[Index, Scalar]:
+    """The cell along an axis at -1..1 of the footprint, and where in the cell."""
+    at = (place + 1) * ((vertices - 1) / 2)
+    cell = jnp.clip(at.astype(jnp.int32), 0, vertices - 2)
+    return cell, jnp.clip(at - cell.astype(at.dtype), 0, 1)

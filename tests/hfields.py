@@ -1,0 +1,71 @@
+"""Height fields and rays for MuJoCo, and what MuJoCo itself says of them."""
+
+import importlib
+from typing import Any
+
+import numpy as np
+
+mujoco: Any = importlib.import_module("mujoco")  # its functions are unknown to type checkers
+
+SIZE = np.array([3.0, 5.0, 0.7, 0.2])
+KINDS = ("outside", "inside", "below", "vertical", "grazing", "walls", "edges")
+
+
+def heights(nrow: int, ncol: int, seed: int = 0) -> np.ndarray:
+    data = np.random.default_rng(seed).uniform(size=(nrow, ncol)).astype(np.float32)
+    return (data - data.min()) / (data.max() - data.min())
+
+
+def rays(kind: str, data: np.ndarray, size: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions in the height field's frame."""
+    random, (nrow, ncol), (rx, ry, top, base) = np.random.default_rng(seed), data.shape, size
+
+    def points(times: float = 1.0) -> np.ndarray:
+        return random.uniform([-rx * times, -ry * times, -base * times], [rx * times, ry * times, top * times], (count, 3))
+
+    o = points({"inside": 1.0, "below": 1.0, "vertical": 1.1, "walls": 1.5}.get(kind, 3.0))
+    d = points() - o
+    every = np.arange(count)
+    if kind == "below":
+        o[:, 2] = -base * random.uniform(1, 2, count)
+    elif kind == "vertical":
+        d = random.choice([-1, 1], (count, 1)) * random.uniform(0.1, 3, (count, 1)) * [[0, 0, 1]]
+    elif kind == "grazing":
+        o[:, 2], d[:, 2] = random.uniform(-0.1, 1.1, count) * top, random.normal(size=count) * 0.02 * top
+    elif kind == "walls":  # beside a wall and almost along it
+        axis = random.integers(0, 2, count)
+        o[every, axis] = random.choice([-1, 1], count) * size[axis] * (1 + random.choice([1e-3, -1e-3], count))
+        d[every, axis] = random.choice([0, 1e-4, -1e-4], count)
+    elif kind == "edges":  # from above at vertices and at points on edges
+        r, c = random.integers(0, nrow - 1, count), random.integers(0, ncol - 1, count)
+        step, along = np.array([[0, 1], [1, 0], [1, 1]])[random.integers(0, 3, count)], random.choice([0, 0.25, 0.5], count)
+        x, y = c + step[:, 1] * along, r + step[:, 0] * along
+        z = data[r, c] * (1 - along) + data[r + step[:, 0], c + step[:, 1]] * along
+        o[:, 2] = top * random.uniform(1.2, 3, count)
+        d = np.stack([rx * (2 * x / (ncol - 1) - 1), ry * (2 * y / (nrow - 1) - 1), z * top], 1) - o
+    return o, d
+
+
+class Reference:
+    """MuJoCo's model of a height field, in a body that may be elsewhere."""
+
+    def __init__(self, data: np.ndarray, size: np.ndarray, geom: str = "", body: str = ""):
+        (nrow, ncol), numbers = data.shape, " ".join(map(repr, size.tolist()))
+        self.model = mujoco.MjModel.from_xml_string(
+            f"""<mujoco><asset><hfield name="h" nrow="{nrow}" ncol="{ncol}" size="{numbers}"/></asset>
+            <worldbody><geom type="sphere" size="1" contype="0" rgba="0 0 0 0"/><body {body}>
+            <geom name="ground" type="hfield" hfield="h" {geom}/></body></worldbody></mujoco>"""
+        )
+        self.model.hfield_data[:] = data.ravel()
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_forward(self.model, self.data)
+
+    def in_world(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rotation = self.data.geom_xmat[1].reshape(3, 3)
+        return o @ rotation.T + self.data.geom_xpos[1], d @ rotation.T
+
+    def __call__(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        t, n = np.empty(len(o)), np.empty((len(o), 3))
+        for k in range(len(o)):
+            t[k] = mujoco.mj_ray(self.model, self.data, o[k], d[k], None, True, -1, None, n[k])
+        return t, n
