@@ -65,9 +65,9 @@ def with_stored_triangles() -> None:
     def at(triangles: Triangles, place: Any) -> jax.Array:
         return triangles.heights.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
-    def corners_of(values: Any, nx: int, ix: jax.Array, iy: jax.Array) -> tuple[jax.Array, ...]:
+    def corners_of(values: Any, nx: int, ix: jax.Array, iy: jax.Array, grid: Any) -> tuple[jax.Array, ...]:
         if not isinstance(values, Triangles):
-            return corners(values, nx, ix, iy)
+            return corners(values, nx, ix, iy, grid)
         first = 6 * (iy * (nx - 1) + ix)
         return tuple(at(values, first + further) for further in (0, 1, 4, 2))
 

@@ -284,7 +284,7 @@ class Walk(eqx.Module):
     def border(self, state: jax.Array) -> Index:
         """The edge by which a ray comes into the grid, see `_edge`; -1 where the ray is above it."""
         _, ix, iy, _ = self._unpack(state)
-        z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ self.flip[0], iy ^ self.flip[1])
+        z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ self.flip[0], iy ^ self.flip[1], self.first)
         u, v = self.x - ix.astype(self.x.dtype), self.y - iy.astype(self.y.dtype)
         through_x = self.distance_x(ix) >= self.distance_y(iy)
         low = jnp.where(through_x, jnp.where(self.back_x, z10, z00), jnp.where(self.back_y, z01, z00))
