@@ -20,7 +20,7 @@ import numpy as np
 
 SCENES = ("hftest", "landsea-0", "landsea-1", "landsea-2", "texture", "landsea-big", "landsea-big64")
 # Seconds of pbrt-v2's rendering phase: stock on one core, a course's walk over cells without bounds and with bounds for each
-# cell on one core, stock on two. Taken on two cores like those of docs/performance.md, busy at the time, and handed down
+# cell on one core, stock on two. Taken on two cores like those of docs/measurements/speed.md, busy at the time, and handed down
 # with the scenes; nothing was measured for landsea-big64.
 PUBLISHED = {
     "hftest": (0.10, 0.11, 0.10, 0.10),

@@ -145,7 +145,7 @@ plt.show()
 #
 # A shadow is dark because something else stands in the light: darkness there says nothing about the slope of the
 # ground on which it lies. A renderer without shadows takes it for a steep slope. A renderer with shadows knows
-# better, and its derivative tells how the shadow's edge moves with the ridge (`docs/gradients.md`). A fit includes that
+# better, and its derivative tells how the shadow's edge moves with the ridge (`docs/concepts/boundary.md`). A fit includes that
 # by itself where shadows or silhouettes are in sight; `edge_samples=0` leaves it out. The loss is robust: it lets the few
 # pixels go that the scene cannot explain. `loss="squares"` does not. Here the scene explains them all, so squares, which
 # forget nothing, come a little nearer.
@@ -223,4 +223,4 @@ plt.show()
 # ## From here
 #
 # The same without Python: a file that names the pictures, and `jaxhf fit case.toml -o heights.tif --report
-# report.html`; see `docs/fitting.md`, which also says what exposures, albedo, masks and checkpoints are for.
+# report.html`; see `docs/guides/fitting.md`, which also says what exposures, albedo, masks and checkpoints are for.

@@ -9,7 +9,7 @@ sampling, SIGGRAPH Asia 2018, equation 5; for shadows Zhang et al., Path-space d
 On a heightfield every boundary is the image of edges: of those that separate triangles facing the eye or a light from
 triangles facing away, where they stand; and of the latter's shadows. A point is drawn on such an edge and followed to its
 position x in the picture by plain arithmetic, which carries the derivative; all else is discrete or held constant.
-docs/gradients.md derives this.
+docs/concepts/boundary.md derives this.
 """
 
 import equinox as eqx

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from ..scene.scene import Scene
 
 # Bytes in single precision. Measured at the peak: 57 for each height and device, 50 for each pixel, 116 while a .png is written
-# (docs/performance.md). Less than that is asked for, so that what might fit is tried.
+# (docs/guides/devices.md). Less than that is asked for, so that what might fit is tried.
 _BYTES_A_HEIGHT = 45
 _BYTES_A_PIXEL = 40
 # A device more costs 7 ms a run, and rays take 10 (one terrain) to 300 ms (mirrors) to trace.

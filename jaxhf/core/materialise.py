@@ -15,7 +15,7 @@ def materialise(tree: Any) -> Any:
     every link, and `lax.optimization_barrier` round the values is gone before the fusion. A conditional is not fused
     through. Its predicate is True behind a barrier of its own, which stands until conditionals have been simplified: always
     true at run time, but unknown to the compiler. With this at the borders of the stages a scene with three objects takes
-    between a quarter and a ninth of the time (docs/performance.md).
+    between a quarter and a ninth of the time (docs/measurements/experiments.md).
     """
     if jax.default_backend() != "cpu":  # `lax.platform_dependent` would have both forms traced and differentiated
         return tree

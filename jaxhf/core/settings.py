@@ -76,8 +76,9 @@ class Settings:
         default=None,
         metadata={
             "help": "points on terrain edges, in all, at which the derivative of moving silhouettes and shadow boundaries is "
-            "taken, and about as many samples more in the pixels that see them, see docs/gradients.md; 0: the derivative that "
-            "each sample has by itself, no more; the picture is the same, but takes longer where render is traced",
+            "taken, and about as many samples more in the pixels that see them, see docs/concepts/boundary.md; 0: the "
+            "derivative that each sample has by itself, no more; the picture is the same, but takes longer where render is "
+            "traced",
             "none": "0, but in a fit, which chooses by what its scenes show",
             "metavar": "N",
         },
@@ -89,17 +90,17 @@ class Settings:
 
     @classmethod
     def draft(cls) -> "Settings":
-        """One sample a pixel: to find a view. RMSE of the picture at most 0.35 of its mean, see docs/tradeoff.md."""
+        """One sample a pixel: to find a view. RMSE of the picture at most 0.35 of its mean, see docs/guides/settings.md."""
         return cls(samples=1, edge_samples=10_000)
 
     @classmethod
     def balanced(cls) -> "Settings":
-        """Nine samples a pixel: to look at. RMSE of the picture at most 0.07 of its mean, see docs/tradeoff.md."""
+        """Nine samples a pixel: to look at. RMSE of the picture at most 0.07 of its mean, see docs/guides/settings.md."""
         return cls(samples=9, edge_samples=100_000)
 
     @classmethod
     def exact(cls) -> "Settings":
-        """64 samples a pixel: to measure with. RMSE of the picture at most 0.02 of its mean, see docs/tradeoff.md."""
+        """64 samples a pixel: to measure with. RMSE of the picture at most 0.02 of its mean, see docs/guides/settings.md."""
         return cls(samples=64, edge_samples=300_000)
 
     def __post_init__(self):

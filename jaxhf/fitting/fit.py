@@ -129,7 +129,7 @@ def fit(
       prior_std: standard deviation of their errors, a number or shape (ny, nx), height units.
       prior_length: correlation length L of those errors, in world units as dx and dy are, not in cells; from one cell to the
         terrain's longer side. None: they are independent. For a terrain that was smoothed by a Gaussian of standard deviation
-        s, L is about s / √2: cells of 30 m smoothed over 8 of them have s = 240 m and L = 170 m, see docs/fitting.md.
+        s, L is about s / √2: cells of 30 m smoothed over 8 of them have s = 240 m and L = 170 m, see docs/concepts/recovery.md.
       prior_exponent: the amplitudes of these errors' DCT modes, over prior_std, go as (1 + (L · frequency)²)^(-exponent / 2)
         (Matérn's family). 2 is Whittle's of 1954, with the correlation (r/L) K₁(r/L) at the distance r; 3 is smoother.
       smoothness: standard deviation of the sum of a height's differences to its four neighbours, height units; None: no

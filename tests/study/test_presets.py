@@ -13,7 +13,7 @@ from jaxhf.study.plan import Configuration
 
 WIDTH, HEIGHT = 128, 96
 
-# As docs/tradeoff.md says: RMSE over the mean radiance, and the share of wrong hits.
+# As docs/guides/settings.md says: RMSE over the mean radiance, and the share of wrong hits.
 PROMISES = {"draft": (0.35, 1e-3), "balanced": (0.07, 1e-3), "exact": (0.02, 1e-3)}
 
 

@@ -1,4 +1,4 @@
-"""Reads scenes in TOML; `docs/scene-files.md` describes them, `scenes/` holds examples.
+"""Reads scenes in TOML; `docs/guides/scene-files.md` describes them, `scenes/` holds examples.
 
 Which keys there are stands in `tables.py`; any other key, a value of another type and a file outside the scene's folder
 are errors.

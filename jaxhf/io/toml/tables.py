@@ -1,4 +1,4 @@
-"""Which keys the tables of a TOML scene take, and what is made of them. `docs/scene-files.md` explains them all."""
+"""Which keys the tables of a TOML scene take, and what is made of them. `docs/guides/scene-files.md` explains them all."""
 
 import functools
 import inspect

@@ -1,0 +1,34 @@
+"""Macros of the pages: tables of measurements, and the settings with their help."""
+
+import csv
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).parent / "measurements"
+
+
+def measured(name: str) -> str:
+    """A table from measurements/, under the command that makes it: the file's first line, `# command`; then come the names."""
+    command, *lines = (FOLDER / f"{name}.csv").read_text().splitlines()
+    head, *rows = ([cell.replace("|", "\\|") for cell in row] for row in csv.reader(lines))
+    rule = ["--:" if k and rows[0][k][:1].isdigit() else "---" for k in range(len(head))]
+    body = "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
+    return f"`{command.removeprefix('# ')}` ([{name}.csv]({name}.csv))\n\n{body}\n"
+
+
+def settings() -> str:
+    """The fields of `jaxhf.Settings`: they describe themselves where Python runs, which the API's pages do without."""
+    from jaxhf.core.settings import Settings
+
+    lines = []
+    for knob in dataclasses.fields(Settings):
+        none = f"; None: {knob.metadata['none']}" if "none" in knob.metadata else ""
+        lines.append(f"- **`{knob.name}`** (default: `{knob.default!r}`): {knob.metadata['help']}{none}.")
+    return "\n".join(lines)
+
+
+def define_env(env: Any) -> None:
+    """Called by the site's builder."""
+    env.macro(measured)
+    env.macro(settings)

@@ -1,0 +1,160 @@
+"""What the documents say is so: each page's blocks run, in the reader's own configuration, and the site builds strictly."""
+
+import doctest
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from unittest import SkipTest
+
+import jax
+import pytest
+from sybil import Document, Example, Region, Sybil
+from sybil.evaluators.python import PythonEvaluator
+from sybil.parsers.markdown import SkipParser
+from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
+
+import jaxhf
+from jaxhf.cli.main import main
+from jaxhf.io.toml.fit import load_case
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+LONG = {"docs/gallery.md", "docs/tutorials/photographs.md"}  # over a minute
+FOREIGN = {"gdaldem", "gdalinfo", "gdal_translate"}  # programs that may not be here
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+
+def blocks(language: str, evaluate: Callable[[Example], None]) -> Callable[[Document], Iterator[Region]]:
+    """A parser of fenced blocks in one language, which may have a title: the name of a file."""
+    lexer = RawFencedCodeBlockLexer(re.compile(rf'{language}(?: title="(?P<title>[^"\n]+)")?$\n', re.MULTILINE))
+
+    def parse(document: Document) -> Iterator[Region]:
+        for region in lexer(document):
+            yield Region(region.start, region.end, (region.lexemes or {})["source"], evaluate, region.lexemes)
+
+    return parse
+
+
+def shell(example: Example) -> None:
+    """Runs the lines of a block one by one: jaxhf's and Python's in this process, what installs only as far as its names."""
+    for line in example.parsed.replace("\\\n", " ").splitlines():
+        program, *arguments = shlex.split(line, comments=True) or [""]
+        if program == "jaxhf":
+            assert main(arguments) == 0, line
+        elif (program, arguments[:1]) == ("python", ["-c"]):
+            exec(arguments[1], {})
+        elif (program, arguments[:2]) == ("python", ["-m", "venv"]):
+            pass  # as below: tests/test_release.py installs
+        elif program == "pip":
+            assert set(re.findall(r"\w+", "".join(re.findall(r"\[(.*?)\]", line)))) <= EXTRAS.keys(), line
+        elif program in FOREIGN:
+            if shutil.which(program):
+                subprocess.run([program, *arguments], check=True, capture_output=True)
+        else:
+            assert program in ("", "source"), f"{example.path}:{example.line}: {line}"
+
+
+def toml(example: Example) -> None:
+    """Reads a scene, or what to fit; a block with a title is also written to that file, a part of a scene only parsed."""
+    tables = tomllib.loads(example.parsed)
+    path = Path((example.region.lexemes or {})["title"] or "untitled.toml")
+    path.write_text(example.parsed)
+    if "pictures" in tables:
+        load_case(path)
+    elif "objects" in tables and "camera" in tables:
+        jaxhf.load_scene(path)
+
+
+SYBIL = Sybil([blocks("python", PythonEvaluator()), blocks("sh", shell), blocks("toml", toml), SkipParser()])
+
+
+@pytest.fixture
+def reader(request, tmp_path, monkeypatch) -> Iterator[None]:
+    """A folder that holds nothing but `scenes`, and JAX as it begins; short pages compile sooner, to slower programs."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)  # this process is set up
+    shutil.copytree(ROOT / "scenes", "scenes")
+    jax.config.update("jax_disable_most_optimizations", request.node.get_closest_marker("slow") is None)
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] if name in LONG else []) for name in NAMES])
+def test_blocks_run(name, reader):
+    """One after the other, in one namespace. `<!-- skip: next if(...) -->` leaves out what needs another renderer."""
+    document = SYBIL.parse(ROOT / name)
+    document.namespace["installed"] = lambda module: find_spec(module) is not None
+    for example in document.examples():
+        try:
+            example.evaluate()
+        except SkipTest as reason:
+            print(f"{name}:{example.line}: skipped, {reason}")
+
+
+def test_docstrings_have_examples_that_run(reader):
+    """Blocks and prompts in docstrings, if there are any."""
+    for path in (ROOT / "jaxhf").rglob("*.py"):
+        text = path.read_text()
+        assert "```" not in text, f"{path}: examples in docstrings stand after >>>"
+        if ">>>" in text:
+            failed, _ = doctest.testmod(import_module(".".join(path.relative_to(ROOT).with_suffix("").parts)))
+            assert not failed, path
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_pages_are_easy_to_read(name):
+    """Lines that fit, blocks in languages that are run, short tables outside of the measurements."""
+    text = (ROOT / name).read_text()
+    assert not [line for line in text.splitlines() if len(line) > 120]
+    assert not re.search(r"^[^\s|#*>-](?!\. ).*\n- ", text, re.MULTILINE), "a list needs an empty line before it"
+    fences = re.findall(r"^```(.*)\n(?:.*\n)*?```$", text, re.MULTILINE)
+    assert {fence.split(" ")[0] for fence in fences} <= {"python", "sh", "toml", "text"}
+    if "/measurements/" not in name:
+        assert "measured(" not in text
+        assert all(table.count("\n") <= 14 for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE))
+
+
+def test_readme_fits_two_screens():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 100
+
+
+def test_pictures_are_small():
+    sizes = {path: path.stat().st_size for path in DOCS.rglob("*") if path.suffix in (".png", ".jpg", ".gif", ".svg")}
+    assert not {path: size for path, size in sizes.items() if size > 250_000}
+    assert sum(sizes.values()) < 3_500_000
+
+
+def test_tables_have_their_rows():
+    """Each CSV file of measurements says by what command it was made, is as wide as its head, and stands on a page."""
+    pages = "".join(path.read_text() for path in (DOCS / "measurements").glob("*.md"))
+    for path in (DOCS / "measurements").glob("*.csv"):
+        assert path.read_text().startswith("# "), path
+        assert f'measured("{path.stem}")' in pages, path
+
+
+@pytest.mark.skipif(find_spec("zensical") is None, reason="the site's builder, the extra docs, is not installed")
+def test_site_builds_strictly_and_needs_no_other(tmp_path):
+    shutil.copytree(DOCS, tmp_path / "docs")
+    shutil.copy(ROOT / "zensical.toml", tmp_path)
+    (tmp_path / "jaxhf").symlink_to(ROOT / "jaxhf")
+    build = [sys.executable, "-m", "zensical", "build", "--strict"]
+    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout + done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert len(pages) > 30
+    for page in pages:
+        text = page.read_text()
+        assert not re.search(r'(?:src="|<link[^>]+href="|@import )(?:https?:)?//', text), page
+        assert "{{" not in re.sub(r"<(code|pre).*?</\1>", "", text, flags=re.DOTALL), page
+    assert (tmp_path / "site" / "api" / "render.html").read_text().count('class="doc doc-heading"') >= 5
