@@ -537,7 +537,7 @@ z = 2
     assert max(found.values()) == 20
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "scene-files.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "guides" / "scene-files.md").read_text(encoding="utf-8")
 
 
 def words(table):
@@ -555,9 +555,3 @@ TABLES = {name: set(words(t)) for name, t in vars(tables).items() if name.isuppe
 def test_the_page_on_scene_files_explains_every_key(word):
     assert {"SCENE", "CAMERAS", "HEIGHTS", "OBJECT"} <= TABLES.keys()
     assert re.search(rf"^\|.*`{word}`.*\|", PAGE, re.MULTILINE)
-
-
-def test_the_example_on_that_page_is_read(tmp_path):
-    (example,) = re.findall(r"^```toml\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
-    scene = read(tmp_path, example)
-    assert len(scene.objects) == len(scene.lights) == 2
