@@ -19,6 +19,15 @@ def greater(a: Scalar, b: Scalar) -> Scalar:
     return jnp.where(a > b, a, b)
 
 
+def within(x: Scalar, least: Scalar | float, most: Scalar | float) -> Scalar:
+    """`x`, or the bound that it is beyond.
+
+    The derivatives of `jnp.clip` and `jnp.maximum` ask which argument equals the result: where XLA computes an argument anew
+    and rounds it otherwise none does, and the derivative is zero.
+    """
+    return lesser(greater(x, jnp.asarray(least, x.dtype)), jnp.asarray(most, x.dtype))
+
+
 def largest_component(v: Vector) -> Scalar:
     """max |v_i|. Written out, as XLA on the CPU calls a library for a reduction, however short; nan is passed over."""
     return greater(greater(jnp.abs(v[0]), jnp.abs(v[1])), jnp.abs(v[2]))

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..core.types import AnyArray, Point2, Vector, float_leaf
+from ..core.vector import within
 
 
 def _texels(value: Any) -> Any:
@@ -44,7 +45,7 @@ class ImageTexture(eqx.Module):
         texels = jnp.asarray(self.texels)
         h, w, _ = texels.shape
         if self.at_vertices:
-            x, y = jnp.clip(uv[0], 0, 1) * (w - 1), jnp.clip(uv[1], 0, 1) * (h - 1)
+            x, y = within(uv[0], 0.0, 1.0) * (w - 1), within(uv[1], 0.0, 1.0) * (h - 1)
         else:
             x, y = uv[0] * w - 0.5, uv[1] * h - 0.5
         column, row = jnp.floor(x), jnp.floor(y)

@@ -12,7 +12,7 @@ from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, largest_component, unit
+from ..core.vector import dot, greater, largest_component, unit, within
 from ..scene.light import Directional, Point, Sky, Sun
 from ..trace.cylinder import Tube
 from ..trace.grid import Grid
@@ -58,7 +58,7 @@ def _seen_share(grid: Grid, sky: Float[jax.Array, "_ 3"], hit: Hit) -> Scalar:
     first, between, last = triangle_corners(sky, grid.shape[1], ix, iy, upper)
     u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
     on_first, on_last = jnp.where(upper, v, u), jnp.where(upper, u, v)
-    return jnp.maximum(dot(first + on_first * (between - first) + on_last * (last - between), hit.ns), 0)
+    return greater(dot(first + on_first * (between - first) + on_last * (last - between), hit.ns), jnp.zeros((), hit.t.dtype))
 
 
 def unshadowed_irradiance(world: World, light: Directional | Point, hit: Hit) -> Vector:
@@ -140,14 +140,14 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
         size = jnp.sqrt(level[0] * level[0] + level[1] * level[1])
         level = jnp.stack([*(level / size), jnp.zeros((), dtype)])
         middle = jnp.arctan2(wi[2], size)
-        bottom, top = (jnp.clip(middle + end, -_STEEPEST, _STEEPEST) for end in (-half, half))
+        bottom, top = (within(middle + end, -_STEEPEST, _STEEPEST) for end in (-half, half))
         lowest, highest = jnp.tan(bottom), jnp.tan(top)
-        slope = jnp.maximum(_own_slope(n, level, jnp.tan(jnp.clip(middle, -_STEEPEST, _STEEPEST))), lowest)
+        slope = greater(_own_slope(n, level, jnp.tan(within(middle, -_STEEPEST, _STEEPEST))), lowest)
         for number, surface in enumerate(world.surfaces):
             if world.settings.shadows and isinstance(surface, Grid):
                 slope, more = skyline_slope(surface, number, hit.p, level, hit, lit, (slope, highest), world.settings.max_steps)
                 exhausted = exhausted + more.astype(jnp.int32)
-        horizon = jnp.clip(jnp.arctan(slope), bottom, top)
+        horizon = within(jnp.arctan(slope), bottom, top)
         weight = 2 * node[1] * node[1] / (_CHORDS + 1) * ((top - horizon) / (top - bottom))
         weight = jnp.where(lit, weight, 0)
         height = (horizon + top) / 2

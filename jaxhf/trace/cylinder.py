@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from ..core.affine import Affine
 from ..core.ray import Ray
 from ..core.types import Flag, Scalar
-from ..core.vector import dot, largest_component, unit
+from ..core.vector import dot, largest_component, lesser, unit
 from ..scene.cylinder import Cylinder
 from .hit import Hit, orthogonal_tangents
 from .status import Status
@@ -57,7 +57,7 @@ def tube_distance(tube: Tube, ray: Ray, left: Flag | None) -> tuple[Scalar, Flag
         return real & (t > 0) & jnp.isfinite(t) & (z >= tube.z_min) & (z <= tube.z_max)
 
     one_reached, two_reached = reached(one), reached(two)
-    t = jnp.minimum(jnp.where(one_reached, one, jnp.inf), jnp.where(two_reached, two, jnp.inf))
+    t = lesser(jnp.where(one_reached, one, jnp.inf), jnp.where(two_reached, two, jnp.inf))
     found = one_reached | two_reached
     return jnp.where(found, t, 0), found
 

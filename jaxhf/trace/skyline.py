@@ -59,7 +59,7 @@ def skyline_slope(
     lowest, highest = between
     fixed = lax.stop_gradient((grid, Ray(o, local), level, leaving, lowest, highest, rise))
     edge, exhausted = stored(materialise(_highest_edge(*fixed, number, active, max_steps)))
-    return jnp.maximum(_slope_to(grid, o, level, edge), lowest), exhausted
+    return greater(_slope_to(grid, o, level, edge), lowest), exhausted
 
 
 def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index) -> Scalar:
