@@ -120,7 +120,8 @@ def vertices_by_heights(slopes: Float[np.ndarray, "9 vertices m"], scene: Scene)
       slopes: `vertex_slopes`.
       scene: whose grids they are.
     """
-    shapes = [obj.shape.heights.shape for obj in scene.objects if isinstance(obj.shape, Heightfield)]
+    # Of several pictures, where that differs from one to the other, heights have an axis for them.
+    shapes = [obj.shape.heights.shape[-2:] for obj in scene.objects if isinstance(obj.shape, Heightfield)]
     shape = scene.heightfields[0].heights.shape
     numbers, (ny, nx) = slopes.shape[2], shape
     rows, columns, values, first = [], [], [], 0
