@@ -82,7 +82,7 @@ def make(
 
     path = require_writable_raster(options.output)
     if numbers and path.suffix.lower() == ".png":
-        raise UserError(f"{path}: a {kind} is in numbers that .png cannot hold; write .tif or .npy")
+        raise UserError(f"{path}: .png cannot hold the numbers of the {kind}; write .tif or .npy")
     begin = time.perf_counter()
     terrain = read_terrain(options.terrain, nodata=options.nodata)
     values = draw(terrain)

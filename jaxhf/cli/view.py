@@ -51,7 +51,7 @@ def add(commands: Any) -> None:
     light.add_argument("--altitude", type=float, default=35.0, metavar="DEGREES", help="of the sun, above the horizon [35]")
     light.add_argument(
         "--sun-from", type=_sun, metavar="AZ,ALT|TIME",
-        help="a film of a moving sun: where it begins, or when, as in 2026-06-21T06:00:00Z",
+        help="a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00",
     )  # fmt: skip
     light.add_argument("--sun-to", type=_sun, metavar="AZ,ALT|TIME", help="and where it ends, or when")
     for name in ("latitude", "longitude"):
@@ -88,7 +88,7 @@ def _sun(text: str) -> tuple[float, float] | datetime.datetime:
     except ValueError:
         time = None
     if time is None or time.tzinfo is None:
-        rule = "must be an azimuth and an altitude, as 90,10, or a time with its offset from UTC, as 2026-06-21T06:00:00Z"
+        rule = "must be an azimuth and an altitude, as 90,10, or a time with its offset from UTC, as 2026-06-21T07:00-05:00"
         raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
     return time
 
@@ -117,7 +117,7 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
     if not (altitude > 0).all():
         low = int(np.argmin(altitude))
         when = instants[low].astype("datetime64[s]")
-        raise UserError(f"view: the sun must be up all the time, its altitude is {altitude[low]:.2f} degrees at {when}Z")
+        raise UserError(f"view: the sun must be up all the time, its altitude is {altitude[low]:.2f} degrees at {when}Z (UTC)")
     return np.stack([azimuth, altitude], -1)
 
 

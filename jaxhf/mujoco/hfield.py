@@ -49,7 +49,7 @@ class HField(eqx.Module):
         if isinstance(self.size, np.ndarray) and not (self.size > 0).all():
             raise ArgumentError("HField", "size", f"must be positive, it is {self.size.tolist()}")
         if isinstance(self.quat, np.ndarray) and not np.abs(self.quat).max(-1).all():
-            raise ArgumentError("HField", "quat", "must not be zero, it is")
+            raise ArgumentError("HField", "quat", "must not be zero, it is (0, 0, 0, 0)")
         self.upright = not isinstance(self.quat, Tracer) and not np.asarray(self.quat)[..., 1:3].any()
 
     def _numbers(self, name: str, value: Any, length: int) -> Any:
@@ -84,9 +84,11 @@ class HField(eqx.Module):
             try:
                 geom = int(model.geom(geom).id)
             except (KeyError, AttributeError) as error:  # MJX's model has no names
-                rule = f"must be a geom's number, or its name in a mujoco.MjModel; it is {name!r}"
+                rule = f"must be a geom's number, or its name in a mujoco.MjModel; no geom there is named {name!r}"
                 raise ArgumentError("HField.from_model", "geom", rule) from error
-        if not 0 <= geom < model.ngeom or int(model.geom_type[geom]) != _MJGEOM_HFIELD:
+        if not 0 <= geom < model.ngeom:
+            raise ArgumentError("HField.from_model", "geom", f"must be a number from 0 to {model.ngeom - 1}, it is {name!r}")
+        if int(model.geom_type[geom]) != _MJGEOM_HFIELD:
             raise ArgumentError("HField.from_model", "geom", f"must be a height field, {name!r} is none")
         number = int(model.geom_dataid[geom])
         nrow, ncol, first = (int(array[number]) for array in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))

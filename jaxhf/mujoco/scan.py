@@ -40,7 +40,7 @@ class Scan(eqx.Module):
 
     @property
     def heights(self) -> Float[jax.Array, "*rays"]:
-        """z of what was met, in the world."""
+        """z of what was met, in the world; of the ray's start where nothing was, see `mask`."""
         return self.p[..., 2]
 
 
@@ -97,12 +97,15 @@ def poses_for(owner: str, hfields: HField, pos: Any, quat: Any) -> tuple[jax.Arr
     """Positions (..., 3) and orientations (..., 4) of robots in the precision of the height fields, whose axes they begin with.
 
     Raises:
-      ValueError: their shapes are others; `owner` is who says so.
+      ValueError: their shapes are others, or an orientation given as plain numbers is zero; `owner` is who says so.
     """
+    if not isinstance(quat, jax.Array) and not np.any(quat, axis=-1).all():
+        raise ArgumentError(owner, "quat", "must not be zero, one is (0, 0, 0, 0)")
     pos, quat, batch = jnp.asarray(pos, hfields.data.dtype), jnp.asarray(quat, hfields.data.dtype), hfields.batch
     for name, value, length in (("pos", pos, 3), ("quat", quat, 4)):
         if value.shape != (*pos.shape[:-1], length) or value.shape[: len(batch)] != batch or value.ndim <= len(batch):
-            wanted = ", ".join(map(str, (*batch, "...", length)))
+            fits = name == "quat" and pos.ndim > len(batch)
+            wanted = ", ".join(map(str, (*pos.shape[:-1], length) if fits else (*batch, "...", length)))
             raise ArgumentError(owner, name, f"must have shape ({wanted}), pos and quat alike, its shape is {value.shape}")
     return pos, quat
 

@@ -105,7 +105,7 @@ def test_maps_and_conversions_do_without_jax(tmp_path):
         (["hillshade", "--altitude", "0"], "hillshade: altitude must be above 0 and at most 90 degrees, it is 0.0"),
         (["hillshade", "--scale", "-1"], "hillshade: scale must be positive and finite, it is -1.0"),
         (["slope", "--dx", "0"], "slope: dx must be positive and finite, it is 0.0"),
-        (["slope", "-o", "map.png"], "a slope is in numbers that .png cannot hold; write .tif or .npy"),
+        (["slope", "-o", "map.png"], ".png cannot hold the numbers of the slope; write .tif or .npy"),
         (["aspect", "-o", "map.exr"], "cannot write a map with the ending '.exr'"),
         (
             ["relief", "--ramp", "terain"],

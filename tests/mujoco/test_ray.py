@@ -90,5 +90,9 @@ def test_says_what_is_wrong():
         HField(GROUND, SIZE, quat=(1, 0, 0))
     with pytest.raises(ValueError, match="geom must be a height field, 0 is none"):
         HField.from_model(TILTED.model, 0)
+    with pytest.raises(ValueError, match=r"geom must be a number from 0 to \d+, it is 99"):
+        HField.from_model(TILTED.model, 99)
+    with pytest.raises(ValueError, match="no geom there is named 'none'"):
+        HField.from_model(TILTED.model, "none")
     with pytest.raises(ValueError, match="ray: pnt must begin with the axes"):
         ray(HField(np.stack([GROUND, GROUND]), SIZE), np.zeros(3), np.ones(3))

@@ -98,6 +98,10 @@ def test_says_what_is_wrong():
     pos, quat = robots(3)
     with pytest.raises(ValueError, match=r"height_scan: pos must have shape \(2, \.\.\., 3\)"):
         height_scan(FIELDS, pos[0], quat[0])
+    with pytest.raises(ValueError, match="quat must not be zero"):
+        height_scan(FIELDS, pos, np.zeros((*pos.shape[:-1], 4)))
+    with pytest.raises(ValueError, match=r"height_scan: quat must have shape \(2, 3, 4\).*, its shape is \(4,\)"):
+        height_scan(FIELDS, pos, (1, 0, 0, 0))
     with pytest.raises(ValueError, match="align must be one of yaw, base, world"):
         height_scan(FIELDS, pos, quat, align="roll")
     with pytest.raises(ValueError, match=r"pattern must have shape \(n, 2\)"):
