@@ -87,7 +87,10 @@ def walk() -> None:
         axis.add_patch(Rectangle((first, 0), last - first, top, fill=False, ec=BLUE, lw=1.4, ls="-" if skipped else "--"))
     axis.plot(x, z, color=INK, lw=1.2)
     axis.plot(x, z, "o", color=INK, ms=3)
-    at = lambda s: 4.9 - 0.235 * s  # noqa: E731
+
+    def at(s):
+        return 4.9 - 0.235 * s
+
     hit = np.array([10.33, at(10.33)])
     k = np.linspace(10, 11, 1001)
     k = k[np.argmin(abs(at(k) - np.interp(k, x, z)))]
@@ -109,12 +112,17 @@ def walk() -> None:
 def boundary() -> None:
     figure, axes = plt.subplots(1, 2, figsize=(9, 2.7))
     x = np.linspace(0, 10, 500)
-    smooth = lambda s: 0.55 + 0.18 * np.sin(0.9 * x + s)  # noqa: E731
+
+    def smooth(s):
+        return 0.55 + 0.18 * np.sin(0.9 * x + s)
+
+    def step(edge):
+        return np.where(x < edge, 0.85, 0.15)
+
     left, right = axes
     left.plot(x, smooth(0), color=INK)
     left.plot(x, smooth(0.4), color=RED, ls="--")
     left.set_title("inside: shading changes everywhere, a little", fontsize=11)
-    step = lambda edge: np.where(x < edge, 0.85, 0.15)  # noqa: E731
     right.plot(x, step(5), color=INK)
     right.plot(x, step(5.9), color=RED, ls="--")
     right.fill_between(x, 0.15, 0.85, where=(x > 5) & (x < 5.9), color=RED, alpha=0.2, lw=0)

@@ -23,6 +23,7 @@ from .normal_matrix import NormalMatrix, is_sparse
 from .problem import Problem
 from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import influence_function, robust_weight
+from .solvers import count_unknowns
 from .view import KNOWN
 
 _INNER_TOLERANCE = 1e-6
@@ -72,10 +73,7 @@ def standard_deviations(
     begin = time.perf_counter()
     try:
         while drawn < count:
-            if matrix is None:
-                draw = np.asarray(_draw(unknowns, problem, jax.random.key(drawn), 5 * inner_steps), np.float64)
-            else:
-                draw = matrix.draw(drawn)
+            draw = _draw_by_lsmr(unknowns, problem, drawn, 5 * inner_steps) if matrix is None else matrix.draw(drawn)
             total, drawn = total + draw * draw, drawn + 1
             if report is not None:
                 seconds = time.perf_counter() - begin
@@ -111,7 +109,7 @@ def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tu
 
 def require_small(unknowns: Unknowns, problem: Problem) -> None:
     """Raises ValueError where "exact" would make a matrix above `EXACT_UNKNOWNS` or `EXACT_ENTRIES`."""
-    count = sum(leaf.size for leaf in jax.tree.leaves(unknowns))
+    count = count_unknowns(unknowns)
     if unknowns.albedo is None and all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
         if count > EXACT_UNKNOWNS:
             rule = f"'exact' takes at most {EXACT_UNKNOWNS} unknowns, there are {count}; give a number of samples"
@@ -141,6 +139,10 @@ def _operator(unknowns: Unknowns, problem: Problem) -> tuple[lx.AbstractLinearOp
 
     operator = lx.FunctionLinearOperator(product, jax.eval_shape(lambda: unknowns))
     return operator, operator.out_structure()
+
+
+def _draw_by_lsmr(unknowns: Unknowns, problem: Problem, seed: int, steps: int) -> Float[np.ndarray, "ny nx"]:
+    return np.asarray(_draw(unknowns, problem, jax.random.key(seed), steps), np.float64)
 
 
 @eqx.filter_jit

@@ -124,9 +124,11 @@ def test_matrix_is_the_derivative_of_render(which, settings, channels, derivativ
 
     @jax.jit
     def vertices(heights):
-        here = localise(scene)
-        change = lambda new: eqx.tree_at(lambda scene: scene.heightfields[0].heights, here, new)  # noqa: E731
-        return vertex_slopes(lambda new: vertex_values(make_world(change(new), settings)), heights)
+        def values(new):
+            changed = eqx.tree_at(lambda scene: scene.heightfields[0].heights, localise(scene), new)
+            return vertex_values(make_world(changed, settings))
+
+        return vertex_slopes(values, heights)
 
     of_heights = vertices_by_heights(np.nan_to_num(vertices(heights[0])), scene)
     one = jax.tree.map(lambda leaf: leaf[0], linear)
