@@ -7,6 +7,7 @@ import threading
 from typing import Any
 
 _AGAIN = 0.01  # seconds
+_waiting: threading.Timer | None = None
 
 
 def end_at_once() -> None:
@@ -33,10 +34,14 @@ def _end(*_: object) -> None:
 
 def _raise_again(unraisable: Any) -> None:
     """For `sys.unraisablehook`: what a callback of the garbage collector or a finaliser raises, Python drops."""
+    global _waiting
     if unraisable.exc_type is KeyboardInterrupt:
+        if _waiting is not None and _waiting.is_alive():  # one for several: the next could meet what the first has begun to end
+            return
         main = threading.main_thread().ident
         assert main is not None
         # Now it would be dropped once more. Sent to the thread it also ends a wait for another process.
-        threading.Timer(_AGAIN, signal.pthread_kill, (main, signal.SIGINT)).start()
+        _waiting = threading.Timer(_AGAIN, signal.pthread_kill, (main, signal.SIGINT))
+        _waiting.start()
     else:
         sys.__unraisablehook__(unraisable)
