@@ -12,7 +12,8 @@ from .kept import Kept
 
 _OPTIONS = {
     # XLA's older emitters of fused loops for the CPU. The newer ones go through MLIR: frames then compile for 1.7 times as
-    # long, and do not run faster. The steps of a fit, however, take 1.4 times as long with these.
+    # long, and do not run faster. The steps of a fit, however, take 1.4 times as long with these. From jaxlib 0.12 on there
+    # are only the newer ones.
     "xla_cpu_use_fusion_emitters": False,
     # Where the processor has AVX-512: else XLA takes half of it, and frames 1.25 times as long, gradients 1.1.
     "xla_cpu_prefer_vector_width": 512,
@@ -37,14 +38,19 @@ def is_traced() -> bool:
 def compiler_options(newer: bool = False) -> dict[str, Any] | None:
     """What `jax.jit` takes as `compiler_options`, so that a program of jaxhf's compiles in less time.
 
-    Or, `newer`, so that it runs in less; see `compiled`. None where XLA knows no such option.
+    Or, `newer`, so that it runs in less; see `compiled`. Options that this version of XLA does not know are left out; None
+    where no other is left.
     """
     options = {"xla_cpu_use_fusion_emitters": True} if newer else _OPTIONS
+    return {name: value for name, value in options.items() if _is_known({name: value})} or None
+
+
+def _is_known(option: dict[str, Any]) -> bool:
     try:
-        _untraced(jax.jit(lambda: (), compiler_options=options))
+        _untraced(jax.jit(lambda: (), compiler_options=option))
     except jax.errors.JaxRuntimeError:
-        return None
-    return options
+        return False
+    return True
 
 
 def compiled(

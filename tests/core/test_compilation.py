@@ -6,6 +6,7 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxhf.core import compilation
 from jaxhf.core.compilation import compiled, compiler_options
@@ -30,11 +31,12 @@ def test_options_are_used_at_the_top_level_alone():
     assert compiler_options() is not None
 
 
-def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+@pytest.mark.parametrize("others", [{}, {"xla_cpu_prefer_vector_width": 512}])
+def test_an_option_that_xla_does_not_know_is_left_out(others, monkeypatch):
     compiler_options.cache_clear()
-    monkeypatch.setattr(compilation, "_OPTIONS", {"xla_cpu_no_such_option": False})
+    monkeypatch.setattr(compilation, "_OPTIONS", {"xla_cpu_no_such_option": False, **others})
     try:
-        assert compiler_options() is None
+        assert compiler_options() == (others or None)
         assert compiled(lambda x: 2 * x)(1.0) == 2
     finally:
         compiler_options.cache_clear()

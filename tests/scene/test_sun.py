@@ -63,7 +63,7 @@ def test_light_by_date_and_place():
             "sun: time must have a time zone, as 2026-06-21T12:00:00Z has, it",
         ),
         (lambda: jaxhf.sun("2026-06-21", 0, 0), "sun: time must be a datetime or datetime64, it is str"),
-        (lambda: jaxhf.sun(np.datetime64("NaT"), 0, 0), "sun: time must be a time, it is NaT"),
+        (lambda: jaxhf.sun(np.datetime64("NaT", "s"), 0, 0), "sun: time must be a time, it is NaT"),
         (lambda: jaxhf.sun(NOON, 91, 0), "sun: latitude must lie between -90 and 90 degrees, it is 91"),
         (lambda: jaxhf.sun(NOON, np.nan, 0), "sun: latitude must be finite, it is nan"),
         (
