@@ -12,7 +12,7 @@ from .kept import Kept
 
 _OPTIONS = {
     # XLA's older emitters of fused loops for the CPU. The newer ones go through MLIR: frames then compile for 1.7 times as
-    # long, and do not run faster. The steps of a fit, however, take 1.4 times as long with these. From jaxlib 0.12 on there
+    # long, and do not run faster. The steps of a fit, however, take 1.4 times as long with these. From jaxlib 0.11 on there
     # are only the newer ones.
     "xla_cpu_use_fusion_emitters": False,
     # Where the processor has AVX-512: else XLA takes half of it, and frames 1.25 times as long, gradients 1.1.
