@@ -21,6 +21,7 @@ from jaxhf.io.rasters import save_raster
 
 folder = pathlib.Path(sys.argv[1])
 rng = np.random.default_rng(0)
+wrong = []
 terrain, image = Terrain(rng.uniform(0, 60000, (100, 90)).astype("f4")), rng.random((100, 90, 3)).astype("f4")
 writers = {
     **{f"heights{e}": lambda path: save_heights(path, terrain) for e in (".npy", ".npz", ".tif", ".asc", ".png", ".exr")},
@@ -49,9 +50,10 @@ for name, write in writers.items():
             said = "nothing"
         resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         if str(path) not in said or "cannot be written" not in said:
-            print(name, share, "said", said)
+            wrong.append(f"{name}, {share}: said {said}")
         if path.read_bytes() != old or [p.name for p in folder.iterdir() if p.name.startswith(".")]:
-            print(name, share, "left a mess")
+            wrong.append(f"{name}, {share}: left a mess")
+sys.exit(", ".join(wrong) or None)
 """
 )
 
@@ -80,7 +82,8 @@ for k in range(8):
     os.waitpid(child, 0)
     for name, contents in versions.items():
         if (folder / name).read_bytes() not in contents:
-            print(name, "is neither the old nor the new one")
+            wrong.append(f"{name} is neither the old nor the new one")
+sys.exit(", ".join(wrong) or None)
 """
 )
 
@@ -88,4 +91,4 @@ for k in range(8):
 @pytest.mark.parametrize("script", [FULL, KILLED], ids=["full", "killed"])
 def test_the_old_file_stays_or_the_whole_new_one_is_there(tmp_path, script):
     run = subprocess.run([sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True)
-    assert (run.stdout, run.stderr, run.returncode) == ("", "", 0)
+    assert run.returncode == 0, run.stderr  # newer OpenEXR prints what it finds in a file that is cut off
