@@ -158,5 +158,6 @@ def test_site_builds_strictly_and_needs_no_other(tmp_path):
     for page in pages:
         text = page.read_text()
         assert not re.search(r'(?:src="|<link[^>]+href="|@import )(?:https?:)?//', text), page
+        assert not re.search("&(reg|copy|trade);|[©®™]", text), f"{page}: (c), (r) and (tm) stand between backquotes"
         assert "{{" not in re.sub(r"<(code|pre).*?</\1>", "", text, flags=re.DOTALL), page
     assert (tmp_path / "site" / "api" / "render.html").read_text().count('class="doc doc-heading"') >= 5
