@@ -13,8 +13,13 @@ from pathlib import Path
 
 from PIL import Image, ImageSequence
 
+from jaxhf.core.machine import available_bytes
+
 DOCS = Path(__file__).resolve().parent
 MOST = 250_000  # bytes of one picture
+BLOCKS = re.compile(  # as the tests read them: a condition and a reason to leave the block out, its language, title and lines
+    r'(?:<!-- skip: next if\((.*), reason="(.*)"\) -->\n\n)?^```(\w+)(?: title="([^"\n]*)")?\n((?:.*\n)*?)```', re.MULTILINE
+)
 
 
 def keep(path: Path) -> None:
@@ -38,17 +43,17 @@ def keep(path: Path) -> None:
 def main(wanted: list[str]) -> None:
     page = (DOCS / "gallery.md").read_text()
     shell = {"check": True, "shell": True}
-    namespace: dict[str, object] = {}
+    namespace: dict[str, object] = {"available_bytes": available_bytes}
     with tempfile.TemporaryDirectory() as folder, chdir(folder):
         shutil.copytree(DOCS.parent / "scenes", "scenes")
         for section in re.split(r"^## ", page, flags=re.MULTILINE):
             name = re.search(r"images/gallery/(\w+)\.", section)
             if wanted and name and name[1] not in wanted:
                 continue
-            for language, title, block in re.findall(
-                r'^```(\w+)(?: title="([^"\n]*)")?\n(.*?)^```', section, re.MULTILINE | re.DOTALL
-            ):
-                if language == "sh":
+            for condition, reason, language, title, block in BLOCKS.findall(section):
+                if condition and eval(condition, namespace):
+                    print(f"{name[1] if name else ''}: left as it is, {reason}")
+                elif language == "sh":
                     subprocess.run(block, **shell)
                 elif language == "toml":
                     Path(title).write_text(block)

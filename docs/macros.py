@@ -1,7 +1,8 @@
-"""Macros of the pages: tables of measurements, and the settings with their help."""
+"""Macros of the pages: tables of measurements, notebooks as they were run, and the settings with their help."""
 
 import csv
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,22 @@ def measured(name: str) -> str:
     rule = ["--:" if k and rows[0][k][:1].isdigit() else "---" for k in range(len(head))]
     body = "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
     return f"`{command.removeprefix('# ')}` ([{name}.csv]({name}.csv))\n\n{body}\n"
+
+
+def notebook(name: str) -> str:
+    """A notebook with what it printed and its pictures; links to pages of docs/ lead to those of the site."""
+    parts = []
+    for cell in json.loads((FOLDER.parents[1] / "notebooks" / f"{name}.ipynb").read_text())["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(text.replace("](../docs/", "](../").replace(".ipynb)", ".md)"))
+            continue
+        parts.append(f"```python\n{text}\n```")
+        printed = "".join("".join(output.get("text", "")) for output in cell["outputs"])
+        pictures = (output.get("data", {}).get("image/png") for output in cell["outputs"])
+        parts += [f'<img alt="" src="data:image/png;base64,{"".join(picture).strip()}">' for picture in pictures if picture]
+        parts += [f"```text\n{printed.strip()}\n```"] if printed.strip() else []
+    return "\n\n".join(parts)
 
 
 def settings() -> str:
@@ -31,4 +48,5 @@ def settings() -> str:
 def define_env(env: Any) -> None:
     """Called by the site's builder."""
     env.macro(measured)
+    env.macro(notebook)
     env.macro(settings)

@@ -22,6 +22,7 @@ from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 
 import jaxhf
 from jaxhf.cli.main import main
+from jaxhf.core.machine import available_bytes
 from jaxhf.io.toml.fit import load_case
 
 ROOT = Path(__file__).parents[1]
@@ -94,7 +95,7 @@ def reader(request, tmp_path, monkeypatch) -> Iterator[None]:
 def test_blocks_run(name, reader):
     """One after the other, in one namespace. `<!-- skip: next if(...) -->` leaves out what needs another renderer."""
     document = SYBIL.parse(ROOT / name)
-    document.namespace["installed"] = lambda module: find_spec(module) is not None
+    document.namespace |= {"installed": lambda module: find_spec(module) is not None, "available_bytes": available_bytes}
     for example in document.examples():
         try:
             example.evaluate()
@@ -146,6 +147,7 @@ def test_tables_have_their_rows():
 @pytest.mark.skipif(find_spec("zensical") is None, reason="the site's builder, the extra docs, is not installed")
 def test_site_builds_strictly_and_needs_no_other(tmp_path):
     shutil.copytree(DOCS, tmp_path / "docs")
+    shutil.copytree(ROOT / "notebooks", tmp_path / "notebooks")
     shutil.copy(ROOT / "zensical.toml", tmp_path)
     (tmp_path / "jaxhf").symlink_to(ROOT / "jaxhf")
     build = [sys.executable, "-m", "zensical", "build", "--strict"]
@@ -156,5 +158,6 @@ def test_site_builds_strictly_and_needs_no_other(tmp_path):
     for page in pages:
         text = page.read_text()
         assert not re.search(r'(?:src="|<link[^>]+href="|@import )(?:https?:)?//', text), page
+        assert not re.search("&(reg|copy|trade);|[©®™]", text), f"{page}: (c), (r) and (tm) stand between backquotes"
         assert "{{" not in re.sub(r"<(code|pre).*?</\1>", "", text, flags=re.DOTALL), page
     assert (tmp_path / "site" / "api" / "render.html").read_text().count('class="doc doc-heading"') >= 5

@@ -132,7 +132,10 @@ class GuidingDistribution(eqx.Module):
 
 
 def make_distribution(weights: Float[jax.Array, " edges"], draws: Index) -> GuidingDistribution:
-    """The distribution in proportion to `weights`, in as many strata as there are draws; no positive weight becomes zero."""
+    """The distribution in proportion to `weights`, in as many strata as there are draws; no positive weight becomes zero.
+
+    Weights are rounded down to powers of two, so that single and double precision draw the same edges from the same key.
+    """
     count = weights.shape[0]
     if count >= _TOTAL_WEIGHT // 2:
         raise ArgumentError(
@@ -155,6 +158,8 @@ def refined_weights(
 
     Shrinks each edge's estimate towards the mean of its 8x8 block, and that towards the global mean, with one pseudo-count
     each; no weight becomes zero, so the estimator stays unbiased. Where nothing was found at all, the weights stay as they are.
+    The factor is the estimate's square root: in proportion to the estimate itself, edges of which the first round said little
+    would hold few points of large measure.
 
     Args:
       world: for `edge_sets`.

@@ -8,8 +8,9 @@ sampling, SIGGRAPH Asia 2018, equation 5; for shadows Zhang et al., Path-space d
 
 On a heightfield every boundary is the image of edges: of those that separate triangles facing the eye or a light from
 triangles facing away, where they stand; and of the latter's shadows. A point is drawn on such an edge and followed to its
-position x in the picture by plain arithmetic, which carries the derivative; all else is discrete or held constant.
-docs/concepts/boundary.md derives this.
+position x(s) in the picture by plain arithmetic, which carries the derivative; all else is discrete or held constant. n dl is
+dx/ds turned by a right angle, times ds, so the term is the mean over points of jump (turned dx/ds) . dx / density of s.
+docs/concepts/boundary.md has the whole.
 """
 
 import equinox as eqx

@@ -1,7 +1,8 @@
 """The boundary term of a picture's derivative: samples of moving boundaries, drawn and traced.
 
 And which pixels are to be sampled once more. Beside a silhouette the interior derivative is as large as one over a cosine, and
-at a shadow it ends: a few pixels hold nearly all of its error.
+at a shadow it ends: a few pixels hold nearly all of its error. They are chosen by the points on edges, which know nothing of
+the picture's samples: to look again where those are large, and to believe them where they are not, would be biased.
 """
 
 import functools

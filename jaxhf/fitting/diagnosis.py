@@ -165,7 +165,7 @@ def warnings(found: Findings) -> tuple[str, ...]:
     if found.scaled is not None and found.scaled > 1.05:
         said.append(
             f"the standard deviations allow for what is left unexplained: they are those of {found.scaled:.2g} times the noise "
-            "(M-estimator's covariance, Huber, Robust statistics, 1981, section 7.6; see docs/guides/fitting.md)"
+            "(M-estimator's covariance, Huber, Robust statistics, 1981, section 7.6; see docs/concepts/recovery.md)"
         )
     if found.draws is not None and found.draws[1] < found.draws[0]:
         said.append(

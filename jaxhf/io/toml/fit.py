@@ -1,4 +1,4 @@
-"""Reads what to recover from which pictures: a scene with tables about pictures; `docs/guides/fitting.md` describes it."""
+"""Reads what to recover from which pictures: a scene with tables about pictures; `docs/guides/fit-files.md` describes it."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
