@@ -19,6 +19,7 @@ from ..trace.triangle import plane_through
 from .hfield import HField
 from .pose import Quaternion, pose, rotation, yaw
 from .ray import first_met, one_axis, triangle_heights
+from .solid import ground
 
 Align = Literal["yaw", "base", "world"]
 
@@ -162,7 +163,7 @@ def _under(hfield: HField, start: _Start, place: Point2) -> Scan:
     iy = jnp.clip(jnp.ceil(lax.stop_gradient(y)).astype(jnp.int32) - 1, 0, nrow - 2)
     u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
     upper = v > u
-    corners = triangle_heights(hfield, ix, iy, upper)
+    corners = triangle_heights(ground(hfield), ix, iy, upper)
     a, b, c = plane_through(corners, upper)
     level = c + a * u + b * v
     inside = (jnp.abs(at[0]) <= size[0]) & (jnp.abs(at[1]) <= size[1])
