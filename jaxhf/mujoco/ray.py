@@ -20,14 +20,13 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import finite, unit
 from ..rendering.chunks import trace_batch
-from ..scene.heightfield import Heightfield
-from ..trace.grid import Grid, joined, make_grid
+from ..trace.grid import Grid, joined
 from ..trace.intersect import plane_distance, ray_in_grid
 from ..trace.search import first_triangle
 from ..trace.status import Status
 from ..trace.triangle import plane_through, triangle_corners
 from ..trace.walk import WalkResult
-from .hfield import HField
+from .hfield import HField, search_grid
 from .pose import pose
 from .solid import Ground, Side, base_faces, column, ground, walls
 
@@ -89,13 +88,16 @@ def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], 
 
 def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Met:
     """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them."""
-    return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, o, d)
+    return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, hfield._grid, o, d)
 
 
 @functools.partial(compiled, serial=True)
-def _first_met(data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, o: jax.Array, d: jax.Array) -> Met:
+def _first_met(
+    data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, grid: Grid | None, o: jax.Array, d: jax.Array
+) -> Met:
     """From the numbers alone: whether they stand upright makes no other program."""
-    axes, fields = o.shape[:-1], one_axis(HField(data, size, pos, quat))
+    hfield = eqx.tree_at(lambda hfield: hfield._grid, HField(data, size, pos, quat), grid, is_leaf=lambda leaf: leaf is None)
+    axes, fields = o.shape[:-1], one_axis(hfield)
     count = len(fields.data)
     rays = o.reshape(count, -1, 3), d.reshape(count, -1, 3)
     met = trace_batch(_ground, _joined, lambda ground, ray: _one(ground, Ray(ray[0], ray[1])), fields, rays, CHUNK)
@@ -109,8 +111,7 @@ def one_axis(hfield: HField) -> HField:
 
 
 def _ground(hfield: HField) -> tuple[Ground, Grid]:
-    """With the grid for the search alone: cells by cells by data."""
-    return ground(hfield), make_grid(Heightfield(lax.stop_gradient(hfield.data), 1.0, 1.0), None, None)
+    return ground(hfield), search_grid(hfield.data) if hfield._grid is None else lax.stop_gradient(hfield._grid)
 
 
 def _joined(ready: tuple[Ground, Grid]) -> tuple[Any, Any]:
