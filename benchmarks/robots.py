@@ -27,6 +27,7 @@ from jaxhf.mujoco import HField, grid_pattern, height_scan, ray
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 hfields: Any = importlib.import_module("hfields")
 KINDS, Reference, heights, rays, mujoco = hfields.KINDS, hfields.Reference, hfields.heights, hfields.rays, hfields.mujoco
+KINDS = *KINDS, *hfields.HELD_OUT
 
 # Rows, columns, size, and where: geom and body. The last two took no part while `ray` was made.
 CASES = {

@@ -18,7 +18,12 @@ from .maps.skyview import horizon as horizon, sky_view as sky_view
 from .maps.slope import aspect as aspect, slope as slope
 from .rendering.aovs import AOVS as AOVS
 from .rendering.cast import cast as cast
-from .rendering.render import Prepared as Prepared, prepare as prepare, render as render
+from .rendering.render import (
+    Prepared as Prepared,
+    PreparedHeightfield as PreparedHeightfield,
+    prepare as prepare,
+    render as render,
+)
 from .scene.camera import Orthographic as Orthographic, Perspective as Perspective
 from .scene.cylinder import Cylinder as Cylinder
 from .scene.heightfield import Heightfield as Heightfield

@@ -8,6 +8,7 @@ import numpy as np
 mujoco: Any = importlib.import_module("mujoco")  # its functions are unknown to type checkers
 
 SIZE = np.array([3.0, 5.0, 0.7, 0.2])
+HELD_OUT = ("buried", "beneath")  # took no part while `ray` was made
 KINDS = ("outside", "inside", "below", "vertical", "grazing", "walls", "edges")
 
 
@@ -26,7 +27,23 @@ def rays(kind: str, data: np.ndarray, size: np.ndarray, count: int, seed: int) -
     o = points({"inside": 1.0, "below": 1.0, "vertical": 1.1, "walls": 1.5}.get(kind, 3.0))
     d = points() - o
     every = np.arange(count)
-    if kind == "below":
+    if kind == "buried":  # within the solid, over the base's upper face or under it, to all sides
+        r, c = random.integers(0, nrow - 1, count), random.integers(0, ncol - 1, count)
+        u, v = random.uniform(size=(2, count))
+        corner, between, last = data[r, c], np.where(v > u, data[r + 1, c], data[r, c + 1]), data[r + 1, c + 1]
+        low, high = np.minimum(u, v), np.maximum(u, v)
+        roof = (corner + high * (between - corner) + low * (last - between)) * top
+        o = np.stack([rx * (2 * (c + u) / (ncol - 1) - 1), ry * (2 * (r + v) / (nrow - 1) - 1), roof], 1)
+        o[:, 2] = np.where(every % 2, roof * random.uniform(0.01, 0.99, count), -base * random.uniform(0.01, 0.99, count))
+        d = random.normal(size=(count, 3)) * [rx, ry, (top + base) * random.choice([0.1, 1, 10])]
+    elif kind == "beneath":  # from below the floor, beside the footprint too: at walls, at the floor and along its border
+        o = points(random.choice([0.5, 1.5]))
+        o[:, 2] = -base * random.uniform(1, 4, count)
+        end = points()
+        axis = random.integers(0, 2, count)
+        end[every, axis] = random.choice([-1, 1], count) * size[axis] * random.choice([1, 1 - 1e-3, 1 + 1e-3], count)
+        d = np.where((every % 3 == 0)[:, None], points() - o, end - o)
+    elif kind == "below":
         o[:, 2] = -base * random.uniform(1, 2, count)
     elif kind == "vertical":
         d = random.choice([-1, 1], (count, 1)) * random.uniform(0.1, 3, (count, 1)) * [[0, 0, 1]]

@@ -1,15 +1,21 @@
 """MuJoCo's height field: heights on a grid over a solid base, somewhere in the world."""
 
+import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.core import Tracer
 from jaxtyping import Float
 
+from ..core.compilation import compiled
 from ..core.errors import ArgumentError
 from ..core.types import AnyArray, float_leaf, require_finite
+from ..scene.heightfield import Heightfield
+from ..trace.grid import Grid, make_grid
 
 
 class HField(eqx.Module):
@@ -22,10 +28,15 @@ class HField(eqx.Module):
     A batch has leading axes; `size`, `pos` and `quat` may be given without them, for all alike. Nothing is compiled again for
     other numbers in the same shapes.
 
+    What breaks a rule below is a ValueError, but for numbers that `jit` traces: there a zero quat is the identity, as for
+    `mju_normalize4`, and other numbers stand as they are.
+
     Attributes:
       data: shape (..., nrow, ncol), at least 2x2, 0 to 1, row 0 at -y. Its dtype, float32 or float64, is the precision of rays.
+        MuJoCo's compiler brings what it reads from files and XML to 0 to 1; of what is written into `hfield_data` it loses
+        rays beyond.
       size: shape (..., 4): half of the extent in x and in y, the height of data = 1, the depth of the base; all positive.
-      pos, quat: where it stands in the world, shapes (..., 3) and (..., 4), quat as (w, x, y, z).
+      pos, quat: where it stands in the world, shapes (..., 3) and (..., 4), quat as (w, x, y, z), not zero, of any length.
       upright: whether `quat` was known to be a rotation about z when this was made. Rays straight down then need no search. One
         that is to be tilted must be made anew, as this is not looked at again.
     """
@@ -34,7 +45,8 @@ class HField(eqx.Module):
     size: Float[AnyArray, "*batch 4"]
     pos: Float[AnyArray, "*batch 3"]
     quat: Float[AnyArray, "*batch 4"]
-    upright: bool = eqx.field(static=True)
+    upright: bool = eqx.field(static=True, init=False)
+    _grid: Grid | None = eqx.field(init=False)
 
     def __init__(self, data: Any, size: Any, pos: Any = (0, 0, 0), quat: Any = (1, 0, 0, 0)):
         data = jnp.asarray(data)
@@ -42,14 +54,19 @@ class HField(eqx.Module):
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
             rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"
             raise ArgumentError("HField", "data", rule)
+        if not isinstance(data, Tracer):
+            low, high = np.min(np.asarray(self.data), initial=1), np.max(np.asarray(self.data), initial=0)
+            if not (low >= 0 and high <= 1):
+                raise ArgumentError("HField", "data", f"must lie from 0 to 1, it goes from {low:g} to {high:g}")
         self.size, self.pos, self.quat = (
             self._numbers(name, value, length)
             for name, value, length in (("size", size, 4), ("pos", pos, 3), ("quat", quat, 4))
         )
-        if isinstance(self.size, np.ndarray) and not (self.size > 0).all():
+        if not isinstance(self.size, Tracer) and not (np.asarray(self.size) > 0).all():
             raise ArgumentError("HField", "size", f"must be positive, it is {self.size.tolist()}")
-        if isinstance(self.quat, np.ndarray) and not np.abs(self.quat).max(-1).all():
+        if not isinstance(self.quat, Tracer) and not np.any(self.quat, axis=-1).all():
             raise ArgumentError("HField", "quat", "must not be zero, it is (0, 0, 0, 0)")
+        self._grid = None
         self.upright = not isinstance(self.quat, Tracer) and not np.asarray(self.quat)[..., 1:3].any()
 
     def _numbers(self, name: str, value: Any, length: int) -> Any:
@@ -67,6 +84,15 @@ class HField(eqx.Module):
     def batch(self) -> tuple[int, ...]:
         """The leading axes of a batch; () for one."""
         return self.data.shape[:-2]
+
+    def prepared(self) -> "HField":
+        """The same with bounds of the heights at hand, which rays that walk otherwise take anew in each call.
+
+        For many calls with the same heights: other ones need an HField of their own. Bounds take 5 times the memory of heights.
+        """
+        grids = _grids(self.data.reshape(-1, *self.data.shape[-2:]))
+        grids = jax.tree.map(lambda leaf: leaf.reshape(*self.batch, *leaf.shape[1:]), grids)
+        return eqx.tree_at(lambda field: field._grid, self, grids, is_leaf=lambda leaf: leaf is None)
 
     @classmethod
     def from_model(cls, model: Any, geom: int | str) -> "HField":
@@ -100,6 +126,16 @@ class HField(eqx.Module):
             pos, quat = np.array(model.body_pos[body]) + _rotated(parent, pos), _product(parent, quat)
             body = int(model.body_parentid[body])
         return cls(data, np.array(model.hfield_size[number], np.float64), pos, quat)
+
+
+def search_grid(data: Float[jax.Array, "nrow ncol"]) -> Grid:
+    """For the search of a triangle alone: cells by cells by data."""
+    return make_grid(Heightfield(lax.stop_gradient(data), 1.0, 1.0), None, None)
+
+
+@functools.partial(compiled, newer=True)
+def _grids(data: Float[jax.Array, "m nrow ncol"]) -> Grid:
+    return lax.map(search_grid, data)
 
 
 _MJGEOM_HFIELD = 1  # mjtGeom's number of a height field

@@ -12,7 +12,7 @@ Quaternion = Float[jax.Array, "4"]
 
 def rotation(quat: Quaternion) -> Float[jax.Array, "3 3"]:
     """The matrix of a quaternion; exactly the identity's rows and columns where a component is zero."""
-    w, x, y, z = quat / jnp.sqrt((quat * quat).sum())
+    w, x, y, z = _normalised(quat)
     xx, yy, zz = x * x, y * y, z * z
     rows = [
         [1 - 2 * (yy + zz), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -22,6 +22,13 @@ def rotation(quat: Quaternion) -> Float[jax.Array, "3 3"]:
     return jnp.stack([jnp.stack(row) for row in rows])
 
 
+def _normalised(quat: Quaternion) -> Quaternion:
+    """Of length 1; the identity for one shorter than 1e-15, as `mju_normalize4` has it."""
+    square = (quat * quat).sum()
+    short = square < 1e-30
+    return jnp.where(short, jnp.array([1, 0, 0, 0], quat.dtype), quat / jnp.sqrt(jnp.where(short, 1, square)))
+
+
 def pose(pos: Vector, quat: Quaternion) -> Affine:
     """world_from_local."""
     return Affine(rotation(quat), pos)
@@ -29,7 +36,7 @@ def pose(pos: Vector, quat: Quaternion) -> Affine:
 
 def yaw(quat: Quaternion) -> Quaternion:
     """The rotation about z alone that a rotation holds, of its angles yaw, pitch, roll (z-y'-x'')."""
-    w, x, y, z = quat / jnp.sqrt((quat * quat).sum())
+    w, x, y, z = _normalised(quat)
     half = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
     zero = jnp.zeros_like(half)
     return jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])

@@ -1,5 +1,6 @@
 """Where rays meet MuJoCo's height field, as `mj_ray` has it."""
 
+import functools
 import math
 from typing import Any
 
@@ -19,16 +20,15 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import finite, unit
 from ..rendering.chunks import trace_batch
-from ..scene.heightfield import Heightfield
-from ..trace.grid import Grid, make_grid
+from ..trace.grid import Grid, joined
 from ..trace.intersect import plane_distance, ray_in_grid
 from ..trace.search import first_triangle
 from ..trace.status import Status
-from ..trace.triangle import plane_through, triangle_vertices
+from ..trace.triangle import plane_through, triangle_corners
 from ..trace.walk import WalkResult
-from .hfield import HField
+from .hfield import HField, search_grid
 from .pose import pose
-from .solid import Side, base_faces, column, walls
+from .solid import Ground, Side, base_faces, column, ground, walls
 
 CHUNK = 1024  # rays traced together
 
@@ -88,22 +88,19 @@ def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], 
 
 def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Met:
     """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them."""
-    return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, o, d)
+    return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, hfield._grid, o, d)
 
 
-@compiled
-def _first_met(data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, o: jax.Array, d: jax.Array) -> Met:
+@functools.partial(compiled, serial=True)
+def _first_met(
+    data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, grid: Grid | None, o: jax.Array, d: jax.Array
+) -> Met:
     """From the numbers alone: whether they stand upright makes no other program."""
-    axes, fields = o.shape[:-1], one_axis(HField(data, size, pos, quat))
+    hfield = eqx.tree_at(lambda hfield: hfield._grid, HField(data, size, pos, quat), grid, is_leaf=lambda leaf: leaf is None)
+    axes, fields = o.shape[:-1], one_axis(hfield)
     count = len(fields.data)
     rays = o.reshape(count, -1, 3), d.reshape(count, -1, 3)
-    met = trace_batch(
-        lambda field: (field, _grid(field)),
-        lambda ready, ray: _one(ready[0], ready[1], Ray(ray[0], ray[1])),
-        fields,
-        rays,
-        CHUNK,
-    )
+    met = trace_batch(_ground, _joined, lambda ground, ray: _one(ground, Ray(ray[0], ray[1])), fields, rays, CHUNK)
     return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[2:]), met)
 
 
@@ -113,13 +110,22 @@ def one_axis(hfield: HField) -> HField:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, hfield.data.dtype).reshape(count, *leaf.shape[axes:]), hfield)
 
 
-def _grid(hfield: HField) -> Grid:
-    """For the search alone: cells by cells by data."""
-    return make_grid(Heightfield(lax.stop_gradient(hfield.data), 1.0, 1.0), None, None)
+def _ground(hfield: HField) -> tuple[Ground, Grid]:
+    return ground(hfield), search_grid(hfield.data) if hfield._grid is None else lax.stop_gradient(hfield._grid)
 
 
-def _one(hfield: HField, grid: Grid, ray: Ray) -> Met:
+def _joined(ready: tuple[Ground, Grid]) -> tuple[Any, Any]:
+    """See `trace_batch`."""
+    shared, own = joined(ready[1])
+    hfields = eqx.tree_at(lambda hfield: hfield.first, ready[0], own.first, is_leaf=lambda leaf: leaf is None)
+    rows = eqx.tree_at(lambda hfield: hfield.rows, jax.tree.map(lambda _: False, hfields), True)
+    common, apiece = eqx.partition(hfields, rows)
+    return (jax.tree.map(jnp.ravel, common), shared), (apiece, own)
+
+
+def _one(ready: tuple[Ground, Grid], ray: Ray) -> Met:
     """What one ray in the world's frame meets, after a walk over the surface."""
+    hfield, grid = ready
     frame = pose(hfield.pos, hfield.quat)
     local = in_hfield(frame, ray)
     within = column(hfield, local)
@@ -129,7 +135,7 @@ def _one(hfield: HField, grid: Grid, ray: Ray) -> Met:
     found = first_triangle(grid, scaled, max_steps=None, t_max=limit * scale)
     found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
     found = stored(materialise(found))
-    return _nearest(hfield, local, frame, found, [*faces, *walls(hfield, local, within, faces[1], found.side < 0)])
+    return nearest(hfield, local, frame, found, [*faces, *walls(hfield, local, within, faces[1], found.side < 0)])
 
 
 def in_hfield(frame: Affine, ray: Ray) -> Ray:
@@ -139,27 +145,25 @@ def in_hfield(frame: Affine, ray: Ray) -> Ray:
     return Ray(frame.covector(o - frame.offset), frame.covector(d))
 
 
-def in_cells(hfield: HField, local: Ray) -> Ray:
+def in_cells(hfield: Ground, local: Ray) -> Ray:
     """A ray of the height field's frame in cells by cells by data, such that the border is at whole numbers to the last bit."""
-    nrow, ncol = hfield.data.shape
+    nrow, ncol = hfield.shape
     half = jnp.array([(ncol - 1) / 2, (nrow - 1) / 2, 1], local.o.dtype)
     centre = jnp.array([1, 1, 0], local.o.dtype)
     size = hfield.size[:3]
     return Ray((local.o / size + centre) * half, local.d / size * half)
 
 
-def triangle_heights(hfield: HField, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
+def triangle_heights(hfield: Ground, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """The data at the vertices of a triangle, see `triangle_corners`."""
-    ncol = hfield.data.shape[1]
 
-    def heights(data, first, between, last):
-        rows = data.reshape(-1)
-        return tuple(rows.at[at].get(mode="promise_in_bounds", wrap_negative_indices=False) for at in (first, between, last))
+    def heights(rows, first, ix, iy, upper):
+        return triangle_corners(rows, hfield.shape[1], ix, iy, upper, first)
 
-    return apart(heights, hfield.data, *triangle_vertices(ncol, ix, iy, upper))
+    return apart(heights, hfield.rows, hfield.first, ix, iy, upper)
 
 
-def _nearest(hfield: HField, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Met:
+def nearest(hfield: Ground, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Met:
     """The nearest of the triangle that a search found and of the solid's sides; of two at the same distance the first side.
 
     Args:
@@ -170,7 +174,7 @@ def _nearest(hfield: HField, local: Ray, frame: Affine, found: WalkResult, solid
         wherever on it the search began.
       solid: the sides.
     """
-    nrow, ncol = hfield.data.shape
+    nrow, ncol = hfield.shape
     plane = a, b, c = plane_through(triangle_heights(hfield, found.ix, found.iy, found.upper), found.upper)
     down = (local.d[0] == 0) & (local.d[1] == 0)
     near, far = jnp.where(down, 0, found.t_near), jnp.where(down, jnp.inf, found.t_far)

@@ -14,11 +14,15 @@ from ..core.autodiff import with_tangent
 from ..core.compilation import compiled
 from ..core.errors import ArgumentError, require_kind
 from ..core.materialise import materialise
+from ..core.ray import Ray
 from ..core.types import Point2, Scalar, Vector
+from ..trace.status import Status
 from ..trace.triangle import plane_through
+from ..trace.walk import WalkResult
 from .hfield import HField
 from .pose import Quaternion, pose, rotation, yaw
-from .ray import first_met, one_axis, triangle_heights
+from .ray import first_met, in_hfield, nearest, one_axis, triangle_heights
+from .solid import base_faces, column, ground
 
 Align = Literal["yaw", "base", "world"]
 
@@ -59,8 +63,9 @@ def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, of
     """What rays meet that start above each place of a pattern, which moves and turns with a robot, and go down.
 
     Straight down over a height field that is upright (see `HField`) there is nothing to search: the triangle is looked up, by
-    the rules of the walk where a place lies between two. Results are the walk's up to rounding, as its rays are rounded in
-    the world's frame first. Differentiable in all numbers of the height fields, the robots and the pattern. Beyond arguments
+    the rules of the walk where a place lies between two. On CPUs places and distances inside of a triangle have the walk's very
+    bits (normals agree to a rounding); within a program that a caller's own `jit` compiles, XLA may round them elsewhere.
+    Differentiable in all numbers of the height fields, the robots and the pattern. Beyond arguments
     and results a look-up needs about 60 bytes a ray, in single precision.
 
     Args:
@@ -150,39 +155,46 @@ def _under(hfield: HField, start: _Start, place: Point2) -> Scan:
     """What the ray straight down from one place meets, without a search, by the rules of the walk and of the solid.
 
     It is over the footprint all along, and no wall stands in its way. Where it is over the border of two triangles, the
-    triangle is the walk's. Numbers stand alone, as arrays of three would have XLA compute each fused value three times.
+    triangle is the walk's. Values are the walk's operation by operation, but for factors that are 0 or 1 where all stands
+    upright; numbers stand alone, as arrays of three would have XLA compute each fused value three times. Derivatives are those
+    of a ray whose triangle was searched.
     """
-    frame, (nrow, ncol), size = pose(hfield.pos, hfield.quat), hfield.data.shape, hfield.size
-    o, d = frame.covector(start.o - frame.offset), frame.covector(start.d)  # of the robot, in the height field's frame
-    per_x, per_y = frame.covector(start.along_x), frame.covector(start.along_y)
-    at = [o[k] + place[0] * per_x[k] + place[1] * per_y[k] for k in range(3)]
-    half_x, half_y = (ncol - 1) / 2, (nrow - 1) / 2
-    x, y, z = (at[0] / size[0] + 1) * half_x, (at[1] / size[1] + 1) * half_y, at[2] / size[2]
-    ix = jnp.clip(jnp.floor(lax.stop_gradient(x)).astype(jnp.int32), 0, ncol - 2)
-    iy = jnp.clip(jnp.ceil(lax.stop_gradient(y)).astype(jnp.int32) - 1, 0, nrow - 2)
+    field, begin, (nrow, ncol) = lax.stop_gradient((hfield, start, hfield.data.shape))
+    frame, size, ready = pose(field.pos, field.quat), field.size, ground(field)
+    turn, place_x, place_y = frame.linear, lax.stop_gradient(place[0]), lax.stop_gradient(place[1])
+    away = [begin.o[k] + place_x * begin.along_x[k] + place_y * begin.along_y[k] - frame.offset[k] for k in range(3)]
+    o = [turn[0, k] * away[0] + turn[1, k] * away[1] for k in (0, 1)]
+    x, y, z = (o[0] / size[0] + 1) * ((ncol - 1) / 2), (o[1] / size[1] + 1) * ((nrow - 1) / 2), away[2] / size[2]
+    ix = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, ncol - 2)
+    iy = jnp.clip(jnp.ceil(y).astype(jnp.int32) - 1, 0, nrow - 2)
+    z = materialise(z)  # else XLA draws two divisions into one, which rounds elsewhere than the walk
     u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
     upper = v > u
-    corners = triangle_heights(hfield, ix, iy, upper)
-    a, b, c = plane_through(corners, upper)
+    a, b, c = plane_through(triangle_heights(ready, ix, iy, upper), upper)
     level = c + a * u + b * v
-    inside = (jnp.abs(at[0]) <= size[0]) & (jnp.abs(at[1]) <= size[1])
-    on_surface, on_base = inside & (z > level), inside & (at[2] >= 0)
-    valid = inside & (at[2] >= -size[3])
-    rise_x, rise_y = a * (half_x / size[0]), b * (half_y / size[1])
-    below = jnp.where(on_base, 0, -size[3])
-    t = jnp.where(on_surface, (level - z) / (d[2] / size[2] - rise_x * d[0] - rise_y * d[1]), (below - at[2]) / d[2])
-    # In the world the ray goes straight down, from wherever: so z changes as -t does.
-    x, y, z = (start.o[k] + place[0] * start.along_x[k] + place[1] * start.along_y[k] for k in range(3))
-    height = lax.stop_gradient(jnp.where(on_surface, level * size[2], below) + frame.offset[2])
-    rise_x, rise_y = rise_x * size[2], rise_y * size[2]
+    inside = (jnp.abs(o[0]) <= size[0]) & (jnp.abs(o[1]) <= size[1])
+    on_base, valid = inside & (away[2] >= 0), inside & (away[2] >= -size[3])
+    down = jnp.full_like(z, -1)
+    # The slope's zero keeps XLA from turning a / (b / c) into a c / b, for the same reason.
+    to_surface, bottom = (level - z) / (down / size[2] - a * 0), jnp.where(on_base, 0, -size[3])
+    to_below = (bottom - away[2]) / down
+    on_surface = inside & (z > level) & (to_surface < jnp.where(valid, to_below, jnp.inf))
+    valid = valid | on_surface
+    t = jnp.where(on_surface, to_surface, jnp.where(valid, to_below, 0))
+    p = [turn[k, 0] * o[0] + turn[k, 1] * o[1] + frame.offset[k] for k in (0, 1)]
+    p.append(jnp.where(on_surface, level * size[2], away[2] - t) + frame.offset[2])
+    rise_x, rise_y = a * size[2] * ((ncol - 1) / 2) / size[0], b * size[2] * ((nrow - 1) / 2) / size[1]
     up = 1 / jnp.sqrt(1 + rise_x * rise_x + rise_y * rise_y)
-    flat = jnp.where(on_base, 1, jnp.where(valid, -1, 0)).astype(up.dtype)
-    n = [jnp.where(on_surface, slope, level) for slope, level in ((-rise_x * up, 0), (-rise_y * up, 0), (up, flat))]
-    n = materialise(n)
-    turn = frame.linear
-    return Scan(
-        p=jnp.stack([x, y, jnp.where(valid, with_tangent(height, z - t), z)]),
-        n=jnp.stack([turn[k, 0] * n[0] + turn[k, 1] * n[1] + turn[k, 2] * n[2] for k in range(3)]),
-        dist=jnp.where(valid, t, -1),
-        mask=valid,
-    )
+    flat = jnp.where(on_base, 1, jnp.where(valid, -1, 0)).astype(t.dtype)
+    n = [jnp.where(on_surface, part, of) for part, of in ((-rise_x * up, 0), (-rise_y * up, 0), (up, flat))]
+    p[2], t, n = materialise((p[2], t, n))
+    n = [turn[0, 0] * n[0] + turn[0, 1] * n[1], turn[1, 0] * n[0] + turn[1, 1] * n[1], n[2]]
+    value = Scan(jnp.stack(p), jnp.stack(n), jnp.where(valid, t, -1), valid)
+
+    status = jnp.where(on_surface, int(Status.HIT), int(Status.MISS)).astype(jnp.int32)
+    zero = jnp.zeros_like(x)
+    found = WalkResult(status, ix, iy, upper, jnp.ones_like(ix), zero, zero, None)
+    frame, ready = pose(hfield.pos, hfield.quat), ground(hfield)
+    local = in_hfield(frame, Ray(start.o + place[0] * start.along_x + place[1] * start.along_y, start.d))
+    met = nearest(ready, local, frame, found, base_faces(ready, local, column(ready, local)))
+    return Scan(with_tangent(value.p, met.p), with_tangent(value.n, met.n), with_tangent(value.dist, met.t), valid)

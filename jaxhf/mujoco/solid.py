@@ -6,13 +6,39 @@ of the very distances at which it meets the floor, so that no rounding opens an 
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from .hfield import HField
 
 _ROUNDING = 16  # units in the last place by which the height of a wall's rim may be off
+
+
+class Ground(eqx.Module):
+    """A height field as one of its rays sees it.
+
+    Attributes:
+      rows: the data, row after row.
+      size, pos, quat: as in `HField`.
+      shape: (nrow, ncol).
+      first: the place of its first number in `rows`, where those hold several height fields; None: 0.
+    """
+
+    rows: Float[jax.Array, " vertices"]
+    size: Float[jax.Array, "4"]
+    pos: Vector
+    quat: Float[jax.Array, "4"]
+    shape: tuple[int, int] = eqx.field(static=True)
+    first: Index | None = None
+
+
+def ground(hfield: HField) -> Ground:
+    """One height field, not a batch."""
+    nrow, ncol = hfield.data.shape
+    return Ground(hfield.data.reshape(-1), hfield.size, hfield.pos, hfield.quat, (nrow, ncol))
 
 
 class Side(eqx.Module):
@@ -30,7 +56,7 @@ class Column(eqx.Module):
     leaves: Side
 
 
-def column(hfield: HField, ray: Ray) -> Column:
+def column(hfield: Ground, ray: Ray) -> Column:
     """The column of a ray in the height field's frame; both of its walls are `met` where the ray comes through it."""
     near, far = [], []
     for axis in (0, 1):
@@ -48,7 +74,7 @@ def column(hfield: HField, ray: Ray) -> Column:
     return Column(Side(t_in, through, jnp.where(first, in_y, in_x)), Side(t_out, through, jnp.where(last, out_y, out_x)))
 
 
-def base_faces(hfield: HField, ray: Ray, within: Column) -> list[Side]:
+def base_faces(hfield: Ground, ray: Ray, within: Column) -> list[Side]:
     """The upper face of the base, and the floor."""
     still = ray.d[2] == 0
     rate = jnp.where(still, 1, ray.d[2])
@@ -60,7 +86,7 @@ def base_faces(hfield: HField, ray: Ray, within: Column) -> list[Side]:
     return faces
 
 
-def walls(hfield: HField, ray: Ray, within: Column, floor: Side, below: Flag) -> list[Side]:
+def walls(hfield: Ground, ray: Ray, within: Column, floor: Side, below: Flag) -> list[Side]:
     """The walls where the ray enters the column and where it leaves it.
 
     Args:
@@ -74,19 +100,19 @@ def walls(hfield: HField, ray: Ray, within: Column, floor: Side, below: Flag) ->
     return [_wall(hfield, ray, side, floor.t, below) for side in (within.enters, within.leaves)]
 
 
-def _wall(hfield: HField, ray: Ray, side: Side, t_floor: Scalar, below: Flag) -> Side:
+def _wall(hfield: Ground, ray: Ray, side: Side, t_floor: Scalar, below: Flag) -> Side:
     """The side where it lies over the floor and below the rim."""
     t = jnp.where(side.met & jnp.isfinite(side.t), side.t, 0)
     p, up = ray(t), ray.d[2]
     over_floor = jnp.where(up > 0, t >= t_floor, jnp.where(up < 0, t <= t_floor, ray.o[2] >= -hfield.size[3]))
-    nrow, ncol = hfield.data.shape
+    nrow, ncol = hfield.shape
     along_x = side.n[1] != 0
     c, u = _cell(p[0] / hfield.size[0], ncol)
     r, v = _cell(p[1] / hfield.size[1], nrow)
     last = jnp.where(along_x, side.n[1], side.n[0]) > 0
     r, c = jnp.where(along_x, jnp.where(last, nrow - 1, 0), r), jnp.where(along_x, c, jnp.where(last, ncol - 1, 0))
-    low = hfield.data[r, c]
-    high = hfield.data[r + jnp.where(along_x, 0, 1), c + jnp.where(along_x, 1, 0)]
+    at = r * ncol + c if hfield.first is None else r * ncol + c + hfield.first
+    low, high = hfield.rows[at], hfield.rows[at + jnp.where(along_x, 1, ncol)]
     rim = (low + jnp.where(along_x, u, v) * (high - low)) * hfield.size[2]
     gap, noise = p[2] - rim, _ROUNDING * jnp.finfo(rim.dtype).eps * (hfield.size[2] + jnp.abs(ray.o[2]) + jnp.abs(t * up))
     under = (gap < -noise) | ((gap <= noise) & below)

@@ -2,6 +2,7 @@
 
 import functools
 import math
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -18,12 +19,12 @@ from ..core.types import float_leaf
 from ..scene.heightfield import Heightfield
 from ..scene.localise import anchor, localise
 from ..scene.scene import Scene
-from ..trace.grid import Grid
+from ..trace.grid import Grid, joined
 from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
-from ..trace.world import World, first_hit, make_surface, make_world, resolve_settings
+from ..trace.world import World, first_hit, make_world, resolve_settings
 from .chunks import trace_batch, trace_chunks
-from .render import Prepared
+from .render import Prepared, PreparedHeightfield, heightfield_grid
 
 
 def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings | None = None) -> Hit:
@@ -49,18 +50,23 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
 
 
 def cast(
-    surface: Heightfield | Scene | Prepared, o: Any, d: Any, settings: Settings | None = None, *, leaving: Hit | None = None
+    surface: Heightfield | Scene | Prepared | PreparedHeightfield,
+    o: Any,
+    d: Any,
+    settings: Settings | None = None,
+    *,
+    leaving: Hit | None = None,
 ) -> Hit:
     """Where rays first meet a heightfield or a scene; differentiable in the heights, in `o`, in `d` and in `leaving`.
 
     Args:
-      surface: a heightfield in the frame of the rays; a scene, of which all objects count; or one that `prepare` made ready,
+      surface: a heightfield in the frame of the rays; a scene, of which all objects count; or what `prepare` made of either,
         for which nothing is prepared again. Or a batch of heightfields that differ in their heights only, shape (..., ny, nx),
         as `jax.vmap(lambda z: jaxhf.Heightfield(z, dx=2.0))(heights)` makes them: each has rays of its own, so that the
         axes of `o` and `d` begin with those of the batch.
       o, d: origins and directions, shape (..., 3) each, broadcast against each other; a direction need not be unit. NumPy
         and Python numbers keep double precision until the grid's x0 and y0 have been subtracted.
-      settings: max_steps, shading, normals and chunk count here; those of a prepared scene are its own.
+      settings: max_steps, shading, normals and chunk count here; those of what is prepared are its own.
       leaving: for rays that start on a heightfield: hits of an earlier `cast` on it, whose leading axes are
         broadcast against those of `d`; `o` must then be None. A ray leaves on the side of its triangle to which `d` points
         and cannot meet that triangle again, so that no offset by an epsilon is needed.
@@ -74,7 +80,8 @@ def cast(
         axes do not begin with those of a batch; `leaving` or other settings with a scene that is prepared.
     """
     scene = surface.scene if isinstance(surface, Prepared) else surface if isinstance(surface, Scene) else None
-    field: Any = surface if scene is None else None
+    ready = isinstance(surface, Prepared | PreparedHeightfield)
+    field: Any = None if scene is not None else surface.field if isinstance(surface, PreparedHeightfield) else surface
     if scene is None and not all(hasattr(field, name) for name in ("heights", "dx", "dy", "x0", "y0")):
         hint = "jaxhf.Heightfield(heights, dx, dy) makes one"
         require_kind("cast", "surface", surface, Heightfield, "a jaxhf.Heightfield or a Scene", hint)
@@ -83,8 +90,11 @@ def cast(
         require_kind("cast", "leaving", leaving, Hit, "the Hit that an earlier cast returned")
         if scene is not None:
             raise UserError("cast: leaving needs a heightfield alone, rays that meet a scene start at o")
-    if isinstance(surface, Prepared) and settings is not None and resolve_settings(settings, surface.scene) != surface.settings:
-        raise UserError(f"cast: the scene was prepared with {surface.settings}, it cannot be cast into with {settings}")
+    given = settings if settings is None or scene is None else resolve_settings(settings, scene)
+    if ready and given not in (None, surface.settings):
+        what = "heightfield" if scene is None else "scene"
+        raise UserError(f"cast: the {what} was prepared with {surface.settings}, it cannot be cast into with {settings}")
+    settings = surface.settings if ready else settings or Settings()
     if scene is not None:
         dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
         corner, batch = anchor(scene), ()
@@ -124,12 +134,14 @@ def cast(
     if isinstance(surface, Prepared):
         hit = _cast_prepared(surface._world, *rays)
     elif isinstance(surface, Scene):
-        hit = _cast_prepared(_make_world(localise(surface.with_lights(())), settings=settings or Settings()), *rays)
+        hit = _cast_prepared(_make_world(localise(surface.with_lights(())), settings=settings), *rays)
+    elif isinstance(surface, PreparedHeightfield):
+        hit = (_cast_grids if batch else _cast_grid)(surface._grid, *rays, settings)
     elif batch:
         heights = field.heights.reshape(-1, *field.heights.shape[-2:])
-        hit = _cast_batch(heights, *rays, field.dx, field.dy, settings or Settings())
+        hit = _cast_batch(heights, *rays, field.dx, field.dy, settings)
     else:
-        hit = _cast(Heightfield(field.heights, field.dx, field.dy), *rays, settings or Settings())
+        hit = _cast(Heightfield(field.heights, field.dx, field.dy), *rays, settings)
     return jax.tree.map(lambda leaf: leaf.reshape(*many, *leaf.shape[rays[1].ndim - 1 :]), _moved(hit, corner))
 
 
@@ -138,14 +150,30 @@ def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
     return eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(jnp.asarray(offset, hit.p.dtype), hit.p.shape))
 
 
-@functools.partial(compiled, static_argnames=("settings",))
-def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
+def _trace(surface: Grid, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
     """Rays from points (n, 3), or from hits with a leading axis n; chunk after chunk of one fixed size."""
-    surface = _surface(heightfield, settings)
     return trace_chunks(lambda ray: _first(surface, ray, settings), (start, d), settings.chunk)
 
 
-@functools.partial(compiled, static_argnames=("dx", "dy", "settings"))
+_cast_grid = compiled(_trace, serial=True, static_argnames=("settings",))
+
+
+@functools.partial(compiled, serial=True, static_argnames=("settings",))
+def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
+    return _trace(heightfield_grid(heightfield, settings), start, d, settings)
+
+
+@functools.partial(compiled, serial=True, static_argnames=("settings",))
+def _cast_grids(grids: Grid, start: jax.Array | Hit, d: Float[jax.Array, "m n 3"], settings: Settings) -> Hit:
+    """Grids with a leading axis m, each of which has rays of its own."""
+    return _trace_each(lambda grid: grid, grids, start, d, settings)
+
+
+def _trace_each(make: Callable[[Any], Grid], shapes: Any, start: jax.Array | Hit, d: jax.Array, settings: Settings) -> Hit:
+    return trace_batch(make, joined, lambda grid, ray: _first(grid, ray, settings), shapes, (start, d), settings.chunk)
+
+
+@functools.partial(compiled, serial=True, static_argnames=("dx", "dy", "settings"))
 def _cast_batch(
     heights: Float[jax.Array, "m ny nx"],
     start: jax.Array | Hit,
@@ -154,16 +182,7 @@ def _cast_batch(
     dy: float,
     settings: Settings,
 ) -> Hit:
-    def made(heights: jax.Array) -> Grid:
-        return _surface(Heightfield(heights, dx, dy), settings)
-
-    return trace_batch(made, lambda surface, ray: _first(surface, ray, settings), heights, (start, d), settings.chunk)
-
-
-def _surface(heightfield: Heightfield, settings: Settings) -> Grid:
-    surface = make_surface(heightfield, None, settings)
-    assert isinstance(surface, Grid)
-    return surface
+    return _trace_each(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights, start, d, settings)
 
 
 def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Settings) -> Hit:
@@ -175,6 +194,6 @@ def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Sett
 _make_world = compiled(make_world, static_argnames=("settings",))
 
 
-@compiled
+@functools.partial(compiled, serial=True)
 def _cast_prepared(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
     return trace_chunks(lambda ray: first_hit(world, Ray(ray[0], ray[1])), (o, d), world.settings.chunk)

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -30,31 +31,48 @@ def trace_chunks(one: Callable[[Any], Any], rays: Any, chunk: int) -> Any:
     return jax.tree.map(lambda leaf: leaf.reshape(count * chunk, *leaf.shape[2:])[:n], results)
 
 
-def trace_batch(make: Callable[[Any], Any], one: Callable[[Any, Any], Any], shapes: Any, rays: Any, chunk: int) -> Any:
+def trace_batch(
+    make: Callable[[Any], Any],
+    join: Callable[[Any], tuple[Any, Any]],
+    one: Callable[[Any, Any], Any],
+    shapes: Any,
+    rays: Any,
+    chunk: int,
+) -> Any:
     """`one(make(shape), ray)` for a batch of shapes that differ in numbers only, each with rays of its own.
 
-    Several shapes share a chunk where they have few rays each. Without a derivative the memory needed beyond arguments and
-    results is that of one chunk and of what `make` makes of its shapes.
+    Several shapes share a chunk where they have few rays each, and their rays are one batch. Without a derivative the memory
+    needed beyond arguments and results is that of one chunk and of what `make` makes of its shapes.
 
     Args:
       make: prepares a shape for tracing.
+      join: takes what `make` makes of several shapes, with a leading axis; returns what they have in common, and the rest of
+        each, with the leading axis. The two are `equinox.combine`d to what `one` takes, as `joined` grids are.
       one: a function of such a shape and one ray.
       shapes: a pytree of arrays whose leading axis counts the shapes.
       rays: one whose two leading axes count the shapes and the rays of each.
       chunk: about how many rays are traced together.
     """
     shape_count, n = jax.tree.leaves(rays)[0].shape[:2]
-    together = min(shape_count, max(1, chunk // max(n, 1)))
+    together = _together(shape_count, max(1, chunk // max(n, 1)))
 
-    def some(given: Any) -> Any:
-        shape, rays = given
-        ready = make(shape)
+    def of_one(given: Any) -> Any:
+        ready, rays = make(given[0]), given[1]
         if n <= chunk:
             return jax.vmap(lambda ray: one(ready, ray))(rays)
         return trace_chunks(lambda ray: one(ready, ray), rays, math.ceil(n / math.ceil(n / chunk)))
 
+    def of_several(given: Any) -> Any:
+        shared, own = join(jax.vmap(make)(given[0]))
+        each = jax.tree.map(lambda leaf: jnp.repeat(leaf, n, axis=0), own)
+        rays = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), given[1])
+        results = jax.vmap(lambda own, ray: one(eqx.combine(shared, own), ray))(each, rays)
+        return jax.tree.map(lambda leaf: leaf.reshape(together, n, *leaf.shape[1:]), results)
+
     if shape_count == 1:
-        return jax.tree.map(lambda leaf: leaf[None], some(jax.tree.map(lambda leaf: leaf[0], (shapes, rays))))
+        return jax.tree.map(lambda leaf: leaf[None], of_one(jax.tree.map(lambda leaf: leaf[0], (shapes, rays))))
+    if together == 1:
+        return lax.map(recomputed(of_one), (shapes, rays))
     count = math.ceil(shape_count / together)
     missing = count * together - shape_count
 
@@ -63,5 +81,12 @@ def trace_batch(make: Callable[[Any], Any], one: Callable[[Any, Any], Any], shap
             leaf = jnp.pad(leaf, ((0, missing), *((0, 0) for _ in leaf.shape[1:])), mode="edge")
         return leaf.reshape(count, together, *leaf.shape[1:])
 
-    results = lax.map(recomputed(jax.vmap(some)), jax.tree.map(grouped, (shapes, rays)))
+    results = lax.map(recomputed(of_several), jax.tree.map(grouped, (shapes, rays)))
     return jax.tree.map(lambda leaf: leaf.reshape(count * together, *leaf.shape[2:])[:shape_count], results)
+
+
+def _together(count: int, wanted: int) -> int:
+    """About as many as wanted: a divisor of the count where one is near, else all are copied to make up the last ones."""
+    wanted = min(count, wanted)
+    near = [k for k in range(-(-2 * wanted // 3), 3 * wanted // 2 + 1) if count % k == 0]
+    return min(near, key=lambda k: abs(k - wanted), default=wanted)

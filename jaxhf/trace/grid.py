@@ -1,5 +1,8 @@
 """A heightfield made ready for tracing."""
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -35,6 +38,7 @@ class Grid(eqx.Module):
       early_exit: whether searches on it end early, see `first_triangle`.
       perturbation: what is added at the vertices of the triangle that a ray meets, for derivatives of one ray in those
         numbers alone; None: nothing.
+      first: the place of the first vertex in `rows` and `normals`; None: 0, else they hold several grids, see `joined`.
     """
 
     rows: Float[jax.Array, " vertices"]
@@ -47,6 +51,7 @@ class Grid(eqx.Module):
     shape: tuple[int, int] = eqx.field(static=True)
     early_exit: bool = eqx.field(static=True, default=True)
     perturbation: Corners | None = None
+    first: Index | None = None
 
     @property
     def z(self) -> Float[jax.Array, "ny nx"]:
@@ -105,6 +110,31 @@ def make_grid(
     )
 
 
+def joined(grids: Grid) -> tuple[Grid, Grid]:
+    """Grids of one shape, which come with a leading axis, in common arrays, so that rays on any of them make up one batch.
+
+    Returns:
+      The heights, bounds and normals of all, one after the other; and the rest of each, with the leading axis. The first with
+      one of the second makes a grid, see `equinox.combine`.
+    """
+    count, vertices = grids.rows.shape
+    number = jnp.arange(count, dtype=jnp.int32)
+
+    def arrays(grid: Grid) -> tuple[Any, ...]:
+        return grid.rows, grid.pyramid.bounds, grid.normals
+
+    def places(grid: Grid) -> tuple[Any, ...]:
+        return grid.first, grid.pyramid.first
+
+    def at(parts: Callable[[Grid], Any], grids: Grid, values: Any) -> Grid:
+        return eqx.tree_at(parts, grids, values, is_leaf=lambda leaf: leaf is None)
+
+    grids = at(places, grids, (number * vertices, number * grids.pyramid.bounds.shape[1]))
+    common = at(arrays, jax.tree.map(lambda _: False, grids), (True, True, None if grids.normals is None else True))
+    shared, own = eqx.partition(grids, common)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), shared), own
+
+
 def triangle_plane(grid: Grid, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """(a, b, c) of the triangle's plane c + a u + b v, with u and v from the cell's vertex 00; finite in a hole too."""
-    return plane_through(triangle_corners(grid.rows, grid.shape[1], ix, iy, upper), upper)
+    return plane_through(triangle_corners(grid.rows, grid.shape[1], ix, iy, upper, grid.first), upper)

@@ -144,8 +144,8 @@ def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkRes
     up to a tenth longer).
     """
     nx, triangle = grid.shape[1], (found.ix, found.iy, found.upper)
-    heights = triangle_corners(grid.rows, nx, *triangle)
-    normals = None if grid.normals is None else triangle_corners(grid.normals, nx, *triangle)
+    heights = triangle_corners(grid.rows, nx, *triangle, grid.first)
+    normals = None if grid.normals is None else triangle_corners(grid.normals, nx, *triangle, grid.first)
     if grid.perturbation is not None:
         heights = _moved(heights, grid.perturbation.heights)
         if normals is not None and grid.perturbation.normals is not None:

@@ -30,10 +30,14 @@ def corners(
 
 
 def triangle_corners(
-    rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index, upper: Flag
+    rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index, upper: Flag, grid: Index | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The values at the vertices of a triangle of a cell in range: 00, the one between (10, or 01 in the upper), and 11."""
-    first, between, last = triangle_vertices(nx, ix, iy, upper)
+    """The values at the vertices of a triangle of a cell in range: 00, the one between (10, or 01 in the upper), and 11.
+
+    `grid` is as in `corners`.
+    """
+    places = triangle_vertices(nx, ix, iy, upper)
+    first, between, last = (place if grid is None else place + grid for place in places)
     return _at(rows, first), _at(rows, between), _at(rows, last)
 
 

@@ -107,6 +107,7 @@ def walk_start(
         t_end=jnp.where(inv_z > 0, grid.z_top - z_ray, -z_ray) * inv_z,
         t_stop=jnp.full_like(x, jnp.inf),
         ahead=None if start is None else (start.upper == begins_upper) & (rate != 0),
+        first=grid.first,
         noise=None if start is None else jnp.where(start.active, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
     )
     t_stop = lesser(lesser(walk.distance_x(end_x), walk.distance_y(end_y)), walk.t_end)

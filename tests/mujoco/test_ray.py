@@ -1,5 +1,7 @@
 """`jaxhf.mujoco.ray` against MuJoCo's own rays, closed forms where those are wrong, and central differences."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +10,7 @@ from hfields import KINDS, SIZE, Reference, heights, rays
 
 import jaxhf
 from jaxhf.mujoco import HField, ray
+from jaxhf.mujoco.pose import rotation
 
 COUNT = 400  # of each kind of ray
 GROUND = heights(9, 6)
@@ -83,7 +86,28 @@ def test_gradients_match_central_differences():
     assert all((slope == 0).all() for slope in program(numbers, jnp.asarray(missed.astype(np.float64)))[1])
 
 
+def test_prepared_and_replaced():
+    """Bounds at hand change no bit; `dataclasses.replace` makes a height field anew; a quat of zero turns nothing."""
+    o, d = cases(Reference(GROUND, SIZE), GROUND)
+    upright = HField(GROUND.astype(np.float64), SIZE)
+    t, n = ray(upright, o, d)
+    np.testing.assert_array_equal(ray(upright.prepared(), o, d)[0], t)
+    turned = dataclasses.replace(upright.prepared(), quat=(0, 0, 0, 1))
+    assert turned._grid is None
+    np.testing.assert_allclose(ray(turned, o * [-1, -1, 1], d * [-1, -1, 1])[1], np.asarray(n) * [-1, -1, 1], atol=1e-12)
+    np.testing.assert_array_equal(rotation(jnp.zeros(4)), np.eye(3))
+    assert jnp.isfinite(jax.jacobian(rotation)(jnp.zeros(4))).all()
+
+
 def test_says_what_is_wrong():
+    with pytest.raises(ValueError, match="HField: data must lie from 0 to 1, it goes from 0 to 2"):
+        HField(2 * GROUND, SIZE)
+    with pytest.raises(ValueError, match="HField: data must lie from 0 to 1, it goes from nan to nan"):
+        HField(np.full((2, 2), np.nan), SIZE)
+    with pytest.raises(ValueError, match="HField: quat must not be zero"):
+        HField(GROUND, SIZE, quat=jnp.zeros(4))
+    with pytest.raises(ValueError, match="HField: pos must be finite"):
+        HField(GROUND, SIZE, pos=(0, np.inf, 0))
     with pytest.raises(ValueError, match="HField: size must be positive"):
         HField(GROUND, (1, 1, 0, 1))
     with pytest.raises(ValueError, match=r"HField: quat must have shape \(4,\), its shape is \(3,\)"):

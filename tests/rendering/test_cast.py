@@ -333,17 +333,22 @@ def test_into_a_scene():
 
 
 def test_batch_of_heightfields():
-    """Each with rays of its own, several or only a part of them in one chunk: what they meet alone."""
-    o, d = slanted(MILD, 144, seed=21)
-    o, d = o.reshape(3, 48, 3), d.reshape(3, 48, 3)
-    heights = np.stack([MILD.heights * scale for scale in (1.0, 0.8, -1.2)])
+    """Each with rays of its own, two in a chunk, with one that is made up: what they meet alone; the same where prepared."""
+    o, d = slanted(MILD, 240, seed=21)
+    o, d = o.reshape(5, 48, 3), d.reshape(5, 48, 3)
+    heights = np.stack([MILD.heights * scale for scale in (1.0, 0.8, -1.2, 0.5, 2.0)])
     fields = jax.vmap(lambda z: jaxhf.Heightfield(z, *MILD[1:]))(jnp.asarray(heights))
-    together = jaxhf.cast(fields, o, d, jaxhf.Settings(chunk=100))
-    assert together.p.shape == (3, 48, 3)
-    for k in range(3):
+    settings = jaxhf.Settings(chunk=100)
+    together, prepared = jaxhf.cast(fields, o, d, settings), jaxhf.prepare(fields, settings)
+    assert together.p.shape == (5, 48, 3)
+    for name, value in numpied(jaxhf.cast(prepared, o, d)).items():
+        np.testing.assert_allclose(value, numpied(together)[name], rtol=1e-9, atol=1e-9, err_msg=name)
+    with pytest.raises(ValueError, match=r"the heightfield was prepared with .*, it cannot be cast into with"):
+        jaxhf.cast(prepared, o, d, jaxhf.Settings(shading="flat"))
+    for k in range(5):
         alone, one = numpied(jaxhf.cast(jaxhf.Heightfield(heights[k], *MILD[1:]), o[k], d[k])), numpied(together)
         assert (alone["status"] == jaxhf.Status.HIT).mean() > 0.5
         for name in alone:
             np.testing.assert_allclose(one[name][k], alone[name], rtol=1e-9, atol=1e-9, err_msg=name)
-    with pytest.raises(ValueError, match=r"must begin with the axes \(3,\) of the heightfields"):
+    with pytest.raises(ValueError, match=r"must begin with the axes \(5,\) of the heightfields"):
         jaxhf.cast(fields, o[0], d[0])
