@@ -342,7 +342,8 @@ def _triangles_at(scheme: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
 def vertex_normals(heights: np.ndarray, dx: float, dy: float, scheme: str) -> tuple[np.ndarray, np.ndarray]:
     """Normals at the vertices, on the +z side, shape (ny, nx, 3), and the summed lengths of the vectors that make each.
 
-    They are sums, not means: a vertex at the border has fewer triangles, and weighs less in an interpolation.
+    They are sums, not means: a vertex at the border has fewer triangles, and weighs less in an interpolation. Those of
+    "six-angle" have length 1.
     """
     heights = np.asarray(heights, np.float64)
     ny, nx = heights.shape
@@ -357,6 +358,9 @@ def vertex_normals(heights: np.ndarray, dx: float, dy: float, scheme: str) -> tu
                 parts = _normals_round(heights, ix, iy, dx, dy, scheme)
                 normals[iy, ix] = np.sum(parts, axis=0) if parts else (0, 0, 1)
                 lengths[iy, ix] = np.linalg.norm(parts, axis=1).sum() if parts else 1
+                if scheme == "six-angle":
+                    size = np.linalg.norm(normals[iy, ix])
+                    normals[iy, ix], lengths[iy, ix] = normals[iy, ix] / size, lengths[iy, ix] / size
     return normals, lengths
 
 

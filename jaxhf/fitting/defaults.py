@@ -40,6 +40,7 @@ def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: boo
     """
     if not all(can_be_linearised(view, settings) for view in views):
         return 0
+    settings = dataclasses.replace(settings, edge_samples=None)  # so that a second call, when some are chosen, compiles nothing
     length = max(float(_boundary_length(view, settings)) for view in views)
     least, most = _EDGE_SAMPLES
     if length == 0:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from .history import Stop
 
-_FAR_FROM_ONE = 1.5  # by which factor chi2 may differ from 1
+FAR_FROM_ONE = 1.5  # by which factor chi2 may differ from 1
 _STRAYED = 2.0  # standard deviations of the prior, root mean square
 _UNSEEN = 0.01  # share of the heights
 _REGIONS = 3
@@ -130,14 +130,14 @@ class Findings(NamedTuple):
 def warnings(found: Findings) -> tuple[str, ...]:
     """What a user should know before trusting the heights; empty where nothing speaks against it."""
     said = []
-    unexplained = found.chi2 > _FAR_FROM_ONE
+    unexplained = found.chi2 > FAR_FROM_ONE
     if unexplained:
         worst = "; ".join(map(str, found.regions))
         said.append(
             f"chi2 is {found.chi2:.3g}, not about 1: the pictures differ from the measured ones by {found.chi2**0.5:.2g} times "
             f"the noise, root mean square; {found.where}. Worst: {worst}"
         )
-    elif found.noise_given and found.chi2 < 1 / _FAR_FROM_ONE:
+    elif found.noise_given and found.chi2 < 1 / FAR_FROM_ONE:
         said.append(
             f"chi2 is {found.chi2:.3g}, not about 1: the noise that was given is {found.chi2**-0.5:.2g} times what is left, so "
             "standard deviations are too large and the prior counts for too much; without a noise the fit estimates it"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float
@@ -17,8 +18,9 @@ from ..core.types import AnyArray
 from ..io.errors import FileError
 from ..io.files import require_folder
 from ..scene.scene import Scene
+from ..trace.normals import vertex_normals
 from .basis import Unknowns
-from .diagnosis import Findings, Places, Region, warnings, where_residuals_are, worst_regions
+from .diagnosis import FAR_FROM_ONE, Findings, Places, Region, warnings, where_residuals_are, worst_regions
 from .history import Draws, Step, Stop
 from .loop import FitLoop
 from .options import Albedo, FitOptions, Loss, Solver
@@ -255,14 +257,14 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         draws = None if drawn is None else (int(options.uncertainty), drawn)
         if problem.prior is None:
             std = np.where(seen, std, np.inf)
-    heights = problem.basis.crop(problem.basis.base)
+    heights = jnp.asarray(problem.basis.crop(np.asarray(problem.basis.base)))
     findings = Findings(
         result=result,
         chi2=chi2,
         noise_given=options.noise is not None,
         where=where,
         regions=regions,
-        help=_what_may_help(problem),
+        help=_what_may_help(problem, heights) if chi2 > FAR_FROM_ONE else "",
         strayed=_strayed(problem, np.asarray(heights), seen, options.prior_std),
         seen=seen,
         lights=_light_directions(problem),
@@ -305,23 +307,45 @@ def _places(problem: Problem) -> list[Places]:
             if known is None:
                 found[k] = Places(np.zeros((h, w), bool), None)
             elif known.edges is None:
-                found[k] = Places(~np.asarray(known.depends[position]), None)
+                found[k] = Places(~np.asarray(known.depends)[position], None)
             else:
-                pixel, kind = np.asarray(known.edges.pixel[position]), np.asarray(known.edges.kind[position])
+                pixel, kind = np.asarray(known.edges.pixel)[position], np.asarray(known.edges.kind)[position]
                 silhouettes, shadows = (np.bincount(pixel[kind == which], minlength=h * w) > 0 for which in (1, 2))
                 found[k] = Places(silhouettes.reshape(h, w), shadows.reshape(h, w))
     return found
 
 
-def _what_may_help(problem: Problem) -> str:
+def _what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> str:
     """The one option to try where pictures are left unexplained."""
     if problem.loss == "squares":
         return "loss='geman' lets pixels go that the scene cannot explain"
     if not problem.settings.edge_samples:
         return "Settings(edge_samples=None), the default, lets the fit move silhouettes, shadows and the terrain's border"
+    share = _share_of_normals(problem, heights)
+    if share > 1:
+        return (
+            f"pictures of terrain as rough as this differ by {share:.2g} times the noise between normals weighted by area, the "
+            "default, and by angle, as by Mitsuba: for those, Settings(normals='six-angle')"
+        )
     if (problem.settings.samples or 1) < 16:
         return "Settings(samples=16) makes pictures of finer samples; if that changes nothing, mask those pixels by weights"
     return "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo)"
+
+
+def _share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> float:
+    """By about how much pictures change, in units of the noise, as normals are weighted by angle: the horizontal part of what
+    they turn by times the pictures' brightness; 0 where the settings are not the default ones."""
+    settings, field = problem.settings, problem.groups[0].shared.heightfields[0]
+    if (settings.normals, settings.shading) != ("six", "smooth"):
+        return 0.0
+
+    @jax.jit
+    def turned(heights: jax.Array) -> jax.Array:
+        area, angle = (vertex_normals(heights, field.dx, field.dy, scheme) for scheme in ("six", "six-angle"))
+        return angle - area / jnp.linalg.norm(area, axis=-1, keepdims=True)
+
+    horizontal = turned(jnp.asarray(heights))[..., :2]
+    return float(np.sqrt(np.mean(np.square(horizontal))) * np.median(problem.brightness / problem.noise))
 
 
 def _strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: Any) -> float | None:
@@ -336,5 +360,5 @@ def _light_directions(problem: Problem) -> int:
     found = set()
     for group in problem.groups:
         for k in range(len(group.indices)):
-            found.add(b"".join(np.asarray(leaf[k]).tobytes() for leaf in jax.tree.leaves(group.scenes.lights)))
+            found.add(b"".join(np.asarray(leaf)[k].tobytes() for leaf in jax.tree.leaves(group.scenes.lights)))
     return len(found)

@@ -27,7 +27,7 @@ from ..trace.world import make_world
 from .basis import Unknowns
 from .linearise import Linearised, vertex_values
 from .problem import Group, Problem
-from .residuals import completion, picture_residuals, views
+from .residuals import completion, heights_of, picture_residuals, views
 from .robust import robust_weight
 
 sp: Any = scipy.sparse  # whose stubs miss much
@@ -48,14 +48,14 @@ def pictures_jacobian(unknowns: Unknowns, problem: Problem) -> Sparse:
       A row for each value of each picture, a column for each height without padding, then for each of `other_unknowns`.
     """
     assert problem.linearised is not None
-    heights = problem.basis.heights(unknowns.coefficients)
-    slopes, weights, others = _dense_parts(heights, unknowns, problem)
+    heights = heights_of(unknowns, problem.basis)
+    slopes, weights, others = jax.tree.map(np.asarray, _dense_parts(heights, unknowns, problem))
     blocks = []
     for n, (group, known) in enumerate(zip(problem.groups, problem.linearised, strict=True)):
         scene = group.complete(group.scenes, heights)
         of_heights = vertices_by_heights(np.asarray(slopes[n], np.float64), scene)
         for k in range(len(group.indices)):
-            here = jax.tree.map(lambda leaf, k=k: np.asarray(leaf[k]), known)
+            here = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], known)
             samples = PictureSamples(scene.camera, problem.settings, None if here.edges is None else here.edges.resampled)
             weight = np.asarray(weights[n][k], np.float64)
             more = np.asarray(others[n][:, k], np.float64).reshape(-1, *weight.shape)

@@ -24,7 +24,7 @@ from .history import Step, Stop, print_progress
 from .normal_matrix import is_sparse
 from .options import FitOptions
 from .problem import Problem, mode_curvature
-from .residuals import heights_of, linearised, pictures_and_influence
+from .residuals import heights_of, linearised, pictures_and_influence, surface_of
 from .solvers import (
     DEFAULT_TOLERANCE,
     FIRST_DAMPING,
@@ -136,7 +136,7 @@ class FitLoop:
         if self.stage + 1 == len(self.stages):
             return False
         unknowns = self.best[1]
-        surface = np.asarray(self.problem.basis.surface(unknowns.coefficients))
+        surface = np.asarray(surface_of(unknowns, self.problem.basis))
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, jnp.zeros_like(unknowns.coefficients))
         share, repeats = self.stages[self.stage + 1], self.stage >= 0 and self.stages[self.stage] == 1
         known = self.known(self.best[1])
@@ -221,7 +221,7 @@ class FitLoop:
 
     def set_all_modes(self) -> None:
         """Varies all modes about the present surface, whatever the level at which the fit stopped."""
-        surface = np.asarray(self.problem.basis.surface(self.unknowns.coefficients))
+        surface = np.asarray(surface_of(self.unknowns, self.problem.basis))
         known = self.known(self.unknowns)
         if self.options.uncertainty is not None and not is_sparse(known):  # for LSMR, of which draws are then made
             self.units, _ = self._measured_units(self.unknowns)
@@ -372,15 +372,17 @@ def _spreads(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarra
     """
     spreads = np.zeros(problem.count)
     for number, (picture, group) in enumerate(zip(pictures, problem.groups, strict=True)):
-        residuals, given = np.abs(np.asarray(group.given * (picture - group.targets))), np.asarray(group.given)
+        given = np.asarray(group.given)
+        residuals = np.abs(given * (np.asarray(picture) - np.asarray(group.targets)))
         known = None if problem.linearised is None else problem.linearised[number]
+        depends, sampling = (None, None) if known is None else (np.asarray(known.depends), np.asarray(known.sampling))
         for position, k in enumerate(group.indices):
             counted = given[position] > 0
-            if known is not None:
-                shown = counted & np.asarray(known.depends[position])[..., None]
+            if depends is not None and sampling is not None:
+                shown = counted & depends[position][..., None]
                 if shown.any():
-                    sampling = np.broadcast_to(np.asarray(known.sampling[position])[..., None], shown.shape)
-                    counted = shown & (sampling <= np.median(sampling[shown]))
+                    error = np.broadcast_to(sampling[position][..., None], shown.shape)
+                    counted = shown & (error <= np.median(error[shown]))
             spreads[k] = 1.4826 * np.median(residuals[position][counted])
     return spreads
 

@@ -56,7 +56,7 @@ class NormalMatrix:
         selection = sp.csr_array((np.ones(places.size), (np.arange(places.size), places)), (places.size, padded + known.size))
         rows = [pictures @ selection, sp.hstack([sp.csr_array((known.size, padded)), sp.diags_array(np.sqrt(known))])]
         if problem.smoothness is not None:
-            smooth = float(problem.smoothness) * _laplacian(problem.basis.crop(basis.base).shape, (1.0, 1.0))
+            smooth = float(problem.smoothness) * _laplacian(problem.basis.crop(np.asarray(basis.base)).shape, (1.0, 1.0))
             rows.append(sp.hstack([smooth, sp.csr_array((within.size, known.size))]) @ selection)
         self.jacobian = sp.vstack(rows, format="csr")
         self.sparse_part = (self.jacobian.T @ self.jacobian).tocsc()

@@ -70,7 +70,7 @@ class Problem(eqx.Module):
       loss_scale: the size, in standard deviations, above which a residual counts less; changes with the level.
       loss: the robust loss, see `soften`.
       noise: standard deviation of each picture's values at weight 1, by which the groups' weights are divided.
-      least_noise: below which no estimate of it may fall.
+      brightness: of each picture, the value that 1 % of it exceeds.
       settings: how to render.
       mesh: the devices that share the work.
       linearised: the pictures of each group with their derivatives in the heights, at the very unknowns at which residuals are
@@ -86,13 +86,18 @@ class Problem(eqx.Module):
     albedo_smoothness: Float[Array, ""] | None
     loss_scale: Float[Array, ""] | None
     noise: Float[np.ndarray, " pictures"]
-    least_noise: Float[np.ndarray, " pictures"]
+    brightness: Float[np.ndarray, " pictures"]
     loss: str = eqx.field(static=True)
     settings: Settings = eqx.field(static=True)
     mesh: Mesh = eqx.field(static=True)
     linearised: tuple[Linearised, ...] | None = None
     view_unit: View = KNOWN
     view_weight: View = KNOWN
+
+    @property
+    def least_noise(self) -> Float[np.ndarray, " pictures"]:
+        """Below which no estimate of the noise may fall."""
+        return _LEAST_NOISE * self.brightness
 
     @property
     def count(self) -> int:
@@ -107,7 +112,7 @@ class Problem(eqx.Module):
         if options.settings.edge_samples is not None or options.albedo != "known":
             return self
         views = [
-            group.complete(jax.tree.map(lambda leaf, k=k: leaf[k], group.scenes), heights)
+            group.complete(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], group.scenes), heights)
             for group in self.groups
             for k in range(len(group.indices))
         ]
@@ -124,13 +129,14 @@ class Problem(eqx.Module):
         """
         groups = []
         for number, group in enumerate(self.groups):
-            variance = jnp.asarray(noise[list(group.indices)], group.given.dtype).reshape(-1, 1, 1, 1) ** 2
-            counts = group.given > 0
-            variance = variance / jnp.where(counts, group.given, 1) ** 2
+            # By NumPy: each operation of JAX's would be a program to compile.
+            given = np.asarray(group.given)
+            variance = noise[list(group.indices)].astype(given.dtype).reshape(-1, 1, 1, 1) ** 2
+            variance = variance / np.where(given > 0, given, 1) ** 2
             if self.linearised is not None:
-                variance = variance + self.linearised[number].sampling[..., None] ** 2
-            weights = jnp.where(counts, 1 / jnp.sqrt(variance), 0)
-            groups.append(dataclasses.replace(group, weights=weights))
+                variance = variance + np.asarray(self.linearised[number].sampling)[..., None] ** 2
+            weights = np.where(given > 0, 1 / np.sqrt(variance), 0)
+            groups.append(dataclasses.replace(group, weights=jnp.asarray(weights, given.dtype)))
         return dataclasses.replace(self, groups=tuple(groups), noise=noise)
 
 
@@ -159,7 +165,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
         None if options.albedo_smoothness is None else jnp.asarray(1 / options.albedo_smoothness, dtype),
         None if options.loss == "squares" else jnp.asarray(options.loss_scale, dtype),
         noise,
-        _brightness(targets) * _LEAST_NOISE,
+        _brightness(targets),
         options.loss,
         settings,
         local_mesh() if options.mesh is None else options.mesh,
@@ -303,7 +309,9 @@ def _stacked(scenes: Sequence[Scene]) -> tuple[Scene, Scene]:
     # A loop over pictures needs something to go through also where there is but one.
     views = jax.tree.map(lambda _: False, (first.camera, first.lights))
     shared = eqx.tree_at(lambda scene: (scene.camera, scene.lights), shared, views)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(eqx.filter(scene, shared, inverse=True) for scene in scenes))
+    stacked = jax.tree.map(
+        lambda *leaves: jnp.asarray(np.stack(leaves)), *(eqx.filter(scene, shared, inverse=True) for scene in scenes)
+    )
     return stacked, jax.tree.map(jnp.asarray, eqx.filter(first, shared))
 
 

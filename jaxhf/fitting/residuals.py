@@ -82,6 +82,12 @@ def heights_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "ny nx"]:
     return basis.heights(unknowns.coefficients)
 
 
+@eqx.filter_jit
+def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
+    """The heights with their padding, as `heights_of`."""
+    return basis.surface(unknowns.coefficients)
+
+
 @functools.partial(compiled, jit=eqx.filter_jit)
 def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem) -> tuple[Linearised, ...]:
     still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), unknowns.view)
@@ -207,7 +213,7 @@ def _pictures_and_influence(
 
 def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:
     """The scenes as they were given, with all that was found; positions keep double precision."""
-    heights, found = problem.basis.heights(unknowns.coefficients), list(scenes)
+    heights, found = heights_of(unknowns, problem.basis), list(scenes)
     for group in problem.groups:
         new, old = ((part.lights, part.camera) for part in (views(unknowns, problem, group), group.scenes))
         change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)

@@ -1,9 +1,12 @@
 """Robust losses."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
+
+from ..core.types import AnyArray
 
 
 def soften(residual: Array, loss: str, scale: Float[Array, ""] | None) -> Array:
@@ -37,14 +40,14 @@ def robust_weight(residual: Array, loss: str, scale: Float[Array, ""] | None) ->
     return 1 / (1 + square) if loss == "cauchy" else 1 / (1 + square) ** 2
 
 
+@functools.partial(jax.jit, static_argnames="loss")
 def influence_function(
-    residual: Float[np.ndarray, " n"], loss: str, scale: Float[Array, ""] | None
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    residual: Float[AnyArray, " n"], loss: str, scale: Float[Array, ""] | None
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
     """ψ = ρ', its derivative, and the weight ψ / r of residuals."""
 
     def psi(residual: Array) -> Array:
         return robust_weight(residual, loss, scale) * residual
 
-    r = jnp.asarray(residual)
-    values, slope = jax.jvp(psi, (r,), (jnp.ones_like(r),))
-    return np.asarray(values), np.asarray(slope), np.asarray(robust_weight(r, loss, scale))
+    values, slope = jax.jvp(psi, (residual,), (jnp.ones_like(residual),))
+    return values, slope, robust_weight(residual, loss, scale)

@@ -69,7 +69,7 @@ def standard_deviations(
     if samples == "exact":
         variance = _exact_variance(unknowns, problem) if matrix is None else matrix.variance()
         return np.sqrt(np.asarray(variance)), None
-    total, drawn, count = np.zeros(problem.basis.crop(problem.basis.base).shape), 0, int(samples)
+    total, drawn, count = np.zeros(problem.basis.crop(np.asarray(problem.basis.base)).shape), 0, int(samples)
     begin = time.perf_counter()
     try:
         while drawn < count:
@@ -98,8 +98,9 @@ def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tu
     """
     if len(residuals) == 0:
         return problem, 1.0
-    psi, slope, weight = influence_function(residuals, problem.loss, problem.loss_scale)
-    free = max(1 - problem.basis.crop(problem.basis.base).size / len(residuals), 0.5)
+    influence = influence_function(jnp.asarray(residuals), problem.loss, problem.loss_scale)
+    psi, slope, weight = map(np.asarray, influence)
+    free = max(1 - problem.basis.crop(np.asarray(problem.basis.base)).size / len(residuals), 0.5)
     factor = float(np.sqrt(np.mean(psi**2) * np.mean(weight) / np.mean(slope) ** 2 / free))
     if not factor > 1:
         return problem, 1.0

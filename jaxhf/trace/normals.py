@@ -25,9 +25,9 @@ def vertex_normals(
     "central": central differences, one-sided at the border. "four": the sum of the unit normals of the triangles
     right-up, up-left, left-down, down-right. "six": of the six triangles that touch the vertex, weighted by area, so
     that it commutes with affine maps (the sum that the seed's pbrt shape takes). "six-equal": the six unit normals with
-    equal weights (Gouraud 1971). "six-angle": weighted by the angle at the vertex (Thürmer and Wüthrich 1998), as
-    Mitsuba does. What lies beyond the border or touches a hole takes no part, so that a vertex there weighs less in the
-    interpolation; one with no triangle at all gets (0, 0, 1).
+    equal weights (Gouraud 1971). "six-angle": weighted by the angle at the vertex (Thürmer and Wüthrich 1998), and of
+    length 1, as Mitsuba does. What lies beyond the border or touches a hole takes no part, so that but for "six-angle" a
+    vertex there weighs less in the interpolation; one with no triangle at all gets (0, 0, 1).
     """
     # Products of two huge heights would be larger than any number in single precision. Any unit will do, and a power of two
     # changes no bit.
@@ -89,7 +89,11 @@ def _fan_mean(heights, dx, dy, fan, weight):
         total_x, total_y, total_z = total_x + x, total_y + y, total_z + z
     # Zero, where there is no triangle; or less than any number, beside slopes that are larger than any.
     nothing = (total_x == 0) & (total_y == 0) & (total_z == 0)
-    return jnp.stack([total_x, total_y, jnp.where(nothing, 1, total_z)], axis=-1)
+    total_z = jnp.where(nothing, 1, total_z)
+    if weight == "angle":
+        unit = 1 / _length(total_x, total_y, total_z)
+        total_x, total_y, total_z = total_x * unit, total_y * unit, total_z * unit
+    return jnp.stack([total_x, total_y, total_z], axis=-1)
 
 
 def _length(x, y, z):

@@ -9,9 +9,10 @@ import pytest
 from test_fit import OPTIONS, SETTINGS, TRUTH, fit_options, pictures, rms, scenes
 
 import jaxhf
-from jaxhf.fitting import uncertainty as _uncertainty
+from jaxhf.fitting import defaults as _defaults, uncertainty as _uncertainty
 from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
+from jaxhf.fitting.fit import _share_of_normals
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.normal_matrix import NormalMatrix
 from jaxhf.fitting.problem import make_problem
@@ -37,6 +38,17 @@ def test_noise_that_is_not_given_is_estimated():
     assert any("chi2 is" in warning and "picture 0 rows 0-3" in warning for warning in found.warnings)
 
 
+def test_normals_of_another_renderer_are_named_where_they_matter():
+    """By how much they turn: hardly any on the smooth terrain, by 20 degrees on steps of a cell's width."""
+    steps = np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0)
+    found = [
+        _share_of_normals(make_problem(scenes(), pictures(), fit_options(settings=settings, noise=0.02))[0], heights)
+        for settings, heights in ((SETTINGS, TRUTH), (SETTINGS, steps), (jaxhf.Settings(normals="six-angle"), steps))
+    ]
+    assert found[0] < 0.5 < 2 < found[1]
+    assert found[2] == 0
+
+
 def test_a_grey_picture_with_three_channels_is_one_measurement():
     grey = pictures()
     colour = np.stack([grey[0], 0.5 * grey[0], grey[0]], axis=-1)
@@ -60,6 +72,15 @@ def test_edges_take_part_where_boundaries_are_in_sight():
     assert choose_samples([flat], jaxhf.Settings()).samples == 4
     assert choose_samples([dataclasses.replace(flat, samples=16)], jaxhf.Settings()).samples == 16
     assert choose_samples([flat], jaxhf.Settings(samples=1)).samples == 1
+
+
+def test_the_length_of_boundaries_is_one_program(monkeypatch):
+    """Whether edges are to be chosen for the first time, or once more beside those of the start."""
+    asked = []
+    monkeypatch.setattr(_defaults, "_boundary_length", lambda _, settings: asked.append(settings) or 0.0)
+    for edge_samples in (None, 2048):
+        choose_edge_samples([localise(scenes()[0])], jaxhf.Settings(samples=4, edge_samples=edge_samples))
+    assert asked[0] == asked[1]
 
 
 def test_edges_take_part_where_the_measured_pictures_show_shadows():

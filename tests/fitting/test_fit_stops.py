@@ -3,10 +3,15 @@
 import math
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import lineax as lx
 import numpy as np
+import optimistix as optx
 import pytest
 
 import jaxhf
+from jaxhf.fitting.solvers import LevenbergMarquardt
 
 pytestmark = pytest.mark.unoptimised
 
@@ -46,3 +51,16 @@ def test_the_loss_is_that_of_the_last_step_where_max_steps_end_a_level():
     assert len(found.history) == level
     assert math.isfinite(found.stats["loss"])
     assert found.stats["loss"] == min(step.loss for step in found.history)
+
+
+def test_a_step_is_taken_at_any_damping():
+    """Also where 1 / λ is below the precision's epsilon, as it is for many pixels with little noise in single precision."""
+    matrix, right = 1e9 * np.random.default_rng(0).standard_normal((6, 3)), np.ones(6)
+    value, linear = jax.linearize(lambda x: jnp.asarray(matrix) @ x - right, jnp.zeros(3))
+    descent = LevenbergMarquardt(1e-4, 60, False).descent
+    state = descent.query(
+        None, optx.FunctionInfo.ResidualJac(value, lx.FunctionLinearOperator(linear, jax.eval_shape(lambda: value[:3]))), None
+    )
+    for damping in (1e3, 1e17):
+        expected = np.linalg.solve(matrix.T @ matrix + damping * np.eye(3), matrix.T @ right)
+        np.testing.assert_allclose(descent.step(jnp.asarray(1 / damping), state)[0], expected, rtol=0.01)

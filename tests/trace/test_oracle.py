@@ -237,11 +237,10 @@ def test_normals_of_one_cell_by_hand():
     np.testing.assert_allclose(six, [[lower + upper, lower], [upper, lower + upper]], atol=1e-15)
     equal = oracle.vertex_normals(heights, 1, 1, "six-equal")[0]
     np.testing.assert_allclose(equal[0], [s * (lower + upper), s * lower], atol=1e-15)
-    # Sides 1, sqrt(2), sqrt(3): a right angle at 10, and arctan(sqrt(2)) and its complement at 00 and 11.
+    # Of length 1. Both triangles have the same angles, at 00 and at 11.
     angle = oracle.vertex_normals(heights, 1, 1, "six-angle")[0]
-    at_00, at_11 = np.arctan(np.sqrt(2)), np.arctan(np.sqrt(0.5))
-    np.testing.assert_allclose(angle[0], [at_00 * s * (lower + upper), np.pi / 2 * s * lower], atol=1e-15)
-    np.testing.assert_allclose(angle[1, 1], at_11 * s * (lower + upper), atol=1e-15)
+    both = (lower + upper) / np.linalg.norm(lower + upper)
+    np.testing.assert_allclose(angle, [[both, s * lower], [s * upper, both]], atol=1e-15)
     # Right-up at 00 is flat; up-left at 10 goes through 11 and 00; left-down at 11 through 01 and 10, with slopes 1 and 1.
     four = oracle.vertex_normals(heights, 1, 1, "four")[0]
     np.testing.assert_allclose(four[0], [[0, 0, 1], s * lower], atol=1e-15)
