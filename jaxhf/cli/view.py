@@ -35,7 +35,12 @@ def add(commands: Any) -> None:
     command.add_argument("-o", "--output", metavar="OUT", help=".png, .exr, .npy, .pfm; a film: .gif, .mp4 [IN's name, .png]")
     size = command.add_argument_group("picture")
     size.add_argument("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]")
-    size.add_argument("--preset", choices=_PRESETS, default="balanced", help="1, 9 or 64 samples a pixel [balanced]")
+    size.add_argument(
+        "--preset",
+        choices=_PRESETS,
+        default="balanced",
+        help="1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]",
+    )
     size.add_argument("--frames", type=int, default=72, metavar="N", help="of a film, 24 a second [72]")
     camera = command.add_argument_group("camera")
     camera.add_argument(
@@ -48,7 +53,7 @@ def add(commands: Any) -> None:
     camera.add_argument("--fov", type=float, default=30.0, metavar="DEGREES", help="angle of view [30]")
     light = command.add_argument_group("light")
     light.add_argument("--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the sun, clockwise from north [315]")
-    light.add_argument("--altitude", type=float, default=35.0, metavar="DEGREES", help="of the sun, above the horizon [35]")
+    light.add_argument("--altitude", type=float, default=45.0, metavar="DEGREES", help="of the sun, above the horizon [45]")
     light.add_argument(
         "--sun-from", type=_sun, metavar="AZ,ALT|TIME",
         help="a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00",
