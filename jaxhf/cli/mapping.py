@@ -110,5 +110,5 @@ def report_spacing(options: argparse.Namespace, terrain: "Terrain") -> None:
         said = f"is in degrees, which are measured in metres at latitude {middle:.4g}; heights count as metres ({overrules})"
     elif terrain.crs is None and (terrain.dx, terrain.dy, *given) == (1, 1, None, None):
         said = "does not say how far apart its heights are, 1 is taken (--dx and --dy overrule)"
-    if said:
+    if said and not options.quiet:
         print(f"jaxhf: {options.terrain} {said}", file=sys.stderr)

@@ -5,10 +5,11 @@ import dataclasses
 import datetime
 import math
 import time
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import UserError
+from ..core.errors import ArgumentError, UserError
 from . import arguments, interruption
 
 if TYPE_CHECKING:
@@ -113,7 +114,11 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
     if first is None or not times:
         return None if first is None else np.linspace(first, last, options.frames)
     if place == (None, None):
-        place = terrain.place
+        try:
+            place = terrain.place
+        except ArgumentError as error:
+            why = error.rule.rpartition(", ")[2]
+            raise UserError(f"view: times need --latitude and --longitude for {options.terrain}: {why}") from error
     elif None in place:
         raise UserError("view: --latitude and --longitude belong together, one is missing")
     start, end = (np.datetime64(t.astimezone(datetime.UTC).replace(tzinfo=None), "us") for t in (first, last))
@@ -180,6 +185,9 @@ class _Stage:
         self.colours = self._colours()
         z = terrain.heights.astype(options.precision)
         if options.water is not None:
+            low, high = np.nanmin(z), np.nanmax(z)
+            if not low < options.water < high:
+                warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {options.water:g}", stacklevel=2)
             z, self.colours = with_water(z, self.colours, options.water)
         self.heights = z * z.dtype.type(self.exaggeration)
         low, high = np.nanmin(self.heights), np.nanmax(self.heights)

@@ -39,7 +39,7 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
     path = require_writable_mesh(path)
     if not hasattr(terrain, "dx"):  # as of a Heightfield, which would import JAX here
         raise ArgumentError("save_mesh", "terrain", f"must be a jaxhf.Terrain, it is {kind_of(terrain)}")
-    heights = terrain.heights.astype(np.float64)
+    heights = np.asarray(terrain.heights, np.float64)
     ny, nx = heights.shape
     if base is not None and not base < np.nanmin(heights, initial=np.inf):
         lowest = np.nanmin(heights, initial=np.inf)
