@@ -63,8 +63,8 @@ def errors() -> None:
 
     def report(name: str, z: np.ndarray, at: tuple[int, int], slopes: np.ndarray) -> None:
         row, column = 512 + at[1], 512 + at[0]
-        found = np.tan(np.deg2rad(np.asarray(jaxhf.horizon(z.astype(np.float32), AZIMUTHS))[:, row, column]))
-        seen = float(jaxhf.sky_view(z.astype(np.float32), AZIMUTHS)[row, column])
+        found = np.tan(np.deg2rad(np.asarray(jaxhf.horizon(z.astype(np.float32), AZIMUTHS, dx=1.0))[:, row, column]))
+        seen = float(jaxhf.sky_view(z.astype(np.float32), AZIMUTHS, dx=1.0)[row, column])
         slopes = np.fmax(slopes, 0)
         share = np.mean(1 - slopes / np.hypot(1, slopes))
         print(f"| {name} | {np.abs(found - slopes).max():.1e} | {abs(seen - share):.1e} |", flush=True)

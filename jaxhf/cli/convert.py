@@ -1,6 +1,7 @@
 """`jaxhf convert`: a terrain in another format."""
 
 import argparse
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -43,4 +44,7 @@ def run(options: argparse.Namespace) -> None:
     else:
         save_heights(options.output, terrain)
     alone = f" ({ending} holds the heights alone)" if ending in (".npy", ".exr") else ""
+    if ending not in MESHES:  # which are in metres; others are in the unit of the file
+        dx, dy, x0, y0 = terrain.in_file
+        terrain = dataclasses.replace(terrain, dx=dx, dy=dy, x0=x0, y0=y0, georeference=None)
     print(f"{options.output}: {heightfield_line(terrain)}{alone}")

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from . import arguments, interruption
+from . import arguments, interruption, mapping
 from .skyview import add_terrain, read
 
 
@@ -28,8 +28,7 @@ def run(options: argparse.Namespace) -> None:
     from ..io.rasters import require_writable_raster, save_raster
 
     path = Path(options.output)
-    if path.suffix.lower() == ".png":
-        raise ArgumentError("", "--output", f"must end in .tif or .npy, as angles are not bytes, it is {path}")
+    mapping.require_numbers(options.output, "angles")
     require_writable_raster(path)
     if options.azimuth is not None and not np.isfinite(options.azimuth):
         raise ArgumentError("", "--azimuth", f"must be finite, it is {options.azimuth}")

@@ -21,14 +21,15 @@ def add_files(command: argparse.ArgumentParser, written: str) -> None:
     command.add_argument("--nodata", type=float, metavar="V", help="a stored value that means no height [as the file says]")
 
 
-def add_spacing(command: argparse.ArgumentParser) -> None:
+def add_spacing(command: argparse.ArgumentParser, scale: bool = True) -> None:
     group = command.add_argument_group("spacing")
-    group.add_argument(
-        "--scale",
-        type=float,
-        metavar="S",
-        help="vertical units in a horizontal one [1; degrees are measured in metres at the middle latitude]",
-    )
+    if scale:
+        group.add_argument(
+            "--scale",
+            type=float,
+            metavar="S",
+            help="vertical units in a horizontal one [1; degrees are measured in metres at the middle latitude]",
+        )
     group.add_argument("--dx", type=float, metavar="D", help="spacing of the columns [as the file says]")
     group.add_argument("--dy", type=float, metavar="D", help="spacing of the rows [as the file says]")
 
@@ -80,18 +81,34 @@ def make(
     from ..io.rasters import require_writable_raster, save_raster
     from . import interruption
 
+    if numbers:
+        require_numbers(options.output, kind)
     path = require_writable_raster(options.output)
-    if numbers and path.suffix.lower() == ".png":
-        raise UserError(f"{path}: .png cannot hold the numbers of the {kind}; write .tif or .npy")
     begin = time.perf_counter()
     terrain = read_terrain(options.terrain, nodata=options.nodata)
     values = draw(terrain)
-    degrees = terrain.crs is not None and terrain.crs.degrees
-    if degrees and scaled and options.scale is None and None in (options.dx, options.dy):
-        middle = terrain.y0 + (len(terrain.heights) - 1) / 2 * terrain.dy
-        said = f"degrees, which are measured in metres at latitude {middle:.4g}; heights count as metres (--scale overrules)"
-        print(f"jaxhf: {options.terrain} is in {said}", file=sys.stderr)
+    if scaled and options.scale is None:
+        report_spacing(options, terrain)
     interruption.raise_from_now_on()
     save_raster(path, values, terrain, nodata)
     ny, nx = terrain.heights.shape
     print(f"{path}: {kind}, {nx} x {ny} pixels, {time.perf_counter() - begin:.2f} s")
+
+
+def require_numbers(output: str, kind: str) -> None:
+    """UserError where the output's format holds bytes alone, and so no map of this kind."""
+    if output.lower().endswith(".png"):
+        raise UserError(f"{output}: a .png holds whole numbers from 0 to 255, no {kind}; write .tif or .npy")
+
+
+def report_spacing(options: argparse.Namespace, terrain: "Terrain") -> None:
+    """Says where the cell size is not simply what the file says."""
+    given, said = (options.dx, options.dy), ""
+    if terrain.crs is not None and terrain.crs.degrees and None in given:
+        middle = terrain.y0 + (len(terrain.heights) - 1) / 2 * terrain.dy
+        overrules = "--scale overrules" if hasattr(options, "scale") else "--dx and --dy overrule"
+        said = f"is in degrees, which are measured in metres at latitude {middle:.4g}; heights count as metres ({overrules})"
+    elif terrain.crs is None and (terrain.dx, terrain.dy, *given) == (1, 1, None, None):
+        said = "does not say how far apart its heights are, 1 is taken (--dx and --dy overrule)"
+    if said and not options.quiet:
+        print(f"jaxhf: {options.terrain} {said}", file=sys.stderr)

@@ -51,6 +51,7 @@ class _Parser(argparse.ArgumentParser):
         kind = re.fullmatch(r"argument (.+): invalid (\w+) value: (.*)", message)
         if kind is not None:
             message = f"{kind[1]} must be {_KINDS.get(kind[2], kind[2])}, it is {kind[3]}"
+        message = re.sub(r"^argument (\S+):", r"\1", message)
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
     def parse_known_args(self, *args: Any, **options: Any) -> Any:

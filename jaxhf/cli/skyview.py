@@ -4,7 +4,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
-from . import arguments, interruption
+from . import arguments, interruption, mapping
 
 if TYPE_CHECKING:
     from ..io.terrain import Terrain
@@ -30,6 +30,7 @@ def add_terrain(command: argparse.ArgumentParser, output: str) -> None:
     command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("-o", "--output", required=True, metavar="OUT", help=output)
     command.add_argument("--azimuths", type=int, default=32, metavar="K", help="directions, at even steps from north on [32]")
+    mapping.add_spacing(command, scale=False)
     arguments.add_raster(command)
     arguments.add_machine(command)
 
@@ -41,15 +42,18 @@ def read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
     from ..core.errors import ArgumentError, UserError
     from ..io.errors import FileError
     from ..io.load_terrain import read_terrain
+    from ..maps.surface import spacing
 
+    given = spacing("", options.dx, options.dy)
     if options.azimuths < 1:
         raise ArgumentError("", "--azimuths", f"must be a whole number from 1 on, it is {options.azimuths}")
     stored = read_terrain(options.terrain, options.z_scale, options.nodata)
     if stored.nodata.all():
         raise UserError(f"{options.terrain}: there is no height in it")
     stored = dataclasses.replace(stored, heights=stored.heights.astype(options.precision))
+    mapping.report_spacing(options, stored)
     try:
-        return stored, stored.in_metres()
+        return stored, stored.in_metres(**given)
     except FileError as error:
         raise FileError(f"{options.terrain}: {error}") from error
 

@@ -5,10 +5,11 @@ import dataclasses
 import datetime
 import math
 import time
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import UserError
+from ..core.errors import ArgumentError, UserError
 from . import arguments, interruption
 
 if TYPE_CHECKING:
@@ -35,7 +36,12 @@ def add(commands: Any) -> None:
     command.add_argument("-o", "--output", metavar="OUT", help=".png, .exr, .npy, .pfm; a film: .gif, .mp4 [IN's name, .png]")
     size = command.add_argument_group("picture")
     size.add_argument("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]")
-    size.add_argument("--preset", choices=_PRESETS, default="balanced", help="1, 9 or 64 samples a pixel [balanced]")
+    size.add_argument(
+        "--preset",
+        choices=_PRESETS,
+        default="balanced",
+        help="1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]",
+    )
     size.add_argument("--frames", type=int, default=72, metavar="N", help="of a film, 24 a second [72]")
     camera = command.add_argument_group("camera")
     camera.add_argument(
@@ -48,7 +54,7 @@ def add(commands: Any) -> None:
     camera.add_argument("--fov", type=float, default=30.0, metavar="DEGREES", help="angle of view [30]")
     light = command.add_argument_group("light")
     light.add_argument("--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the sun, clockwise from north [315]")
-    light.add_argument("--altitude", type=float, default=35.0, metavar="DEGREES", help="of the sun, above the horizon [35]")
+    light.add_argument("--altitude", type=float, default=45.0, metavar="DEGREES", help="of the sun, above the horizon [45]")
     light.add_argument(
         "--sun-from", type=_sun, metavar="AZ,ALT|TIME",
         help="a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00",
@@ -108,7 +114,11 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
     if first is None or not times:
         return None if first is None else np.linspace(first, last, options.frames)
     if place == (None, None):
-        place = terrain.place
+        try:
+            place = terrain.place
+        except ArgumentError as error:
+            why = error.rule.rpartition(", ")[2]
+            raise UserError(f"view: times need --latitude and --longitude for {options.terrain}: {why}") from error
     elif None in place:
         raise UserError("view: --latitude and --longitude belong together, one is missing")
     start, end = (np.datetime64(t.astimezone(datetime.UTC).replace(tzinfo=None), "us") for t in (first, last))
@@ -175,6 +185,9 @@ class _Stage:
         self.colours = self._colours()
         z = terrain.heights.astype(options.precision)
         if options.water is not None:
+            low, high = np.nanmin(z), np.nanmax(z)
+            if not low < options.water < high:
+                warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {options.water:g}", stacklevel=2)
             z, self.colours = with_water(z, self.colours, options.water)
         self.heights = z * z.dtype.type(self.exaggeration)
         low, high = np.nanmin(self.heights), np.nanmax(self.heights)

@@ -39,7 +39,7 @@ def hillshade(
 
     Args:
       heights: shape (ny, nx), row 0 in the south, nan where there is none; or a `Terrain`.
-      dx, dy: the spacing; None: a terrain's own, for an array 1.
+      dx, dy: the spacing; None: a terrain's own; an array must have one, which counts for both.
       azimuth: of the light, degrees clockwise from north; without a meaning in "multidirectional".
       altitude: of the light, degrees above the horizon; without a meaning in "igor".
       z_factor: heights are multiplied by it.

@@ -1,5 +1,6 @@
 """Colour ramps: a colour for each height, from a colour file as gdaldem reads it, from matplotlib, or our own."""
 
+import difflib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -99,11 +100,12 @@ def matplotlib_ramp(name: str, low: float, high: float) -> Ramp:
     """
     matplotlib = import_extra("matplotlib", f"the colour ramp {name!r} needs", "plot")
     if name not in matplotlib.colormaps:
-        raise SceneError(
-            name,
-            None,
-            f"there is no such file, nor a matplotlib colour map of this name; {nearest(name, matplotlib.colormaps)}",
-        )
+        known = {known.lower(): known for known in reversed(list(matplotlib.colormaps))}
+        close = difflib.get_close_matches(name.lower(), known, n=3, cutoff=0.5)
+        meant = " or ".join(known[word] for word in close)
+        meant = f"did you mean {meant}?" if meant else "terrain, gist_earth or viridis are some"
+        shown = "matplotlib.org/stable/gallery/color/colormap_reference.html shows all"
+        raise SceneError(name, None, f"there is no such file, nor a matplotlib colour map of this name; {meant} ({shown})")
     table = matplotlib.colormaps[name](np.linspace(0, 1, 256), bytes=True)
     return Ramp(np.linspace(low, high, 256), table)
 

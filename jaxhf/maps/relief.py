@@ -30,7 +30,7 @@ def color_relief(
       ValueError, FileNotFoundError: there is no such file or name, or a line of the file is wrong.
     """
     require_one_of("color_relief", "entries", entries, ENTRIES)
-    ground = surface("color_relief", heights, scale=1.0)
+    ground = surface("color_relief", heights, 1.0, scale=1.0)
     z = ground.north_first()[::-1]
     table = as_ramp(ramp, float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights)))
     bands = 4 if alpha else 3
@@ -77,7 +77,7 @@ def relief(
     shade = hillshade(heights, dx, dy, **light, z_factor=z_factor, scale=scale, compute_edges=True, shadows=shadows)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the light, which has been said
-        level = float(hillshade(np.zeros((3, 3)), **light)[1, 1])
+        level = float(hillshade(np.zeros((3, 3)), 1.0, **light)[1, 1])
     there = shade > 0  # what has no height keeps its colour
 
     def blend(rows: slice) -> None:

@@ -28,6 +28,7 @@ from ..trace.horizon import (
     tile_count,
 )
 from ..trace.normals import vertex_normals
+from .surface import both_spacings, spacing
 
 
 def horizon(
@@ -49,7 +50,7 @@ def horizon(
       terrain: a `Terrain` (degrees count as metres, see `load_heights`), a `Heightfield`, or heights, shape (ny, nx), row 0 in
         the south, nan where there is none.
       azimuths: degrees clockwise from north (y), shape (k,); or how many, from north on at even steps.
-      dx, dy: cell size of heights given as an array, in the unit of the heights, 1 if not given; dx alone counts for both.
+      dx, dy: cell size, in the unit of the heights. An array must have one, which counts for both; None: a terrain's own.
       lowest: the angle where nothing stands higher, degrees: 0, the horizontal; -90 shows terrain that falls away, and
         stays where there is none.
       progress: called with (vertices done, vertices in all) as the map grows; not under a transformation.
@@ -180,12 +181,14 @@ def _holed(heights: jax.Array) -> jax.Array:
 
 
 def _field(owner: str, terrain: Any, dx: float | None, dy: float | None) -> Heightfield:
-    if not isinstance(terrain, Terrain | Heightfield):
-        return Heightfield(terrain, 1.0 if dx is None and dy is None else dx, dy)
-    if dx is not None or dy is not None:
-        kind = type(terrain).__name__
-        raise ArgumentError(owner, "dx" if dy is None else "dy", f"must stand without a {kind}, which has its own cell size")
-    return terrain.in_metres().heightfield() if isinstance(terrain, Terrain) else terrain
+    given = spacing(owner, dx, dy)
+    if isinstance(terrain, Terrain):
+        return terrain.in_metres(**given).heightfield()
+    if not isinstance(terrain, Heightfield):
+        return Heightfield(terrain, *both_spacings(owner, terrain, given))
+    if given:
+        raise ArgumentError(owner, next(iter(given)), "must stand without a Heightfield, which has its own cell size")
+    return terrain
 
 
 def _count(owner: str, azimuths: Any) -> int:

@@ -63,7 +63,7 @@ def aspect(
       ArgumentError: as `hillshade`.
     """
     require_one_of("aspect", "algorithm", algorithm, ALGORITHMS)
-    ground = surface("aspect", heights, scale=1.0)
+    ground = surface("aspect", heights, 1.0, scale=1.0)
     nothing = np.float32(0.0 if zero_for_flat else NODATA)
 
     def formula(window: Window) -> Float32[np.ndarray, "k m"]:

@@ -44,21 +44,38 @@ def surface(
     Args:
       owner: that function, for messages.
       heights: an array of shape (ny, nx), row 0 in the south, or a terrain.
-      dx, dy: the spacing; None: a terrain's own, for an array 1.
+      dx, dy: the spacing; None: a terrain's own; an array must have one, which counts for both.
       scale: vertical units in a horizontal one; None: 1, but a terrain in degrees is measured in metres at its middle latitude.
 
     Raises:
-      ArgumentError: heights are not a grid of numbers, none is finite, or a number is not positive.
+      ArgumentError: heights are not a grid of numbers, none is finite, a number is not positive, or an array has no spacing.
     """
-    grid = {name: value for name, value in (("dx", dx), ("dy", dy)) if value is not None}
-    for name, value in (*grid.items(), ("scale", 1.0 if scale is None else scale)):
-        require_positive(owner, name, value)
+    grid = spacing(owner, dx, dy)
+    require_positive(owner, "scale", 1.0 if scale is None else scale)
     if isinstance(heights, Terrain):
         terrain = heights.in_metres(**grid) if scale is None else heights
         grid = {"dx": terrain.dx, "dy": terrain.dy, **grid}
         heights = terrain.heights
     values = _numbers(owner, heights)
-    return Surface(values, grid.get("dx", 1.0), grid.get("dy", 1.0), 1.0 if scale is None else scale)
+    return Surface(values, *both_spacings(owner, heights, grid), 1.0 if scale is None else scale)
+
+
+def spacing(owner: str, dx: float | None, dy: float | None) -> dict[str, float]:
+    """What is given of the two; ArgumentError where it is not positive."""
+    given = {name: value for name, value in (("dx", dx), ("dy", dy)) if value is not None}
+    for name, value in given.items():
+        require_positive(owner, name, value)
+    return given
+
+
+def both_spacings(owner: str, heights: Any, given: dict[str, float]) -> tuple[float, float]:
+    """dx and dy of an array, of which one alone counts for both; ArgumentError where neither is given, or it is xarray's."""
+    if hasattr(heights, "dims"):
+        raise ArgumentError(owner, "heights", "must not be xarray's, whose rows begin anywhere: take Terrain.from_xarray(...)")
+    if not given:
+        raise ArgumentError(owner, "dx", "must be given for an array: its cell size, in the unit of the heights")
+    square = next(iter(given.values()))
+    return given.get("dx", square), given.get("dy", square)
 
 
 def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:

@@ -19,7 +19,9 @@ from ..scene.skirt import Skirt
 from ..scene.texture import ImageTexture
 from .render import Prepared, prepare, render
 
-_SUN, _SKY = 0.8, 0.3  # radiance of white ground that faces the sun, and what the whole sky adds
+# Radiance of white ground that faces the sun, and what the whole sky adds where nothing hides it, or where nobody asks.
+_SUN, _SKY, _EVEN_SKY = (0.76, 0.74, 0.70), (0.38, 0.42, 0.48), (0.34, 0.38, 0.44)
+_OCCLUSION, _MOST_OCCLUDED = 16, 2**21  # azimuths; heights, beyond which looking round takes longer than the picture
 _ABOVE, _BELOW = (0.60, 0.72, 0.86), (0.95, 0.95, 0.93)  # the background's highest and lowest row
 _HAZE = (0.78, 0.84, 0.90)
 _SHALLOW, _DEEP = (0.16, 0.38, 0.46), (0.02, 0.09, 0.20)
@@ -33,11 +35,11 @@ class Look:
     Attributes:
       azimuth, altitude: of the sun, degrees clockwise from north and above the horizon.
       haze: the share of light that haze takes over the length of the terrain, 0 to 1.
-      samples: rays a pixel, a square number.
+      samples: rays a pixel, a square number; with more than one, mountains hide parts of the sky.
     """
 
     azimuth: float = 315.0
-    altitude: float = 35.0
+    altitude: float = 45.0
     haze: float = 0.15
     samples: int = 9
 
@@ -100,11 +102,10 @@ def block(field: Heightfield, colours: Any, camera: Perspective, look: Look, bas
     objects = [Object(field, Matte(albedo))]
     if base is not None:
         objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))
-    return Scene(objects, camera, _lights(look))
-
-
-def _lights(look: Look) -> list[Any]:
-    return [Directional.from_angles(look.azimuth, look.altitude, math.pi * _SUN), Sky(_SKY)]
+    sun = Directional.from_angles(look.azimuth, look.altitude, np.array(_SUN) * math.pi)
+    occluded = look.samples > 1 and field.heights.size <= _MOST_OCCLUDED
+    sky = Sky(np.array(_SKY), occlusion=_OCCLUSION) if occluded else Sky(np.array(_EVEN_SKY))
+    return Scene(objects, camera, [sun, sky])
 
 
 def photograph(

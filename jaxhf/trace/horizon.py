@@ -26,7 +26,7 @@ from .grid import Grid
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
 _TILE = 32  # vertices along its side
 _STRETCH = 32  # cells, along the axis on which a direction moves faster
-_TOGETHER = 4  # crossings in one pass over a tile
+_TOGETHER = 8  # crossings in one pass over a tile
 _GRAIN = 8  # cells from one of the windows whose highest points are kept to the next
 _MARGIN = _TILE + 1
 
@@ -265,11 +265,12 @@ def _from_tile(
 
     def moved(heights: jax.Array, by_x: Index, by_y: Index) -> jax.Array:
         """Of the tile, moved by some cells. The start is clamped: a tile beyond the margin is one within it, all nan."""
-        return lax.dynamic_slice(heights, (y + _MARGIN + by_y, x + _MARGIN + by_x), (_TILE, _TILE))
+        start = y + _MARGIN + by_y, x + _MARGIN + by_x
+        return lax.dynamic_slice(heights, start, (_TILE, _TILE), allow_negative_indices=False)
 
     def moved_edges(kind: Index, by_x: Index, by_y: Index) -> jax.Array:
         start = kind, y + _MARGIN + by_y, x + _MARGIN + by_x
-        return lax.dynamic_slice(view.edges, start, (1, _TILE, _TILE))[0]
+        return lax.dynamic_slice(view.edges, start, (1, _TILE, _TILE), allow_negative_indices=False)[0]
 
     z = moved(view.heights, jnp.zeros_like(x), jnp.zeros_like(y))
     window = [(at + first[:, k]) // _GRAIN + _reach() for k, at in enumerate((x, y))]
@@ -294,19 +295,22 @@ def _from_tile(
             found = None if found is None else jnp.where(steeper, n, found)
         return slopes, found
 
-    def walk(carry: tuple[Index, Any]) -> tuple[Index, Any]:
-        k, seen = carry
+    def walk(carry: tuple[Index, Any, Any]) -> tuple[Index, Any, Any]:
+        k, _, seen = carry
         groups = begins[k] // _TOGETHER, (begins[k + 1] + _TOGETHER - 1) // _TOGETHER
         needed = rises(top[k], seen[0], bounds[k], bounds[k + 1])
-        return k + 1, lax.cond(needed, lambda seen: lax.fori_loop(*groups, look, seen), lambda seen: seen, seen)
+        return k + 1, *lax.cond(
+            needed,
+            lambda seen: (jnp.ones((), bool), lax.fori_loop(*groups, look, seen)),
+            lambda seen: (rises(top_from_here[k], seen[0], bounds[k], end), seen),
+            seen,
+        )
 
-    def going(carry: tuple[Index, Any]) -> Bool[jax.Array, ""]:
-        k, (slopes, _) = carry
-        here = jnp.minimum(k, stretches - 1)
-        return (k < stretches) & rises(top_from_here[here], slopes, bounds[here], end)
+    def going(carry: tuple[Index, Any, Any]) -> Bool[jax.Array, ""]:
+        return (carry[0] < stretches) & carry[1]
 
     seen = jnp.full_like(z, lowest), jnp.full(z.shape, -1, jnp.int32) if numbered else None
-    return lax.while_loop(going, walk, (jnp.zeros((), jnp.int32), seen))[1]
+    return lax.while_loop(going, walk, (jnp.zeros((), jnp.int32), jnp.ones((), bool), seen))[2]
 
 
 def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:

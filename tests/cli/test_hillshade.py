@@ -84,6 +84,15 @@ def test_degrees_are_measured_in_metres_and_that_is_said(tmp_path, capsys):
     np.testing.assert_allclose(np.load(tmp_path / "slope.npy"), expected, rtol=1e-5)
 
 
+def test_an_unknown_spacing_is_said(tmp_path, capsys):
+    np.save(tmp_path / "in.npy", hills(False).heights)
+    command = ["slope", str(tmp_path / "in.npy"), "-o", str(tmp_path / "slope.npy")]
+    assert main(command) == 0
+    assert "in.npy does not say how far apart its heights are, 1 is taken (--dx and --dy overrule)" in capsys.readouterr().err
+    assert main([*command, "--dx", "1"]) == 0
+    assert capsys.readouterr().err == ""
+
+
 def test_maps_and_conversions_do_without_jax(tmp_path):
     heights = np.random.default_rng(0).uniform(0, 1, (41, 41))
     np.save(tmp_path / "in.npy", heights)
@@ -105,12 +114,13 @@ def test_maps_and_conversions_do_without_jax(tmp_path):
         (["hillshade", "--altitude", "0"], "hillshade: altitude must be above 0 and at most 90 degrees, it is 0.0"),
         (["hillshade", "--scale", "-1"], "hillshade: scale must be positive and finite, it is -1.0"),
         (["slope", "--dx", "0"], "slope: dx must be positive and finite, it is 0.0"),
-        (["slope", "-o", "map.png"], ".png cannot hold the numbers of the slope; write .tif or .npy"),
+        (["slope", "-o", "map.png"], "map.png: a .png holds whole numbers from 0 to 255, no slope; write .tif or .npy"),
         (["aspect", "-o", "map.exr"], "cannot write a map with the ending '.exr'"),
         (
             ["relief", "--ramp", "terain"],
-            "terain: there is no such file, nor a matplotlib colour map of this name; did you mean",
+            "terain: there is no such file, nor a matplotlib colour map of this name; did you mean terrain or ",
         ),
+        (["relief", "--ramp", "nosuch"], "colour map of this name; terrain, gist_earth or viridis are some (matplotlib.org/"),
         (["relief", "--ramp", "no.txt"], "no.txt: there is no such file"),
         (["hillshade", "--nodata", "0"], "hillshade: heights must hold a finite one"),
     ],

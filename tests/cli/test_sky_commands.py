@@ -89,8 +89,9 @@ def test_a_bar_tells_what_is_done_until_ctrl_c(run, name, heights, tmp_path, mon
     [
         (("skyview", "sky.npy", "--azimuths", "0"), "--azimuths must be a whole number from 1 on, it is 0"),
         (("skyview", "sky.txt"), "sky.txt"),
-        (("horizon", "h.png"), "--output must end in .tif or .npy, as angles are not bytes, it is "),
+        (("horizon", "h.png"), "h.png: a .png holds whole numbers from 0 to 255, no angles; write .tif or .npy"),
         (("horizon", "h.npy", "--azimuth", "nan"), "--azimuth must be finite, it is nan"),
+        (("horizon", "h.npy", "--dx", "-2"), "dx must be positive and finite, it is -2.0"),
     ],
 )
 def test_mistakes_are_one_line(run, arguments, message):

@@ -67,6 +67,13 @@ def test_info_refuses(folder, capsys):
         assert message in capsys.readouterr().err
 
 
+def test_convert_reports_what_the_file_says(folder, capsys):
+    """Its coordinates, but for a mesh, which is in metres."""
+    for ending, said in ((".asc", "cells 0.01 x 0.01, origin (10, 44.99)"), (".ply", "cells 788.468 x 1111.32, origin (0, 0)")):
+        assert main(["convert", str(folder / "degrees.npz"), str(folder / f"x{ending}")]) == 0
+        assert said in capsys.readouterr().out
+
+
 def test_convert_to_a_mesh(folder, capsys):
     trimesh = pytest.importorskip("trimesh")
     assert main(["convert", str(folder / "metres.asc"), str(folder / "x.glb"), "--base", "0"]) == 0

@@ -34,9 +34,12 @@ def terrain(tmp_path_factory) -> str:
     return str(path)
 
 
+@pytest.mark.filterwarnings("always:view. the heights go from")
 def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, capsys):
-    assert main(["view", terrain, "-o", str(tmp_path / "out.png"), *SMALL]) == 0
-    assert "48 x 32 pixels, heights x 1, " in capsys.readouterr().out
+    assert main(["view", terrain, "-o", str(tmp_path / "out.png"), "--water", "-9", *SMALL]) == 0
+    told = capsys.readouterr()
+    assert "48 x 32 pixels, heights x 1, " in told.out
+    assert told.err.endswith(" to 300, --water is -9\n")
     image = imageio.imread(tmp_path / "out.png").astype(int)
     background = (image[:, :1] == image).all(-1)
     rows, columns = np.nonzero(~background)
@@ -144,7 +147,8 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
         (["--sun-from", "90,10"], "--sun-from and --sun-to belong together"),
         (["--sun-from", "90,10", "--sun-to", "90,20"], "a moving sun makes a film"),
         (["-o", "a.gif", "--sun-from", "90,10", "--sun-to", MORNING], "must both be angles or both be times"),
-        (["-o", "a.gif", *BY_TIME], "place must be given as latitude and longitude, it has no georeference"),
+        (["-o", "a.gif", *BY_TIME], "in.npz: it has no georeference"),
+        (["-o", "a.gif", "--sun-from", "noon"], "error: --sun-from must be an azimuth and an altitude, as 90,10, or a time"),
         (["-o", "a.gif", *BY_TIME, "--latitude", "46.5"], "--latitude and --longitude belong together, one is missing"),
         (
             ["-o", "a.gif", *BY_TIME, "--latitude", "-80", "--longitude", "8"],
@@ -160,7 +164,11 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
 )
 def test_what_cannot_be_is_refused_in_one_line(terrain, tmp_path, capsys, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
-    assert main(["view", terrain, "-o", "out.png", *words]) == 2
+    try:
+        code = main(["view", terrain, "-o", "out.png", *words])
+    except SystemExit as refused:
+        code = refused.code
+    assert code == 2
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1

@@ -156,13 +156,31 @@ def test_degrees_become_metres_unless_a_scale_is_given():
 )
 def test_refuses(heights, options, message):
     with pytest.raises(jaxhf.ArgumentError, match=re.escape(message)):
-        jaxhf.hillshade(heights, **options)
+        jaxhf.hillshade(heights, **{"dx": 1.0, **options})
+
+
+@pytest.mark.parametrize("draw", [jaxhf.hillshade, jaxhf.slope, jaxhf.relief, jaxhf.horizon, jaxhf.sky_view])
+def test_arrays_need_a_cell_size(draw):
+    """As a slope of unknown cells is one of nothing; without one GDAL and others take 1 in silence."""
+    with pytest.raises(jaxhf.ArgumentError, match="dx must be given for an array: its cell size, in the unit of the heights"):
+        draw(rough(9, 9))
+    labelled = rough(9, 9).view(type("DataArray", (np.ndarray,), {"dims": ("y", "x")}))
+    with pytest.raises(jaxhf.ArgumentError, match=r"heights must not be xarray's, .* Terrain.from_xarray"):
+        draw(labelled, dx=1.0)
+
+
+def test_one_spacing_counts_for_both():
+    for draw in (jaxhf.hillshade, jaxhf.slope):
+        np.testing.assert_array_equal(draw(rough(9, 9), 30.0), draw(rough(9, 9), 30.0, 30.0))
+        np.testing.assert_array_equal(draw(rough(9, 9), dy=30.0), draw(rough(9, 9), 30.0))
+    terrain = Terrain(rough(9, 9), 20.0, 30.0)  # of which only what is given is overruled
+    np.testing.assert_array_equal(jaxhf.slope(terrain, 10.0), jaxhf.slope(terrain.heights, 10.0, 30.0))
 
 
 def test_light_beyond_the_zenith():
     with pytest.warns(UserWarning, match="opposite the azimuth, 60.0 high"):
-        found = jaxhf.hillshade(rough(9, 9), azimuth=20.0, altitude=120.0)
-    np.testing.assert_array_equal(found, jaxhf.hillshade(rough(9, 9), azimuth=200.0, altitude=60.0))
+        found = jaxhf.hillshade(rough(9, 9), 1.0, azimuth=20.0, altitude=120.0)
+    np.testing.assert_array_equal(found, jaxhf.hillshade(rough(9, 9), 1.0, azimuth=200.0, altitude=60.0))
 
 
 RAMPS = {
@@ -207,7 +225,8 @@ def test_shading_darkens_and_lightens_tints():
     heights = np.abs(x - 9.0) + 20.0
     heights[:, 14:] = 25.0
     heights[5, 17] = np.nan
-    tint, shaded = jaxhf.color_relief(heights).astype(int), jaxhf.relief(heights, azimuth=270.0, altitude=25.0).astype(int)
+    tint = jaxhf.color_relief(heights).astype(int)
+    shaded = jaxhf.relief(heights, 1.0, azimuth=270.0, altitude=25.0).astype(int)
     np.testing.assert_array_equal(shaded[:, 18], tint[:, 18])
     assert (shaded[:, 2:8] < tint[:, 2:8]).all()  # falls to the east
     assert (shaded[:, 11:13] > tint[:, 11:13]).any()

@@ -59,16 +59,16 @@ def test_horizon_is_that_of_every_crossing(dtype, lowest, tolerance):
 def test_closed_forms():
     """A plane, a valley, a pit with a flat floor, a far wall a little above a near one; the sky that an inclined plane sees."""
     a = np.deg2rad(AZIMUTHS)[:, None, None]
-    plane = np.asarray(jaxhf.horizon(0.5 * X - 0.2 * Y, AZIMUTHS))[:, 1:-1, 1:-1]
+    plane = np.asarray(jaxhf.horizon(0.5 * X - 0.2 * Y, AZIMUTHS, dx=1.0))[:, 1:-1, 1:-1]
     slope = 0.5 * np.sin(a) - 0.2 * np.cos(a)
     np.testing.assert_allclose(plane, np.rad2deg(np.arctan(np.fmax(slope, 0))) + 0 * plane, atol=1e-9)
-    valley = np.asarray(jaxhf.horizon(0.7 * np.abs(X - 36), AZIMUTHS))[:, 20, 36]
+    valley = np.asarray(jaxhf.horizon(0.7 * np.abs(X - 36), AZIMUTHS, dx=1.0))[:, 20, 36]
     np.testing.assert_allclose(valley, np.rad2deg(np.arctan(0.7 * np.abs(np.sin(a[:, 0, 0])))), atol=1e-9)
-    pit = np.asarray(jaxhf.horizon(np.where(np.hypot(X - 36, Y - 20) < 17.5, -12.0, 0.0), AZIMUTHS))[:, 20, 36]
+    pit = np.asarray(jaxhf.horizon(np.where(np.hypot(X - 36, Y - 20) < 17.5, -12.0, 0.0), AZIMUTHS, dx=1.0))[:, 20, 36]
     assert np.all((pit > np.rad2deg(np.arctan(12 / 19))) & (pit < np.rad2deg(np.arctan(12 / 17))))
-    walls = np.asarray(jaxhf.horizon(np.where(X == 20, 6.0, np.where(X == 33, 33 * 0.302, 0.0)), AZIMUTHS))[2, :, 0]
+    walls = np.asarray(jaxhf.horizon(np.where(X == 20, 6.0, np.where(X == 33, 33 * 0.302, 0.0)), AZIMUTHS, dx=1.0))[2, :, 0]
     np.testing.assert_allclose(walls, np.rad2deg(np.arctan(0.302)), atol=1e-9)
-    seen = jaxhf.sky_view(0.5 * X - 0.2 * Y, 32, weighting="slope")[1:-1, 1:-1]
+    seen = jaxhf.sky_view(0.5 * X - 0.2 * Y, 32, weighting="slope", dx=1.0)[1:-1, 1:-1]
     np.testing.assert_allclose(seen, (1 + 1 / np.sqrt(1.29)) / 2, atol=1e-3)
 
 
@@ -103,7 +103,7 @@ def test_derivatives_are_those_of_differences():
     weights, eps = rng.normal(size=z.shape), 1e-6
 
     def weighted(z):
-        seen = jaxhf.sky_view(z, 6, weighting="slope")
+        seen = jaxhf.sky_view(z, 6, weighting="slope", dx=1.0)
         return jnp.sum(jnp.where(jnp.isnan(seen), 0, seen * weights))
 
     numeric = (weighted(z + eps * dz) - weighted(z - eps * dz)) / (2 * eps)
@@ -120,18 +120,24 @@ def test_derivatives_are_those_of_differences():
     np.testing.assert_allclose(np.sum(gradient * dz), numeric, rtol=1e-6)
 
 
+FLAT = np.zeros((2, 2))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: jaxhf.horizon(np.zeros((2, 2)), 0), "horizon: azimuths must be a whole number from 1 on, it is 0"),
-        (lambda: jaxhf.horizon(np.zeros((2, 2)), [np.nan]), "horizon: azimuths must be a whole number or a list of finite"),
+        (lambda: jaxhf.horizon(FLAT, 0, dx=1.0), "horizon: azimuths must be a whole number from 1 on, it is 0"),
+        (lambda: jaxhf.horizon(FLAT, [np.nan], dx=1.0), "horizon: azimuths must be a whole number or a list of finite"),
         (
-            lambda: jaxhf.horizon(np.zeros((2, 2)), lowest=90.0),
+            lambda: jaxhf.horizon(FLAT, lowest=90.0, dx=1.0),
             "horizon: lowest must be from -90 to below 90 degrees, it is 90.0",
         ),
-        (lambda: jaxhf.horizon(np.zeros(4)), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (4,)"),
-        (lambda: jaxhf.sky_view(np.zeros((2, 2)), -2), "sky_view: azimuths must be a whole number from 1 on, it is -2"),
-        (lambda: jaxhf.sky_view(np.zeros((2, 2)), weighting="x"), "sky_view: weighting must be among solid-angle, horiz"),
+        (
+            lambda: jaxhf.horizon(FLAT[0], dx=1.0),
+            "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (2,)",
+        ),
+        (lambda: jaxhf.sky_view(FLAT, -2, dx=1.0), "sky_view: azimuths must be a whole number from 1 on, it is -2"),
+        (lambda: jaxhf.sky_view(FLAT, weighting="x", dx=1.0), "sky_view: weighting must be among solid-angle, horiz"),
         (
             lambda: jaxhf.sky_view(jaxhf.Heightfield(np.zeros((2, 2))), dx=1.0),
             "sky_view: dx must stand without a Heightfield, w",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.rendering.view import Look, _in_haze as in_haze, _moved as moved, exaggeration, with_water
+from jaxhf.rendering.view import Look, _in_haze as in_haze, _moved as moved, block, exaggeration, with_water
 
 RAMP = np.linspace(0, 1, 101)[:, None] * np.ones(101)
 
@@ -53,3 +53,12 @@ def test_a_camera_looks_past_the_centres_of_its_pixels():
         past = moved(camera, dx, dy)
         for x, y in ((0.5, 39.5), (17.0, 3.0)):
             np.testing.assert_allclose(past.ray(*jnp.array([x, y])).d, camera.ray(*jnp.array([x + dx, y + dy])).d, atol=1e-6)
+
+
+@pytest.mark.parametrize(("samples", "side", "occlusion"), [(9, 17, 16), (1, 17, None), (9, 1500, None)])
+def test_mountains_hide_the_sky_but_in_drafts_and_large_terrains(samples: int, side: int, occlusion: int | None):
+    field = jaxhf.Heightfield(np.zeros((side, side), np.float32), 1.0)
+    camera = jaxhf.Perspective.framing(field, 205.0, 35.0, width=8, height=8)
+    sky = block(field, np.full(3, 0.5), camera, Look(samples=samples), None).lights[1]
+    assert isinstance(sky, jaxhf.Sky)
+    assert sky.occlusion == occlusion
