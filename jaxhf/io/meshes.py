@@ -1,23 +1,25 @@
 """Terrain as triangles for other programs, written through trimesh."""
 
-from collections.abc import Iterator
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from ..core.errors import ArgumentError, kind_of
-from .files import PathLike, by_ending, file_path, replacing, require_folder
-from .mesh_formats import Mesh, Triangles, write_glb, write_obj, write_ply
+from ..core.extras import import_extra
+from .files import PathLike, by_ending, file_path, reading, replacing, require_folder
+from .images import linear_from_srgb
 from .terrain import Terrain
 
-_WRITERS = {".glb": write_glb, ".obj": write_obj, ".ply": write_ply}
-MESHES = tuple(_WRITERS)
+MESHES = (".glb", ".obj", ".ply")
+
+_Triangles = Int[np.ndarray, "m 3"]
 
 
 def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, colours: Any = None, uv: bool = False) -> None:
-    """Writes a terrain as a mesh of the triangles that the renderer sees: .ply, .obj or .glb.
+    """Writes a terrain as a mesh of the triangles that the renderer sees: .ply, .obj or .glb (needs trimesh).
 
     Its vertices are those of the terrain from vertex (0, 0) on, as float32 holds no UTM coordinates, in the terrain's unit; x
     points east, y north and z up, in .glb y up and z south, as glTF demands. Cells at a hole are left out. The file appears
@@ -32,7 +34,7 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
       uv: whether each vertex has its position in the footprint, 0..1 to the east and to the north, for an image to be draped.
 
     Raises:
-      ValueError: the ending is not known, `path` is a folder, no cell has four heights, or `base`,
+      ValueError: the ending is not known, trimesh is missing, `path` is a folder, no cell has four heights, or `base`,
         `colours` or `uv` cannot be; see there.
       FileNotFoundError, PermissionError: the folder does not exist, or cannot be written to.
     """
@@ -53,48 +55,87 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
     whole = finite[:-1, :-1] & finite[:-1, 1:] & finite[1:, 1:] & finite[1:, :-1]
     if not whole.any():
         raise ArgumentError("save_mesh", "terrain", "must have a cell without a hole, it has none")
-    faces, z, of = _surface(whole), heights.ravel(), np.arange(ny * nx, dtype=np.int32)
+    points = np.stack([*np.meshgrid(np.arange(nx) * terrain.dx, np.arange(ny) * terrain.dy), heights], axis=-1).reshape(-1, 3)
+    faces = _surface(whole)
+    of = np.arange(ny * nx)  # the vertex of the terrain that each point belongs to
     if base is not None:
-        faces = np.concatenate([faces, faces[:, ::-1] + np.int32(ny * nx), *_walls(whole, ny * nx)])
-        z, of = np.concatenate([z, np.full(ny * nx, base)]), np.tile(of, 2)
-    used = np.zeros(len(of), bool)
+        faces = np.concatenate([faces, faces[:, ::-1] + len(of), _walls(whole, len(of))])
+        points, of = np.concatenate([points, points * (1, 1, 0) + (0, 0, base)]), np.tile(of, 2)
+    used = np.zeros(len(points), bool)
     used[faces] = True
     if not used.all():  # copies of the largest arrays
-        z, of, faces = z[used], of[used], (np.cumsum(used, dtype=np.int32) - np.int32(1))[faces]
-    mesh = Mesh(z, of, faces, (ny, nx), (terrain.dx, terrain.dy), colours, uv)
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        by_ending(_WRITERS, path, "write a mesh with")(file, mesh)
+        points, faces, of = points[used], (np.cumsum(used) - 1)[faces], of[used]
+    mesh = _mesh(path, points, faces, terrain, of, colours, uv)
+    with replacing(path) as temporary:
+        temporary.write_bytes(mesh)
 
 
 def require_writable_mesh(path: PathLike) -> Path:
     """Checks that `save_mesh` can write to `path`; errors as there."""
     path = file_path("save_mesh", path)
-    by_ending(_WRITERS, path, "write a mesh with")
+    by_ending(dict.fromkeys(MESHES), path, "write a mesh with")
     require_folder(path, "a mesh")
+    with reading(path):
+        import_extra("trimesh", f"writing {path.suffix.lower()} needs", "mesh")
     return path
 
 
-def _corners(whole: Bool[np.ndarray, "cy cx"]) -> list[Int[np.ndarray, " cells"]]:
-    """The vertices of each whole cell, counter-clockwise from 00: 00, 10, 11, 01."""
-    (iy, ix), columns = (at.astype(np.int32) for at in np.nonzero(whole)), np.int32(whole.shape[1] + 1)
-    first = iy * columns + ix
-    return [first, first + 1, first + 1 + columns, first + columns]
+def _corners(shape: tuple[int, ...]) -> list[np.ndarray]:
+    """The vertices of each cell, counter-clockwise from 00: 00, 10, 11, 01."""
+    index = np.arange((shape[0] + 1) * (shape[1] + 1)).reshape(shape[0] + 1, shape[1] + 1)
+    return [index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]]
 
 
-def _surface(whole: Bool[np.ndarray, "cy cx"]) -> Triangles:
+def _surface(whole: Bool[np.ndarray, "cy cx"]) -> _Triangles:
     """Two triangles for each whole cell, split along 00-11, counter-clockwise from above."""
-    a, b, c, d = _corners(whole)
-    faces = np.empty((len(a), 6), np.int32)
-    for k, corner in enumerate((a, b, c, a, c, d)):
-        faces[:, k] = corner
-    return faces.reshape(-1, 3)
+    a, b, c, d = (corner[whole] for corner in _corners(whole.shape))
+    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
 
 
-def _walls(whole: Bool[np.ndarray, "cy cx"], count: int) -> Iterator[Triangles]:
+def _walls(whole: Bool[np.ndarray, "cy cx"], count: int) -> _Triangles:
     """Two triangles below each edge of a whole cell that no other shares; a vertex's foot is `count` further."""
-    padded, foot = np.pad(whole, 1), np.int32(count)
+    corners, padded, found = _corners(whole.shape), np.pad(whole, 1), []
     for k, (iy, ix) in enumerate(((0, 1), (1, 2), (2, 1), (1, 0))):  # the neighbours in the south, east, north and west
-        corners = _corners(whole & ~padded[iy : iy + whole.shape[0], ix : ix + whole.shape[1]])
-        p, q = corners[k], corners[(k + 1) % 4]
-        yield np.stack([q, p, p + foot], axis=-1)
-        yield np.stack([q, p + foot, q + foot], axis=-1)
+        alone = whole & ~padded[iy : iy + whole.shape[0], ix : ix + whole.shape[1]]
+        p, q = corners[k][alone], corners[(k + 1) % 4][alone]
+        found += [np.stack([q, p, p + count], axis=-1), np.stack([q, p + count, q + count], axis=-1)]
+    return np.concatenate(found)
+
+
+def _mesh(
+    path: Path,
+    points: Float[np.ndarray, "n 3"],
+    faces: _Triangles,
+    terrain: Terrain,
+    of: Int[np.ndarray, " n"],
+    colours: Any,
+    uv: bool,
+) -> bytes:
+    """The file's bytes; `of` says which vertex of the terrain each point belongs to."""
+    trimesh, ending = import_extra("trimesh", "writing meshes needs", "mesh"), path.suffix.lower()
+    ny, nx = terrain.heights.shape
+    visual = None
+    if colours is not None:
+        colours = colours.reshape(ny * nx, -1)[of]
+        if ending == ".glb":  # whose colours are linear
+            linear = (linear_from_srgb(np.arange(256) / 255) * 255 + 0.5).astype(np.uint8)
+            colours = np.concatenate([linear[colours[:, :3]], colours[:, 3:]], axis=-1)
+        visual = trimesh.visual.ColorVisuals(vertex_colors=colours)
+    elif uv:
+        visual = trimesh.visual.TextureVisuals(uv=np.stack([of % nx / (nx - 1), of // nx / (ny - 1)], axis=-1))
+    if ending == ".glb":
+        points = points[:, [0, 2, 1]] * (1, 1, -1)
+    plain = {"tree_postprocessor": _with_material} if ending == ".glb" else {}
+    data = trimesh.Trimesh(points, faces, process=False, visual=visual).export(file_type=ending[1:], **plain)
+    if isinstance(data, bytes):
+        return data
+    return re.sub(r"^(mtllib|usemtl).*\n?", "", data, flags=re.MULTILINE).encode()
+
+
+def _with_material(tree: Any) -> None:
+    """Gives a glTF without a material a matte one, as those who show it otherwise take the surface for metal."""
+    if "materials" not in tree:
+        tree["materials"] = [{"pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1}}]
+        for mesh in tree["meshes"]:
+            for primitive in mesh["primitives"]:
+                primitive["material"] = 0

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("resource")  # not on Windows
 pytest.importorskip("rasterio")
 pytest.importorskip("OpenEXR")
+pytest.importorskip("trimesh")
 
 WRITERS = """
 import os, pathlib, resource, signal, sys, time

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxhf import Terrain, jacksboro, load_heights, save_heights
+from jaxhf import Terrain, jacksboro, load_heights, save_heights, save_mesh
 from jaxhf.io.files import MAX_PIXELS
 from jaxhf.io.georeference import metres_per_degree
 
@@ -241,6 +241,9 @@ def test_extras_are_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(ValueError, match=r"x.tif: reading .tif needs rasterio: pip install 'jaxhf\[geo\]'"):
         load_heights(tmp_path / "x.tif")
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(ValueError, match=r"x.glb: writing .glb needs trimesh: pip install 'jaxhf\[mesh\]'"):
+        save_mesh(tmp_path / "x.glb", Terrain(np.zeros((2, 2))))
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ValueError, match=r"pip install 'jaxhf\[plot\]'"):
         jacksboro()
