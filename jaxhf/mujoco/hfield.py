@@ -54,8 +54,8 @@ class HField(eqx.Module):
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
             rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"
             raise ArgumentError("HField", "data", rule)
-        if not isinstance(data, Tracer):
-            low, high = np.min(np.asarray(self.data), initial=1), np.max(np.asarray(self.data), initial=0)
+        if not isinstance(data, Tracer) and data.size:
+            low, high = np.asarray(self.data).min(), np.asarray(self.data).max()
             if not (low >= 0 and high <= 1):
                 raise ArgumentError("HField", "data", f"must lie from 0 to 1, it goes from {low:g} to {high:g}")
         self.size, self.pos, self.quat = (
