@@ -157,6 +157,7 @@ def speed(robots: int, cores: int = 2) -> None:
     aimed = jnp.asarray(random.normal(size=(robots, len(places), 3)) * [1, 1, 0.3] - [0, 0, 0.3], jnp.float32)
     starts = jnp.broadcast_to(pos[:, None], aimed.shape)
     one = HField(data[0], size)
+    ready, one_ready = fields.prepared(), one.prepared()
     runs: dict[str, tuple[Callable[[], Any], int]] = {
         "mj_ray, one thread": (lambda: one_by_one(0), len(o)),
         f"mj_ray, {cores} threads": (lambda: threads(one_by_one, cores), cores * len(o)),
@@ -167,6 +168,8 @@ def speed(robots: int, cores: int = 2) -> None:
         "height_scan, tilted with the robot (walks)": (lambda: height_scan(fields, pos, quat, align="base"), many),
         "ray, slanted, each robot on its own": (lambda: ray(fields, starts, aimed), many),
         "ray, slanted, all on one": (lambda: ray(one, starts.reshape(-1, 3), aimed.reshape(-1, 3)), many),
+        "ray, slanted, each on its own, prepared": (lambda: ray(ready, starts, aimed), many),
+        "ray, slanted, all on one, prepared": (lambda: ray(one_ready, starts.reshape(-1, 3), aimed.reshape(-1, 3)), many),
     }  # fmt: skip
     for _ in range(2):
         for name, (run, count) in runs.items():
@@ -174,6 +177,16 @@ def speed(robots: int, cores: int = 2) -> None:
     base = results[f"mj_ray, {cores} threads"]
     for name, value in results.items():
         print(f"{value / 1e6:8.2f} million rays a second, {value / base:6.1f} times mj_ray's in threads: {name}")
+
+    walks = {name: run for name, (run, _) in runs.items() if name.startswith("ray, ")}
+    seconds = {name: [] for name in walks}
+    for _ in range(9):
+        for name, run in walks.items():
+            begin = time.process_time()
+            jax.block_until_ready(run())
+            seconds[name].append(time.process_time() - begin)
+    for name, times in seconds.items():
+        print(f"{np.median(times):6.3f} s of processor time, median of {len(times)}: {name}")
 
     compiled = jax.jit(height_scan).lower(fields, pos, quat).compile().memory_analysis()
     assert compiled is not None

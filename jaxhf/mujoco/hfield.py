@@ -1,6 +1,5 @@
 """MuJoCo's height field: heights on a grid over a solid base, somewhere in the world."""
 
-import functools
 from typing import Any
 
 import equinox as eqx
@@ -11,9 +10,10 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Float
 
-from ..core.compilation import compiled
 from ..core.errors import ArgumentError
+from ..core.settings import Settings
 from ..core.types import AnyArray, float_leaf, require_finite
+from ..rendering.render import heightfield_grids
 from ..scene.heightfield import Heightfield
 from ..trace.grid import Grid, make_grid
 
@@ -54,8 +54,8 @@ class HField(eqx.Module):
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
             rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"
             raise ArgumentError("HField", "data", rule)
-        if not isinstance(data, Tracer):
-            low, high = np.min(np.asarray(self.data), initial=1), np.max(np.asarray(self.data), initial=0)
+        if not isinstance(data, Tracer) and data.size:
+            low, high = np.asarray(self.data).min(), np.asarray(self.data).max()
             if not (low >= 0 and high <= 1):
                 raise ArgumentError("HField", "data", f"must lie from 0 to 1, it goes from {low:g} to {high:g}")
         self.size, self.pos, self.quat = (
@@ -90,7 +90,8 @@ class HField(eqx.Module):
 
         For many calls with the same heights: other ones need an HField of their own. Bounds take 5 times the memory of heights.
         """
-        grids = _grids(self.data.reshape(-1, *self.data.shape[-2:]))
+        data = lax.stop_gradient(self.data).reshape(-1, *self.data.shape[-2:])
+        grids = heightfield_grids(data, 1.0, 1.0, Settings(shading="flat"))
         grids = jax.tree.map(lambda leaf: leaf.reshape(*self.batch, *leaf.shape[1:]), grids)
         return eqx.tree_at(lambda field: field._grid, self, grids, is_leaf=lambda leaf: leaf is None)
 
@@ -131,11 +132,6 @@ class HField(eqx.Module):
 def search_grid(data: Float[jax.Array, "nrow ncol"]) -> Grid:
     """For the search of a triangle alone: cells by cells by data."""
     return make_grid(Heightfield(lax.stop_gradient(data), 1.0, 1.0), None, None)
-
-
-@functools.partial(compiled, newer=True)
-def _grids(data: Float[jax.Array, "m nrow ncol"]) -> Grid:
-    return lax.map(search_grid, data)
 
 
 _MJGEOM_HFIELD = 1  # mjtGeom's number of a height field

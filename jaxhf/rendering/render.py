@@ -86,7 +86,7 @@ def prepare(
             raise UserError("prepare: a heightfield alone goes to no mesh, as cast uses one device")
         require_kind("prepare", "settings", settings or Settings(), Settings, "a jaxhf.Settings")
         heights, settings = jnp.asarray(scene.heights), settings or Settings()
-        grid = _make_grids(heights.reshape(-1, *heights.shape[-2:]), scene.dx, scene.dy, settings)
+        grid = heightfield_grids(heights.reshape(-1, *heights.shape[-2:]), scene.dx, scene.dy, settings)
         return PreparedHeightfield(scene, settings, grid if heights.ndim > 2 else jax.tree.map(lambda leaf: leaf[0], grid))
     _require_scene("prepare", scene, Scene)
     settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("prepare", mesh)
@@ -235,7 +235,8 @@ def heightfield_grid(field: Heightfield, settings: Settings) -> Grid:
 
 
 @functools.partial(compiled, newer=True, static_argnames=("dx", "dy", "settings"))
-def _make_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float, settings: Settings) -> Grid:
+def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float, settings: Settings) -> Grid:
+    """Of heightfields that differ in their heights only."""
     return lax.map(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights)
 
 
