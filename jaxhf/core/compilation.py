@@ -17,10 +17,10 @@ _OPTIONS = {
     "xla_cpu_use_fusion_emitters": False,
     # Where the processor has AVX-512: else XLA takes half of it, and frames 1.25 times as long, gradients 1.1.
     "xla_cpu_prefer_vector_width": 512,
+    # Else XLA deals out kernels of microseconds, which a walk's steps are, to threads: on one device pictures and gradients
+    # then take twice the processor's and the clock's time, on two 1.1 to 1.3 of it. jaxlib 0.12 does not.
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
 }
-# XLA on the CPU deals out the kernels of a walk's step, which take microseconds, to threads: a batch of rays then takes 1.6
-# to 2.7 times as much processor time, and no less of the clock's. Large arrays do profit from it.
-_SERIAL = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
 
 
 def _untraced(fun: Callable[[], Any]) -> Any:
@@ -38,13 +38,13 @@ def is_traced() -> bool:
 
 
 @functools.cache
-def compiler_options(newer: bool = False, serial: bool = False) -> dict[str, Any] | None:
-    """What `jax.jit` takes as `compiler_options`, so that a program of jaxhf's compiles in less time.
+def compiler_options(newer: bool = False) -> dict[str, Any] | None:
+    """What `jax.jit` takes as `compiler_options`, so that a program of jaxhf's compiles and runs in less time.
 
-    Or, `newer`, so that it runs in less, and `serial`, so that batches of rays do; see `compiled`. Options that this version
-    of XLA does not know are left out; None where no other is left.
+    `newer` is for programs without rays, see `compiled`. Options that this version of XLA does not know are left out; None
+    where no other is left.
     """
-    options = ({"xla_cpu_use_fusion_emitters": True} if newer else _OPTIONS) | (_SERIAL if serial else {})
+    options = {"xla_cpu_use_fusion_emitters": True} if newer else _OPTIONS
     return {name: value for name, value in options.items() if _is_known({name: value})} or None
 
 
@@ -57,7 +57,7 @@ def _is_known(option: dict[str, Any]) -> bool:
 
 
 def compiled(
-    fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, newer: bool = False, serial: bool = False, **options: Any
+    fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, newer: bool = False, **options: Any
 ) -> Callable[..., Any]:
     """`jit(fun, **options)`, with `compiler_options` where it is called as it is, not as part of another program.
 
@@ -66,8 +66,8 @@ def compiled(
     Args:
       fun: to be compiled.
       jit: `jax.jit`, or `equinox.filter_jit`.
-      newer: with XLA's newer emitters: passes over tiles of a grid run 3 to 4 times as fast with them.
-      serial: each kernel on one thread: batches of rays run up to 2.7 times as fast.
+      newer: with XLA's newer emitters, and its kernels dealt out to threads: passes over tiles of a grid run 3 to 4 times as
+        fast.
       options: of `jit`.
     """
 
@@ -75,11 +75,11 @@ def compiled(
 
     @functools.cache
     def alone() -> Callable[..., Any]:
-        return jit(fun, compiler_options=compiler_options(newer, serial), **options)
+        return jit(fun, compiler_options=compiler_options(newer), **options)
 
     @functools.cache
     def kept() -> Kept:
-        given = compiler_options(newer, serial)
+        given = compiler_options(newer)
         return Kept(fun, lambda flat: jit(flat, compiler_options=given), options.get("static_argnames", ()))
 
     @functools.wraps(fun)

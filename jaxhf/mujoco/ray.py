@@ -1,6 +1,5 @@
 """Where rays meet MuJoCo's height field, as `mj_ray` has it."""
 
-import functools
 import math
 from typing import Any
 
@@ -91,7 +90,7 @@ def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array
     return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, hfield._grid, o, d)
 
 
-@functools.partial(compiled, serial=True)
+@compiled
 def _first_met(
     data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, grid: Grid | None, o: jax.Array, d: jax.Array
 ) -> Met:

@@ -155,15 +155,15 @@ def _trace(surface: Grid, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], se
     return trace_chunks(lambda ray: _first(surface, ray, settings), (start, d), settings.chunk)
 
 
-_cast_grid = compiled(_trace, serial=True, static_argnames=("settings",))
+_cast_grid = compiled(_trace, static_argnames=("settings",))
 
 
-@functools.partial(compiled, serial=True, static_argnames=("settings",))
+@functools.partial(compiled, static_argnames=("settings",))
 def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
     return _trace(heightfield_grid(heightfield, settings), start, d, settings)
 
 
-@functools.partial(compiled, serial=True, static_argnames=("settings",))
+@functools.partial(compiled, static_argnames=("settings",))
 def _cast_grids(grids: Grid, start: jax.Array | Hit, d: Float[jax.Array, "m n 3"], settings: Settings) -> Hit:
     """Grids with a leading axis m, each of which has rays of its own."""
     return _trace_each(lambda grid: grid, grids, start, d, settings)
@@ -173,7 +173,7 @@ def _trace_each(make: Callable[[Any], Grid], shapes: Any, start: jax.Array | Hit
     return trace_batch(make, joined, lambda grid, ray: _first(grid, ray, settings), shapes, (start, d), settings.chunk)
 
 
-@functools.partial(compiled, serial=True, static_argnames=("dx", "dy", "settings"))
+@functools.partial(compiled, static_argnames=("dx", "dy", "settings"))
 def _cast_batch(
     heights: Float[jax.Array, "m ny nx"],
     start: jax.Array | Hit,
@@ -194,6 +194,6 @@ def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Sett
 _make_world = compiled(make_world, static_argnames=("settings",))
 
 
-@functools.partial(compiled, serial=True)
+@compiled
 def _cast_prepared(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
     return trace_chunks(lambda ray: first_hit(world, Ray(ray[0], ray[1])), (o, d), world.settings.chunk)

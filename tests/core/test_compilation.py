@@ -56,7 +56,7 @@ def test_the_first_use_may_be_within_a_trace():
         "from jaxhf.core import compilation\n"
         "made = []\n"
         "options = compilation.compiler_options\n"
-        "compilation.compiler_options = lambda *given: made.append(1) or options(*given)\n"
+        "compilation.compiler_options = lambda newer: made.append(1) or options(newer)\n"
         "np.testing.assert_allclose(inside, top(z), rtol=1e-6)\n"
         "assert made == [1], made\n"
     )
