@@ -1,7 +1,7 @@
 """The cases on which the default call of `jaxhf.fit` is judged: six that were looked at while it was built.
 
 A case gives what a user would have, and no more: scenes, pictures, the noise where it is known, a coarse map and its deviation
-where there is one. No settings, loss, length, levels or solver.
+where there is one. No settings, loss, length, levels or solver; `hfield-angle` alone has the settings that a warning named.
 """
 
 import dataclasses
@@ -198,6 +198,12 @@ def hfield(sources: Sources) -> Case:
     return surveyed(sources, "hfield", whole, np.s_[:64, :64], (20 / 255, 20 / 255), 2, suns, True)
 
 
+def hfield_angle(sources: Sources) -> Case:
+    """`hfield` by a user who does as its warning says: normals weighted by angle, as Mitsuba's are."""
+    case = hfield(sources)
+    return dataclasses.replace(case, given=case.given | {"settings": jaxhf.Settings(normals="six-angle")})
+
+
 CASES = {
     "flat": Definition("float64", flat),
     "common-4": Definition("float32", lambda sources: common(sources, 4)),
@@ -205,6 +211,7 @@ CASES = {
     "jacksboro": Definition("float32", jacksboro),
     "topobathy": Definition("float32", topobathy),
     "hfield": Definition("float32", hfield),
+    "hfield-angle": Definition("float32", hfield_angle),
 }
 
 

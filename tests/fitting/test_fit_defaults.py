@@ -42,7 +42,9 @@ def test_normals_of_another_renderer_are_named_where_they_matter():
     """By how much they turn: hardly any on the smooth terrain, by 20 degrees on steps of a cell's width."""
     steps = np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0)
     found = [
-        _share_of_normals(make_problem(scenes(), pictures(), fit_options(settings=settings, noise=0.02))[0], heights)
+        _share_of_normals(
+            make_problem(scenes(), pictures(), fit_options(settings=settings, noise=0.02))[0], jnp.asarray(heights)
+        )
         for settings, heights in ((SETTINGS, TRUTH), (SETTINGS, steps), (jaxhf.Settings(normals="six-angle"), steps))
     ]
     assert found[0] < 0.5 < 2 < found[1]
