@@ -3,7 +3,8 @@
 "prepared" leaves out what a frame of new heights needs first: their normals and bounds.
 
 The variants are run in turn, several times and each time in another order, so that neither a machine whose speed drifts nor
-what one leaves to the next favours one; medians are printed, and the ratio to the first variant, pair by pair. With
+what one leaves to the next favours one, and each twice in a row, as frame after frame: the second counts. Medians are
+printed, and the ratio to the first variant, pair by pair. With
 `--mitsuba` (pip install mitsuba; it needs LLVM's library, see DRJIT_LIBLLVM_PATH) the same terrain is also rendered by
 Mitsuba 3's `direct` integrator, with `--embree` (pip install embreex) by Embree and NumPy, with `--povray` by POV-Ray.
 """
@@ -157,6 +158,7 @@ def report(title: str, variants: dict[str, Callable[[], object]], repeats: int) 
     order = np.random.default_rng(0)
     for _ in range(repeats):
         for name in order.permutation(list(variants)):
+            variants[name]()
             begin = time.perf_counter()
             variants[name]()
             times[name].append(time.perf_counter() - begin)

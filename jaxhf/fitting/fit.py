@@ -1,6 +1,7 @@
 """Recovers heights from pictures."""
 
 import dataclasses
+import functools
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float
 
+from ..core.compilation import compiled
 from ..core.errors import ArgumentError, require_kind
 from ..core.settings import Settings
 from ..core.types import AnyArray
@@ -338,14 +340,15 @@ def _share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> fl
     settings, field = problem.settings, problem.groups[0].shared.heightfields[0]
     if (settings.normals, settings.shading) != ("six", "smooth"):
         return 0.0
-
-    @jax.jit
-    def turned(heights: jax.Array) -> jax.Array:
-        area, angle = (vertex_normals(heights, field.dx, field.dy, scheme) for scheme in ("six", "six-angle"))
-        return angle - area / jnp.linalg.norm(area, axis=-1, keepdims=True)
-
-    horizontal = turned(jnp.asarray(heights))[..., :2]
+    horizontal = _turned_normals(jnp.asarray(heights), field.dx, field.dy)[..., :2]
     return float(np.sqrt(np.mean(np.square(horizontal))) * np.median(problem.brightness / problem.noise))
+
+
+@functools.partial(compiled, static_argnames=("dx", "dy"))
+def _turned_normals(heights: Float[jax.Array, "ny nx"], dx: float, dy: float) -> Float[jax.Array, "ny nx 3"]:
+    """By what unit normals differ that are weighted by angle from those by area."""
+    area, angle = (vertex_normals(heights, dx, dy, scheme) for scheme in ("six", "six-angle"))
+    return angle - area / jnp.linalg.norm(area, axis=-1, keepdims=True)
 
 
 def _strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: Any) -> float | None:

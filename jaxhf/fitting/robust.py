@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..core.compilation import compiled
 from ..core.types import AnyArray
 
 
@@ -40,7 +41,7 @@ def robust_weight(residual: Array, loss: str, scale: Float[Array, ""] | None) ->
     return 1 / (1 + square) if loss == "cauchy" else 1 / (1 + square) ** 2
 
 
-@functools.partial(jax.jit, static_argnames="loss")
+@functools.partial(compiled, static_argnames=("loss",))
 def influence_function(
     residual: Float[AnyArray, " n"], loss: str, scale: Float[Array, ""] | None
 ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:

@@ -151,7 +151,7 @@ ANSWERS = {
     'jaxhf.save_mesh("a.ply", np.eye(3))': "save_mesh: terrain must be a jaxhf.Terrain, it is a ndarray",
     'jaxhf.save_heights(np.eye(3), "a.npy")': "save_heights: path must be the name of a file, it is a ndarray",
     'jaxhf.render(scene, "draft")': "settings must be a jaxhf.Settings, it is a str",
-    "jaxhf.prepare(field)": "prepare: scene must be a jaxhf.Scene, it is a Heightfield; "
+    "jaxhf.render(field)": "render: scene must be a jaxhf.Scene, it is a Heightfield; "
     "which has a camera and lights besides: jaxhf.Scene([jaxhf.Object(heightfield)], camera, lights)",
     'jaxhf.cast("t.tif", *ray)': "cast: surface must be a jaxhf.Heightfield or a Scene, it is a str; "
     "jaxhf.Heightfield(heights, dx, dy) makes one",
