@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from ..core.autodiff import recomputed
 from ..core.devices import map_over
+from ..core.kernel import one_kernel
 from ..core.materialise import materialise
 from ..core.sampling import sample_offset
 from ..core.settings import Settings
@@ -52,12 +53,15 @@ def trace_tiles(
     return map_over(mesh, lambda seen, tile: _trace_tile(seen[0], seen[1], aovs, tile), (world, camera), tiles)
 
 
-@recomputed
 def light_along(
     world: World, camera: Camera, x: Float[jax.Array, " n"], y: Float[jax.Array, " n"]
 ) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
     """The radiance of samples at these positions in the picture, and how many of each one's walks ran out of steps."""
-    return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y))))(x, y)
+
+    def along(world: World, camera: Camera, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y))))(x, y)
+
+    return one_kernel(recomputed(along), world, camera, x, y)
 
 
 def _trace_tile(world: World, camera: Camera, aovs: tuple[str, ...], tile: jax.Array) -> dict[str, jax.Array]:
