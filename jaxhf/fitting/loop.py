@@ -386,7 +386,8 @@ def _spreads(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarra
                     error = np.broadcast_to(sampling[position][..., None], shown.shape)
                     counted = shown & (error <= np.median(error[shown]))
             left = residuals[position][counted].astype(np.float64)
-            spreads[k] = min(1.4826 * np.median(left), np.sqrt(np.mean(left * left)))
+            with np.errstate(over="ignore"):
+                spreads[k] = min(1.4826 * np.median(left), np.sqrt(np.mean(left * left)))
     return spreads
 
 
