@@ -31,6 +31,8 @@ from .residuals import found_scenes, pictures_and_influence
 from .solvers import BFGS_UNKNOWNS, count_unknowns
 from .uncertainty import require_small, standard_deviations, with_unexplained
 
+_OFF = 3.0  # standard deviations of the noise by which a background must be off to count
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
@@ -50,8 +52,8 @@ class Fit:
       residuals: `images` - targets; 0 where a target has no weight.
       regions: the three blocks of the pictures with the largest residuals.
       warnings: what speaks against trusting the heights, a sentence each; empty where nothing does.
-      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals in units of `noise`, but for those
-        that are exactly 0: about 1 where `noise` is right and all is explained.
+      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals in units of `noise` and the error
+        of their samples, without a background that is explained: about 1 where `noise` is right and all is explained.
       history: a `Step` for each step.
     """
 
@@ -246,8 +248,9 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
             shape = np.shape(targets[k])
             images[k], differences[k] = _in_shape(image, shape), _in_shape(values, shape)
             in_noise[k] = values * weight
-    # A background that is black in picture and target says nothing.
-    counted = np.concatenate([values[values != 0] for values in in_noise]).astype(np.float64)
+    counted = np.concatenate(
+        [values[informs | (np.abs(values) > _OFF)] for values, informs in zip(in_noise, _informing(problem), strict=True)]
+    ).astype(np.float64)
     with np.errstate(over="ignore"):
         regions, where = worst_regions(in_noise), where_residuals_are(in_noise, _places(problem))
         chi2 = float(np.mean(np.square(counted))) if len(counted) else 0.0
@@ -297,6 +300,18 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         stats=stats,
         history=tuple(loop.history),
     )
+
+
+def _informing(problem: Problem) -> list[Bool[np.ndarray, "h w c"]]:
+    """Which values of each picture depend on the heights; all of those with a weight where that is not known."""
+    found = [np.zeros((1, 1, 1), bool)] * problem.count
+    for number, group in enumerate(problem.groups):
+        informing = np.asarray(group.weights) > 0
+        if problem.linearised is not None:
+            informing &= np.asarray(problem.linearised[number].depends)[..., None]
+        for k, values in zip(group.indices, informing, strict=True):
+            found[k] = values
+    return found
 
 
 def _places(problem: Problem) -> list[Places]:

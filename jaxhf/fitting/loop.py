@@ -365,8 +365,10 @@ def _same_place(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> bool:
 
 
 def _spreads(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarray, " pictures"]:
-    """The standard deviation of each picture's values at weight 1, by the median of its residuals; radiance.
+    """The standard deviation of each picture's values at weight 1, by its residuals; radiance.
 
+    By their median, as some are unexplained, or by their root mean square, which is less where they are all of one size, as
+    those from rounding to 8 bits.
     Pixels that do not change with the heights, such as the background, do not count, nor the half of the others whose samples
     differ most.
     """
@@ -383,7 +385,9 @@ def _spreads(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarra
                 if shown.any():
                     error = np.broadcast_to(sampling[position][..., None], shown.shape)
                     counted = shown & (error <= np.median(error[shown]))
-            spreads[k] = 1.4826 * np.median(residuals[position][counted])
+            left = residuals[position][counted].astype(np.float64)
+            with np.errstate(over="ignore"):
+                spreads[k] = min(1.4826 * np.median(left), np.sqrt(np.mean(left * left)))
     return spreads
 
 

@@ -94,7 +94,7 @@ def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tu
 
     Args:
       problem: of the fit.
-      residuals: of the pictures, in units of the noise, without those of a background that is black in picture and target.
+      residuals: of the pictures, in units of the noise, without those of a background that is explained.
     """
     if len(residuals) == 0:
         return problem, 1.0

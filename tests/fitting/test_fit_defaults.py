@@ -14,6 +14,7 @@ from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
 from jaxhf.fitting.fit import _share_of_normals
 from jaxhf.fitting.history import Draws
+from jaxhf.fitting.loop import _spreads
 from jaxhf.fitting.normal_matrix import NormalMatrix
 from jaxhf.fitting.problem import make_problem
 from jaxhf.fitting.residuals import picture_residuals
@@ -36,6 +37,17 @@ def test_noise_that_is_not_given_is_estimated():
     assert found.regions[0].picture == 0
     assert found.regions[0].row == 0
     assert any("chi2 is" in warning and "picture 0 rows 0-3" in warning for warning in found.warnings)
+
+
+def test_the_noise_of_rounded_pictures_is_their_root_mean_square():
+    """Rounding leaves errors that are evenly spread: their median would be a quarter too large for a deviation."""
+    step = 0.05
+    problem, _ = make_problem(scenes(), [step * np.round(picture / step) for picture in pictures()], fit_options())
+    exact = [
+        jnp.stack([jnp.asarray(pictures()[k]).reshape(group.targets.shape[1:]) for k in group.indices])
+        for group in problem.groups
+    ]
+    np.testing.assert_allclose(_spreads(exact, problem), step / np.sqrt(12), rtol=0.1)
 
 
 def test_normals_of_another_renderer_are_named_where_they_matter():
