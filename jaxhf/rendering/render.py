@@ -140,13 +140,13 @@ def render(
         world, mesh = scene._world, scene.mesh
         camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:
-            outputs = _trace_prepared(world, camera, aovs, mesh, _key(key, world.settings, mesh))
+            outputs = _trace_prepared(world, camera, aovs, mesh, _key(key, world.settings, mesh), not is_traced())
         else:
             outputs = _trace_in_parts(world, camera, aovs, mesh, progress)
     else:
         settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("render", mesh)
         local = on_every_device(localise(scene), mesh)
-        outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh))
+        outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh), not is_traced())
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -184,31 +184,31 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         resolved = resolve_settings(settings, scene)
-        return _trace_all(on_every_device(scene, mesh), resolved, (), mesh, default_key(None, resolved, mesh))["image"]
+        return _trace_all(on_every_device(scene, mesh), resolved, (), mesh, default_key(None, resolved, mesh), False)["image"]
 
     return lax.map(one, scenes)
 
 
-@functools.partial(compiled, static_argnames=("settings", "aovs", "mesh"))
+@functools.partial(compiled, static_argnames=("settings", "aovs", "mesh", "alone"))
 def _trace_all(
-    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None, alone: bool = False
 ) -> dict[str, jax.Array]:
-    return _trace_world(make_world(scene, settings), scene.camera, aovs, mesh, key)
+    return _trace_world(make_world(scene, settings), scene.camera, aovs, mesh, key, alone)
 
 
 def _trace_world(
-    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None, alone: bool = False
 ) -> dict[str, jax.Array]:
     if key is not None and edge_sets(world):
-        others = _trace_picture(world, camera, aovs, mesh) if aovs else {}
+        others = _trace_picture(world, camera, aovs, mesh, alone) if aovs else {}
         drawn = draw_boundaries(world, camera, key, mesh)
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
-    return _trace_picture(world, camera, aovs, mesh)
+    return _trace_picture(world, camera, aovs, mesh, alone)
 
 
-def _trace_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh) -> dict[str, jax.Array]:
+def _trace_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, alone: bool) -> dict[str, jax.Array]:
     tiling = Tiling(camera, world.settings)
-    tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
+    tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32), alone)
     return jax.tree.map(tiling.assemble, tiles)
 
 
@@ -240,8 +240,8 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
     return lax.map(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights)
 
 
-_trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh"))
-_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
+_trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh", "alone"))
+_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs", "alone"))
 _make_world = compiled(make_world, static_argnames=("settings",))
 _make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
 
@@ -256,6 +256,6 @@ def _trace_in_parts(
     parts = []
     for first in range(0, tiling.count, size):
         tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
-        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, aovs, np.asarray(tiles, np.int32))))
+        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, aovs, np.asarray(tiles, np.int32), True)))
         progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
     return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)

@@ -47,21 +47,28 @@ class Tiling:
 
 
 def trace_tiles(
-    mesh: Mesh, world: World, camera: Camera, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]
+    mesh: Mesh, world: World, camera: Camera, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"], alone: bool
 ) -> dict[str, jax.Array]:
-    """The picture ("image") and AOVs of tiles, traced one after the other; (n, side * side, ...) each."""
-    return map_over(mesh, lambda seen, tile: _trace_tile(seen[0], seen[1], aovs, tile), (world, camera), tiles)
+    """The picture ("image") and AOVs of tiles, traced one after the other; (n, side * side, ...) each.
+
+    `alone` says that nothing is differentiated or transformed: each tile then is one kernel.
+    """
+
+    def of_tile(world: World, camera: Camera, tile: jax.Array) -> dict[str, jax.Array]:
+        return _trace_tile(world, camera, aovs, tile)
+
+    def one(seen: tuple[World, Camera], tile: jax.Array) -> dict[str, jax.Array]:
+        return one_kernel(of_tile, *seen, tile) if alone else of_tile(*seen, tile)
+
+    return map_over(mesh, one, (world, camera), tiles)
 
 
+@recomputed
 def light_along(
     world: World, camera: Camera, x: Float[jax.Array, " n"], y: Float[jax.Array, " n"]
 ) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
     """The radiance of samples at these positions in the picture, and how many of each one's walks ran out of steps."""
-
-    def along(world: World, camera: Camera, x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y))))(x, y)
-
-    return one_kernel(recomputed(along), world, camera, x, y)
+    return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y))))(x, y)
 
 
 def _trace_tile(world: World, camera: Camera, aovs: tuple[str, ...], tile: jax.Array) -> dict[str, jax.Array]:
