@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..boundary.guiding import edge_sets
 from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
-from ..boundary.term import default_key, draw_boundaries
+from ..boundary.term import Packed, default_key, draw_boundaries
 from ..core.autodiff import with_tangent
 from ..core.devices import map_over, on_every_device
 from ..core.materialise import materialise
@@ -142,8 +142,9 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int, stil
     sampling = _sampling_error(samples.in_rows(light), math.isqrt(world.settings.samples or 1))
     if drawn is not None:
         followed = functools.partial(_boundary_samples, channels)
-        edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, (world, camera, still), (drawn.samples, drawn.flows))
-        kind = jnp.where(drawn.samples.valid, jnp.where(drawn.samples.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
+        edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, (world, camera, still), drawn.contributions)
+        points, _ = drawn.contributions.unpacked()
+        kind = jnp.where(points.valid, jnp.where(points.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
         edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled, edge_view)
         finer = samples.of_resampled(light)
         side = math.isqrt(finer.shape[1])
@@ -259,10 +260,10 @@ def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
     return vertices
 
 
-def _boundary_samples(channels: int, seen: tuple[World, Camera, View], drawn: tuple[BoundarySample, Float[jax.Array, "n 3 2"]]):
+def _boundary_samples(channels: int, seen: tuple[World, Camera, View], drawn: Packed[tuple[BoundarySample, jax.Array]]):
     """Slopes, vertices and view of boundary samples, see `LinearisedEdges`."""
     world, camera, still = seen
-    samples, flows = drawn
+    samples, flows = drawn.unpacked()
     flows = jnp.moveaxis(_channels(jnp.moveaxis(flows, 1, -1), channels), -1, 0)
 
     def position(sample: BoundarySample, perturbation: jax.Array, view: View) -> jax.Array:
