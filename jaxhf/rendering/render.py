@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import PurePath
 from typing import Any, overload
 
@@ -24,10 +24,11 @@ from ..core.errors import UserError, require_kind, require_progress
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
+from ..scene.light import Light
 from ..scene.localise import localise, localise_camera
 from ..scene.scene import Scene
 from ..trace.grid import Grid
-from ..trace.world import World, make_surface, make_world, resolve_settings
+from ..trace.world import World, make_ceilings, make_surface, make_world, resolve_settings
 from .aovs import known_aovs
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, trace_tiles
@@ -53,6 +54,15 @@ class Prepared(eqx.Module):
     def with_camera(self, camera: Camera) -> "Prepared":
         """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
         return dataclasses.replace(self, scene=self.scene.with_camera(camera))
+
+    def with_lights(self, lights: Iterable[Light]) -> "Prepared":
+        """The same in another light; normals, bounds and what hides the sky are kept, see `Scene.with_lights`."""
+        scene = self.scene.with_lights(lights)
+        if scene.sky_occlusion != self.scene.sky_occlusion:
+            return prepare(scene, self.settings, mesh=self.mesh)
+        local = on_every_device(localise(scene).lights, self.mesh)
+        ceilings = _make_ceilings(self._world.surfaces, local, self.settings)
+        return dataclasses.replace(self, scene=scene, _world=dataclasses.replace(self._world, lights=local, ceilings=ceilings))
 
 
 class PreparedHeightfield(eqx.Module):
@@ -243,6 +253,7 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
 _trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh", "alone"))
 _trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs", "alone"))
 _make_world = compiled(make_world, static_argnames=("settings",))
+_make_ceilings = compiled(make_ceilings, static_argnames=("settings",))
 _make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
 
 
