@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
+import jaxlib.version
 from jax.extend.core import get_opaque_trace_state
 
 from .kept import Kept
@@ -59,7 +60,7 @@ def compiler_options(newer: bool = False) -> dict[str, Any] | None:
     where no other is left.
     """
     options = {"xla_cpu_use_fusion_emitters": True} if newer else _OPTIONS
-    return {name: value for name, value in options.items() if _is_known({name: value})} or None
+    return {name: value for name, value in options.items() if _is_known({name: value}) and _is_right(name)} or None
 
 
 def _is_known(option: dict[str, Any]) -> bool:
@@ -68,6 +69,12 @@ def _is_known(option: dict[str, Any]) -> bool:
     except jax.errors.JaxRuntimeError:
         return False
     return True
+
+
+def _is_right(name: str) -> bool:
+    """Whether an option does no harm: with wide vectors the newer emitters of jaxlib 0.10 and 0.11 compile a wrong arctan."""
+    older_emitters = _is_known({"xla_cpu_use_fusion_emitters": False})
+    return name != "xla_cpu_prefer_vector_width" or older_emitters or jaxlib.version.__version_info__ >= (0, 12)
 
 
 def compiled(
