@@ -27,7 +27,7 @@ from .history import Draws, Step, Stop
 from .loop import FitLoop
 from .options import Albedo, FitOptions, Loss, Solver
 from .problem import Problem, make_problem
-from .residuals import found_scenes, pictures_and_influence
+from .residuals import found_scenes
 from .solvers import BFGS_UNKNOWNS, count_unknowns
 from .uncertainty import require_small, standard_deviations, with_unexplained
 
@@ -238,7 +238,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
     images: list[np.ndarray] = [np.zeros(())] * problem.count
     differences: list[np.ndarray] = [np.zeros(())] * problem.count
     in_noise: list[np.ndarray] = [np.zeros(())] * problem.count
-    pictures, influence = pictures_and_influence(unknowns, problem)
+    pictures, influence = loop.pictures_and_influence(unknowns)
     for group, simulated in zip(problem.groups, pictures, strict=True):
         simulated, weights = np.asarray(simulated), np.asarray(group.weights)
         difference = np.where(weights > 0, simulated - np.asarray(group.targets), 0)
@@ -251,7 +251,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
     with np.errstate(over="ignore"):
         regions, where = worst_regions(in_noise), where_residuals_are(in_noise, _places(problem))
         chi2 = float(np.mean(np.square(counted))) if len(counted) else 0.0
-    seen = np.asarray(influence) != 0
+    seen = influence != 0
     std, scaled, draws = None, None, None
     if options.uncertainty is not None and result is not Stop.NON_FINITE:
         borne_out, scaled = with_unexplained(problem, counted)

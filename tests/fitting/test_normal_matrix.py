@@ -31,7 +31,7 @@ def test_it_is_the_square_of_the_residuals_derivative():
 
     basis, n = problem.basis, unknowns.coefficients.size
     heights = basis.surface(jnp.asarray(change[:n].reshape(basis.base.shape))) - basis.base
-    product = matrix._product(np.concatenate([np.ravel(heights), change[n:]]))
+    product = matrix.model.product(np.concatenate([np.ravel(heights), change[n:]]))
     modes = basis.scale * basis.transform(jnp.asarray(product[:n].reshape(basis.base.shape)))
     np.testing.assert_allclose(np.concatenate([np.ravel(modes), product[n:]]), expected, rtol=1e-9, atol=1e-9 * rms(expected))
 
