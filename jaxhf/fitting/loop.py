@@ -25,6 +25,7 @@ from .history import Step, Stop, print_progress
 from .jacobian import Sparse
 from .known import Known, KnownPictures, jacobian_at, pictures_and_influence, spreads_of
 from .normal_equations import NormalEquations, advance, has_damping, init_state, reset_state, step_size, with_rejections
+from .normals import share_of_normals
 from .options import FitOptions, make_stages
 from .problem import Problem
 from .quadratic import is_sparse
@@ -38,6 +39,8 @@ _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviati
 _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
 _LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
+_BETTER = 1.03  # by which factor other normals must lower what is left of the pictures
+_TRIAL_STEPS = 3  # with other normals
 _PROBES = 8  # of the pictures' curvature
 
 
@@ -125,14 +128,10 @@ class FitLoop:
         surface = np.asarray(surface_of(unknowns, self.problem.basis))
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, jnp.zeros_like(unknowns.coefficients))
         share, repeats = self.stages[self.stage + 1], self.stage >= 0 and self.stages[self.stage] == 1
-        known = self.known(self.best[1])
-        refined = repeats and self._take_more_edges(surface)
-        if refined:
-            known = self.known(self.best[1])
-        pictures, _ = self.pictures_and_influence(self.best[1])
-        spreads = spreads_of(pictures, known)  # radiance
+        refined = repeats and self._take_other_settings(surface)
+        known, spreads = self.known(self.best[1]), self._spreads()
         noise = self._estimated_noise(spreads, share)
-        spread = float(np.sqrt(np.mean(np.square(spreads / noise))))
+        spread = _rms(spreads / noise)
         scale = None
         if self.final_loss_scale is not None:
             scale = max(self.final_loss_scale, 3 * spread)
@@ -158,14 +157,37 @@ class FitLoop:
         self._take_snapshot()
         return True
 
-    def _take_more_edges(self, surface: np.ndarray) -> bool:
-        """Whether the heights that were found call for many more points on edges than those of the start did."""
-        heights = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype)
-        problem = self.problem.with_edge_samples(heights, self.options)
-        if problem.settings == self.problem.settings:
-            return False
-        self._set_settings(problem.settings)
-        return True
+    def _spreads(self, unknowns: Unknowns | None = None) -> Float[np.ndarray, " pictures"]:
+        """Of what these unknowns, or else the best ones, leave of the pictures, radiance."""
+        unknowns = self.best[1] if unknowns is None else unknowns
+        pictures, _ = self.pictures_and_influence(unknowns)
+        return spreads_of(pictures, self.known(unknowns))
+
+    def _tried(self, steps: int) -> Unknowns:
+        """Where some steps from the best unknowns lead, which are not taken: heights that were fitted with other normals make
+        up for these."""
+        at, (_, curvature) = self.best[1], self._measured_units(self.best[1])
+        size = jnp.asarray(1 / (FIRST_DAMPING * curvature), self.field.heights.dtype)
+        state = reset_state(self.initial_state, at, size)
+        for _ in range(1 + steps):
+            there = evaluated_at(at, state)
+            at, state, _ = advance(with_rejections(self.solver, 0, self._jacobian(there)), at, state, self.known(there))
+        return at
+
+    def _take_other_settings(self, surface: np.ndarray) -> bool:
+        """Whether the heights that were found call for many more points on edges than those of the start did, or other normals
+        explain the pictures better, after some steps."""
+        heights, before = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype), self.problem.settings
+        settings = self.problem.with_edge_samples(heights, self.options).settings
+        if settings.normals is None and self.options.noise is not None and share_of_normals(self.problem, heights) > 1:
+            spread = _rms(self._spreads() / self.problem.noise)
+            if spread > _LEAST_CHANGE:
+                self._set_settings(dataclasses.replace(settings, normals="six-angle"))
+                if _rms(self._spreads(self._tried(_TRIAL_STEPS)) / self.problem.noise) < spread / _BETTER:
+                    return True
+        if settings != self.problem.settings:
+            self._set_settings(settings)
+        return settings != before
 
     def _set_settings(self, settings: Settings) -> None:
         """Renders otherwise; the solver's state has another structure then."""
@@ -312,6 +334,7 @@ class FitLoop:
             "converged": self.converged,
             "predicted": self.predicted,
             "edge_samples": self.problem.settings.edge_samples,
+            "normals": self.problem.settings.normals,
             "seconds": self.elapsed(),
             "history": [list(step) for step in self.history],
         }
@@ -327,7 +350,7 @@ class FitLoop:
         facts = load_facts(self.path)
         if facts["fingerprint"] != self.fingerprint:
             raise FileError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
-        settings = dataclasses.replace(self.problem.settings, edge_samples=facts["edge_samples"])
+        settings = dataclasses.replace(self.problem.settings, edge_samples=facts["edge_samples"], normals=facts["normals"])
         if settings != self.problem.settings:
             self._set_settings(settings)
         self.units = np.zeros(self.problem.basis.base.shape)
@@ -345,3 +368,7 @@ class FitLoop:
                 self.unknowns, self.state, _ = self._advance(0)
         else:
             self.state = eqx.combine(state, self.initial_state)
+
+
+def _rms(values: Float[np.ndarray, " n"]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -41,13 +41,13 @@ class NormalEquations:
     rejections: int = 0
     jacobian: Callable[[], Sparse] | None = None
 
+    @np.errstate(over="ignore", invalid="ignore")  # a fit says by itself that a loss is not finite
     def advance(self, unknowns: Unknowns, state: "Position", problem: Problem) -> tuple[Unknowns, "Position", Outcome]:
         """See `solvers.advance`."""
         assert self.jacobian is not None
         new, size, model = state.y_eval, float(state.step_size), state.model
         values = picture_values(new, problem)
-        with np.errstate(over="ignore", invalid="ignore"):  # a fit says by itself that a loss is not finite
-            loss, before = loss_at(new, problem, values), state.loss
+        loss, before = loss_at(new, problem, values), state.loss
         first, moved, converged = model is None, 0.0, False
         accepted = first or before - loss >= LEAST_GAIN * state.predicted
         if model is None or accepted:
@@ -56,9 +56,7 @@ class NormalEquations:
                 converged = self._converged(unknowns, new, before, loss)
                 if before - loss >= GOOD * state.predicted:
                     size *= HIGHER
-            unknowns = new
-            with np.errstate(over="ignore", invalid="ignore"):
-                model = Quadratic(new, problem, self.jacobian(), values)
+            unknowns, model = new, Quadratic(new, problem, self.jacobian(), values)
         else:
             size, loss = size * REJECTED / 2**self.rejections, before
         step, predicted = _solved(model, problem.basis, 1 / size, _ITERATIONS * self.inner_steps)
@@ -147,7 +145,7 @@ def _solved(model: Quadratic, basis: Basis, damping: float, iterations: int) -> 
         return np.concatenate([modes.ravel(), values[scale.size :]])
 
     n, right = model.gradient.size, -gathered(model.gradient)
-    if not np.isfinite(right).all():
+    if not math.isfinite(right @ right):
         return np.full(n, np.nan), math.nan
     product: Any = sp.linalg.LinearOperator(
         (n, n), lambda change: gathered(model.product(spread(change))) + damping * change, dtype=np.float64
