@@ -129,7 +129,7 @@ class FitLoop:
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, jnp.zeros_like(unknowns.coefficients))
         share, repeats = self.stages[self.stage + 1], self.stage >= 0 and self.stages[self.stage] == 1
         refined = repeats and self._take_other_settings(surface)
-        known, spreads = self.known(self.best[1]), self._spreads()
+        known, spreads = self.known(self.best[1]), self._spreads(self.best[1])
         noise = self._estimated_noise(spreads, share)
         spread = _rms(spreads / noise)
         scale = None
@@ -157,9 +157,8 @@ class FitLoop:
         self._take_snapshot()
         return True
 
-    def _spreads(self, unknowns: Unknowns | None = None) -> Float[np.ndarray, " pictures"]:
-        """Of what these unknowns, or else the best ones, leave of the pictures, radiance."""
-        unknowns = self.best[1] if unknowns is None else unknowns
+    def _spreads(self, unknowns: Unknowns) -> Float[np.ndarray, " pictures"]:
+        """Of what these unknowns leave of the pictures, radiance."""
         pictures, _ = self.pictures_and_influence(unknowns)
         return spreads_of(pictures, self.known(unknowns))
 
@@ -179,8 +178,9 @@ class FitLoop:
         explain the pictures better, after some steps."""
         heights, before = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype), self.problem.settings
         settings = self.problem.with_edge_samples(heights, self.options).settings
-        if settings.normals is None and self.options.noise is not None and share_of_normals(self.problem, heights) > 1:
-            spread = _rms(self._spreads() / self.problem.noise)
+        chosen = settings.normals is None and self.options.noise is not None and self._damped()
+        if chosen and share_of_normals(self.problem, heights) > 1:
+            spread = _rms(self._spreads(self.best[1]) / self.problem.noise)
             if spread > _LEAST_CHANGE:
                 self._set_settings(dataclasses.replace(settings, normals="six-angle"))
                 if _rms(self._spreads(self._tried(_TRIAL_STEPS)) / self.problem.noise) < spread / _BETTER:
