@@ -19,8 +19,9 @@ from ..core.errors import ArgumentError
 from .basis import Unknowns
 from .history import Draws
 from .linearise import can_be_linearised
-from .normal_matrix import NormalMatrix, is_sparse
+from .normal_matrix import NormalMatrix
 from .problem import Problem
+from .quadratic import is_sparse
 from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import influence_function, robust_weight
 from .solvers import count_unknowns

@@ -110,7 +110,7 @@ def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: S
     """A shape made ready for tracing; the scheme of its normals and the levels of its bounds are those of the settings."""
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
-        normals = settings.normals if settings.shading == "smooth" else None
+        normals = (settings.normals or "six") if settings.shading == "smooth" else None
         levels = 0 if settings.traversal == "dda" else None
         return make_grid(shape, world, normals, levels, settings.early_exit)
     return make_walls(shape, world) if isinstance(shape, Skirt) else make_tube(shape, world)
