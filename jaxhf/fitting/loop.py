@@ -22,10 +22,10 @@ from .basis import Unknowns, balanced_units, make_basis
 from .curvature import mode_curvature
 from .fingerprint import fingerprint
 from .history import Step, Stop, print_progress
-from .jacobian import Sparse
+from .jacobian import Sparse, in_rows, picture_values
 from .known import Known, KnownPictures, jacobian_at, pictures_and_influence, spreads_of
 from .normal_equations import NormalEquations, advance, has_damping, init_state, reset_state, step_size, with_rejections
-from .normals import share_of_normals
+from .normals import evidence_for_angles
 from .options import FitOptions, make_stages
 from .problem import Problem
 from .quadratic import is_sparse
@@ -39,8 +39,9 @@ _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviati
 _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
 _LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
-_BETTER = 1.03  # by which factor other normals must lower what is left of the pictures
-_TRIAL_STEPS = 3  # with other normals
+_TRIAL_STEPS = 6  # with other normals
+_EVIDENCE = 3.0  # for these, standard deviations, to try them: another program is compiled
+_FAR = 3.0  # standard deviations of the noise: a residual that is larger counts as this
 _PROBES = 8  # of the pictures' curvature
 
 
@@ -178,16 +179,27 @@ class FitLoop:
         explain the pictures better, after some steps."""
         heights, before = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype), self.problem.settings
         settings = self.problem.with_edge_samples(heights, self.options).settings
-        chosen = settings.normals is None and self.options.noise is not None and self._damped()
-        if chosen and share_of_normals(self.problem, heights) > 1:
-            spread = _rms(self._spreads(self.best[1]) / self.problem.noise)
-            if spread > _LEAST_CHANGE:
-                self._set_settings(dataclasses.replace(settings, normals="six-angle"))
-                if _rms(self._spreads(self._tried(_TRIAL_STEPS)) / self.problem.noise) < spread / _BETTER:
-                    return True
+        left_open = settings.normals is None and settings.shading == "smooth" and self._damped()
+        if left_open and self._evidence_for_angles(heights) > _EVIDENCE:
+            left = self._left(self.best[1])
+            self._set_settings(dataclasses.replace(settings, normals="six-angle"))
+            if self._left(self._tried(_TRIAL_STEPS)) < left:
+                return True
         if settings != self.problem.settings:
             self._set_settings(settings)
         return settings != before
+
+    def _evidence_for_angles(self, heights: jax.Array) -> float:
+        """See there; 0 where the pictures' derivatives are not known."""
+        known = self.known(self.best[1])
+        return evidence_for_angles(known, heights, picture_values(self.best[1], known).images) if is_sparse(known) else 0.0
+
+    def _left(self, unknowns: Unknowns) -> float:
+        """What these unknowns leave of the pictures: the sum of squared residuals in units of the noise, of large ones less."""
+        known = self.known(unknowns)
+        pairs = zip(known.groups, picture_values(unknowns, known).images, strict=True)
+        residuals = in_rows([group.weights * (image - group.targets) for group, image in pairs])
+        return float(np.sum(np.minimum(residuals * residuals, _FAR**2)))
 
     def _set_settings(self, settings: Settings) -> None:
         """Renders otherwise; the solver's state has another structure then."""

@@ -15,9 +15,9 @@ from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.known import spreads_of
 from jaxhf.fitting.normal_matrix import NormalMatrix
-from jaxhf.fitting.normals import share_of_normals
+from jaxhf.fitting.normals import evidence_for_angles, share_of_normals
 from jaxhf.fitting.problem import make_problem
-from jaxhf.fitting.residuals import picture_residuals
+from jaxhf.fitting.residuals import linearised, picture_residuals, simulate
 from jaxhf.fitting.robust import influence_function, soften
 from jaxhf.fitting.uncertainty import with_unexplained
 from jaxhf.scene.localise import localise
@@ -77,6 +77,23 @@ def test_a_fit_takes_the_normals_that_explain_rough_terrain():
     given = jaxhf.fit(scenes(TRUTH), measured, settings=dataclasses.replace(SETTINGS, normals="six"), **known)
     assert given.settings.normals == "six"
     assert rms(chosen.heights - rough) < 0.5 * rms(given.heights - rough)
+
+
+def test_evidence_for_other_normals_is_in_the_pictures():
+    """Many deviations where they are by angle, none where they are by area."""
+    rng = np.random.default_rng(2)
+    rough = TRUTH + 0.02 * rng.standard_normal(TRUTH.shape)
+    found = {}
+    for scheme in ("six", "six-angle"):
+        rendered = [
+            np.asarray(jaxhf.render(scene, dataclasses.replace(SETTINGS, normals=scheme)))[..., 0] for scene in scenes(rough)
+        ]
+        measured = [picture + 0.002 * rng.standard_normal(picture.shape) for picture in rendered]
+        problem, unknowns = make_problem(scenes(rough), measured, fit_options(noise=0.002, start=rough))
+        known = linearised(unknowns, problem)
+        found[scheme] = evidence_for_angles(known, jnp.asarray(rough), simulate(unknowns, known))
+    assert found["six"] < 3
+    assert found["six-angle"] > 20
 
 
 def test_a_grey_picture_with_three_channels_is_one_measurement():
