@@ -1,7 +1,7 @@
 """The cases on which the default call of `jaxhf.fit` is judged: six that were looked at while it was built.
 
 A case gives what a user would have, and no more: scenes, pictures, the noise where it is known, a coarse map and its deviation
-where there is one. No settings, loss, length, levels or solver; `hfield-angle` alone has the settings that a warning named.
+where there is one. No settings, loss, length, levels or solver; `hfield-angle` alone has settings.
 """
 
 import dataclasses
@@ -199,7 +199,7 @@ def hfield(sources: Sources) -> Case:
 
 
 def hfield_angle(sources: Sources) -> Case:
-    """`hfield` by a user who does as its warning says: normals weighted by angle, as Mitsuba's are."""
+    """`hfield` by a user who knows that normals are weighted by angle, as Mitsuba's are."""
     case = hfield(sources)
     return dataclasses.replace(case, given=case.given | {"settings": jaxhf.Settings(normals="six-angle")})
 

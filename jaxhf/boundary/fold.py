@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, unit
@@ -15,6 +16,7 @@ from ..trace.intersect import intersect
 from ..trace.status import Status
 from ..trace.world import World, nearest_hit, no_hit
 from .sample import BoundarySample, between_ends, on_edge
+from .silhouette import whole_cells
 
 # Other surfaces are looked for beside the edge and from a little before it, so that those that share a border with the edge's
 # are met: this many times the square root of an ulp of the grid's larger side beside it, and as many times that before it.
@@ -126,8 +128,7 @@ def _fold_on(grid: Grid, number: int, sample: BoundarySample, past: Ray, distanc
 def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
     """Whether there is such a cell, with all its vertices."""
     x, y = jnp.clip(ix, 0, grid.cells[0] - 1), jnp.clip(iy, 0, grid.cells[1] - 1)
-    z = grid.z
-    return (x == ix) & (y == iy) & jnp.isfinite(z[y, x] + z[y, x + 1] + z[y + 1, x] + z[y + 1, x + 1])
+    return materialise((x == ix) & (y == iy) & whole_cells(grid)[y, x])
 
 
 class Probe(eqx.Module):

@@ -166,12 +166,11 @@ def refined_weights(
       weights: `initial_weights`.
       edge, found: of each draw, its edge and the size of the change that it contributes.
     """
-    none = jnp.zeros_like(weights)
-    draws, sums = none.at[edge].add(1), none.at[edge].add(found)
+    counted = jnp.zeros((weights.shape[0], 2), weights.dtype).at[edge].add(jnp.stack([jnp.ones_like(found), found], axis=1))
     everywhere = jnp.mean(found)
     refined = []
     for edges in edge_sets(world):
-        n, total = (value[edges.first : edges.end].reshape(3, edges.ny, edges.nx) for value in (draws, sums))
+        n, total = (value.reshape(3, edges.ny, edges.nx) for value in counted[edges.first : edges.end].T)
         n_block, total_block = _over_blocks(n), _over_blocks(total)
         mean = (jnp.sum(total) + everywhere) / (jnp.sum(n) + 1)
         mean = (total_block + mean) / (n_block + 1)

@@ -79,7 +79,7 @@ def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[Bou
     def look(known: tuple[Flag, Hit, Flag], number: Index) -> tuple[tuple[Flag, Hit, Flag], None]:
         free, beyond, _ = known
         hit, clear = meet(world, sample, lax.switch(number, [to_source, past_edge, to_eye], free, beyond))
-        beyond = jax.tree.map(lambda new, old: jnp.where(number == 1, new, old), hit, beyond)
+        beyond = lax.cond(number == 1, lambda hits: hits[0], lambda hits: hits[1], (hit, beyond))  # no kernel, unlike `where`
         return (jnp.where(number == 0, clear, free), beyond, clear), None
 
     # One walk in the compiled program, not three.
@@ -149,7 +149,7 @@ def radiance_jump(world: World, sample: BoundarySample, passage: Passage, active
 def _side_radiance(world: World, fold: Fold, beyond: Hit, side: Index, active: Flag) -> Vector:
     """What comes to the eye from the triangle that is near, or from what stands beyond: the other triangle, if that is seen."""
     ahead = eqx.tree_at(lambda hit: hit.side, fold.ahead, fold.source_side)
-    at = jax.tree.map(lambda a, b: jnp.where(side == 0, a, b), fold.near, ahead)
+    at = lax.cond(side == 0, lambda ends: ends[0], lambda ends: ends[1], (fold.near, ahead))
     hit = beyond
     for number, grid, _ in world.grids:
         own = ((side == 0) | ~fold.bends) & (at.object == number)

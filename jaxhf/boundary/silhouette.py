@@ -48,7 +48,7 @@ def folds(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
 
 def all_edges(grid: Grid) -> EdgeFlags:
     """The edges with at least one triangle."""
-    present = _present(grid)
+    present = whole_cells(grid)
     return _between(present, present, lambda a, b: a | b)
 
 
@@ -59,7 +59,8 @@ def _between(lower: jax.Array, upper: jax.Array, compare: Any) -> EdgeFlags:
     return jnp.stack([compare(above, below), compare(right, left), compare(above, right)])
 
 
-def _present(grid: Grid) -> Bool[jax.Array, "cells_y cells_x"]:
+def whole_cells(grid: Grid) -> Bool[jax.Array, "cells_y cells_x"]:
+    """Which cells have all their vertices."""
     z = grid.z
     return jnp.isfinite(z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:])
 
@@ -73,7 +74,7 @@ def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
     if viewpoint.at_place:
         x, y = _vertices(grid)
         to_x, to_y, to_z = v[0] - x[:-1, :-1], v[1] - y[:-1, :-1], v[2] - z00
-    present = _present(grid)
+    present = whole_cells(grid)
 
     def facing(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(present, jnp.where(to_z - a * to_x - b * to_y >= 0, 1, -1), 0).astype(jnp.int8)
@@ -87,23 +88,30 @@ def _vertices(grid: Grid) -> tuple[jax.Array, jax.Array]:
     return x, y
 
 
-def _ends(values: Float[jax.Array, "ny nx"]) -> tuple[EdgeWeights, EdgeWeights]:
-    """The values at the two ends of every edge."""
-    ny, nx = values.shape
-    padded = jnp.pad(values, ((0, 1), (0, 1)), mode="edge")
-    return jnp.stack([values] * 3), jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS])
+def _steps(dtype: Any) -> tuple[jax.Array, jax.Array]:
+    """From the first vertex of the edges of each kind to the second, in x and in y; shape (3, 1, 1)."""
+    along_x, along_y = (jnp.array(steps, dtype)[:, None, None] for steps in zip(*STEPS, strict=True))
+    return along_x, along_y
+
+
+def _second_heights(z: Float[jax.Array, "ny nx"]) -> EdgeWeights:
+    """The heights at the second vertex of every edge; of one that would leave the grid, zero."""
+    ny, nx = z.shape
+    padded = jnp.pad(z, ((0, 1), (0, 1)))
+    return materialise(jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS]))
 
 
 def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
     """The length in the picture, in pixels, of the part of every edge that lies in its frame; hidden or not."""
     film = camera.film_from_world().of(grid.world_from_grid)
     z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
-    x, y = _vertices(grid)
 
-    def seen(row: int) -> jax.Array:
-        return film.linear[row, 0] * x + film.linear[row, 1] * y + film.linear[row, 2] * z + film.offset[row]
+    def seen(x: jax.Array, y: jax.Array, z: jax.Array) -> list[jax.Array]:
+        return [film.linear[k, 0] * x + film.linear[k, 1] * y + film.linear[k, 2] * z + film.offset[k] for k in range(4)]
 
-    a, b = zip(*(_ends(row) for row in materialise([seen(row) for row in range(4)])), strict=True)
+    (x, y), (along_x, along_y) = _vertices(grid), _steps(z.dtype)
+    a = [jnp.stack([row] * 3) for row in materialise(seen(x, y, z))]
+    b = materialise(seen(x[None] + along_x, y[None] + along_y, _second_heights(z)))
     first, last = materialise(framed_part(camera, a, b))
     w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
     ends = [
@@ -143,16 +151,15 @@ def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:
     """The length of every edge as seen from a light: projected across its direction; for a point light, as an angle."""
     z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
     x, y = _vertices(grid)
-    (x0, x1), (y0, y1), (z0, z1) = _ends(x), _ends(y), _ends(z)
     world = grid.world_from_grid
 
     def turned(vx: jax.Array, vy: jax.Array, vz: jax.Array) -> list[jax.Array]:
         return [world.linear[k, 0] * vx + world.linear[k, 1] * vy + world.linear[k, 2] * vz for k in range(3)]
 
-    e = turned(x1 - x0, y1 - y0, z1 - z0)
+    e = turned(*_steps(z.dtype), _second_heights(z) - z[None])
     to: list[Any] = [light.v[k] for k in range(3)]
     if light.at_place:
-        to = [light.v[k] - world.offset[k] - p for k, p in enumerate(turned(x0, y0, z0))]
+        to = [light.v[k] - world.offset[k] - p for k, p in enumerate(turned(x[None], y[None], z[None]))]
     square = to[0] * to[0] + to[1] * to[1] + to[2] * to[2]
     cross = [e[i] * to[j] - e[j] * to[i] for i, j in ((1, 2), (2, 0), (0, 1))]
     across = jnp.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])

@@ -7,6 +7,7 @@ the picture's samples: to look again where those are large, and to believe them 
 
 import functools
 import math
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,6 +24,8 @@ from ..trace.world import World
 from .guiding import GuidingDistribution, initial_weights, make_distribution, refined_weights
 from .jump import boundary_segment, pass_edge, radiance_jump
 from .sample import BoundarySample, draw, picture_point
+
+Tree = TypeVar("Tree")
 
 # The first of this many rounds of samples only refines the guiding distribution.
 _ROUNDS = 4
@@ -41,16 +44,48 @@ class Boundaries(eqx.Module):
     """Samples of moving boundaries, without a derivative, in chunks; pixels are numbered from the top left corner, row by row.
 
     Attributes:
-      samples: valid where they contribute. Their leaves have the leading axes (chunks, size).
-      flows: derivative of the light that leaves a sample's pixel in the sample's position in the picture.
+      contributions: samples, valid where they contribute, and their flows: the derivative of the light that leaves a sample's
+        pixel in the sample's position in the picture, (size, 3, 2). With the leading axis of the chunks.
       pixel: the pixel of each sample.
       resampled: the pixels that change most, whose interior derivative is taken from `resampled_side` squared samples.
     """
 
-    samples: BoundarySample
-    flows: Float[jax.Array, "chunks size 3 2"]
+    contributions: "Packed[tuple[BoundarySample, jax.Array]]"
     pixel: Int[jax.Array, " points"]
     resampled: Int[jax.Array, " pixels"]
+
+
+class Packed(eqx.Module, Generic[Tree]):
+    """A pytree whose arrays have one first axis, as one array of integers and one of floats, with that axis last.
+
+    XLA compiles several kernels for each array that a loop hands on: with one array a leaf these were a tenth of the program.
+    """
+
+    whole: Int[jax.Array, "*chunks integers n"]
+    real: Float[jax.Array, "*chunks floats n"]
+    _form: Any = eqx.field(static=True)
+
+    @staticmethod
+    def of(tree: Tree) -> "Packed[Tree]":
+        leaves, structure = jax.tree.flatten(tree)
+        rows: tuple[list[jax.Array], list[jax.Array]] = [], []
+        for leaf in leaves:
+            real = jnp.issubdtype(leaf.dtype, jnp.floating)
+            rows[real].extend((leaf if real else leaf.astype(jnp.int32)).reshape(leaf.shape[0], -1).T)
+        whole, real = (jnp.stack(part) for part in rows)
+        return Packed(whole, real, (structure, tuple((leaf.dtype, leaf.shape[1:]) for leaf in leaves)))
+
+    def unpacked(self) -> Tree:
+        """The pytree; the axes that a loop has added come first."""
+        structure, forms = self._form
+        taken, leaves = [0, 0], []
+        for dtype, shape in forms:
+            real, size = jnp.issubdtype(dtype, jnp.floating), math.prod(shape)
+            first = taken[real]
+            taken[real] += size
+            part = jnp.moveaxis((self.whole, self.real)[real][..., first : first + size, :], -2, -1)
+            leaves.append(part.reshape(*part.shape[:-1], *shape).astype(dtype))
+        return jax.tree.unflatten(structure, leaves)
 
 
 def draw_boundaries(world: World, camera: Camera, key: jax.Array, mesh: Mesh, resampled: int | None = None) -> Boundaries:
@@ -66,17 +101,15 @@ def draw_boundaries(world: World, camera: Camera, key: jax.Array, mesh: Mesh, re
     settings, edge_samples = world.settings, world.settings.edge_samples or 0
     chunks = math.ceil(edge_samples / (_ROUNDS * settings.chunk))
     size = math.ceil(edge_samples / (_ROUNDS * chunks))
-    samples, segments, flows = lax.stop_gradient(_draw_edges(world, camera, key, mesh, chunks, size))
-    samples = eqx.tree_at(lambda samples: samples.valid, samples, (flows != 0).any((2, 3)))
-    column, row = (segments.x[..., axis].astype(jnp.int32).ravel() for axis in (0, 1))
-    pixel, all_pixels = row * camera.width + column, camera.width * camera.height
+    contributions, seen = lax.stop_gradient(_draw_edges(world, camera, key, mesh, chunks, size))
+    pixel, _, sizes, _ = (values.ravel() for values in seen.unpacked())
+    all_pixels = camera.width * camera.height
 
     # They are chosen by the boundaries alone: a choice by the picture's own samples would keep what these happen to miss.
-    sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(2, 3))).ravel()
     count = min(math.ceil(edge_samples / resampled_side(settings) ** 2), all_pixels)
     count = count if resampled is None else min(resampled, all_pixels)
     _, chosen = lax.top_k(jnp.zeros(all_pixels, sizes.dtype).at[pixel].add(sizes), count)
-    return Boundaries(samples, flows, pixel, chosen.astype(jnp.int32))
+    return Boundaries(contributions, pixel, chosen.astype(jnp.int32))
 
 
 def resampled_side(settings: Settings) -> int:
@@ -88,19 +121,19 @@ def moved_light(world: World, camera: Camera, drawn: Boundaries, mesh: Mesh) -> 
     """For each boundary sample a number whose value is meaningless; its derivative is what the boundary's moving adds to the
     sample's pixel."""
 
-    @jax.checkpoint
     def moved(world: World, camera: Camera, sample: BoundarySample, flow: jax.Array):
         x, _ = picture_point(world, camera, sample, sample.s)
         return flow[:, 0] * x[0] + flow[:, 1] * x[1]
 
-    def chunk(seen: tuple[World, Camera], drawn: tuple[BoundarySample, jax.Array]):
-        return jax.vmap(moved, in_axes=(None, None, 0, 0))(*seen, *drawn)
+    @jax.checkpoint
+    def chunk(seen: tuple[World, Camera], contributions: Packed[tuple[BoundarySample, jax.Array]]):
+        return jax.vmap(moved, in_axes=(None, None, 0, 0))(*seen, *contributions.unpacked())
 
-    return map_over(mesh, chunk, (world, camera), (drawn.samples, drawn.flows)).reshape(-1, 3)
+    return map_over(mesh, chunk, (world, camera), drawn.contributions).reshape(-1, 3)
 
 
 def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks: int, size: int):
-    """Samples in chunks, the boundaries round them in the picture, and their flows, see `Boundaries`."""
+    """In chunks the `contributions` of `Boundaries`, and of each its pixel, its edge, the size of its flow and its speed."""
     world, camera = lax.stop_gradient((world, camera))
 
     def one(world: World, camera: Camera, guiding: GuidingDistribution, k: jax.Array, u: jax.Array):
@@ -115,14 +148,19 @@ def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks
         samples, passages, segments = jax.vmap(functools.partial(one, world, camera, guiding))(
             first + jnp.arange(size, dtype=jnp.int32), u
         )
-        # One batch: a `vmap` of a `vmap` would have to do all that `only_where` leaves out.
-        both = jax.tree.map(lambda leaf: jnp.repeat(leaf, 2, axis=0), (samples, passages, segments.valid))
-        sides = jnp.tile(jnp.arange(2, dtype=jnp.int32), size)
-        light = jax.vmap(lambda both, side: radiance_jump(world, both[0], both[1], both[2], side))(both, sides).reshape(
-            size, 2, 3
-        )
-        jump = light.sum(1) * jnp.where(segments.valid, samples.measure, 0)[:, None]
-        return samples, segments, jump[:, :, None] * segments.across[:, None, :]
+
+        def one_side(side: jax.Array) -> jax.Array:
+            return jax.vmap(functools.partial(radiance_jump, world, side=side))(samples, passages, segments.valid)
+
+        # A `vmap` of a `vmap` would have to do all that `only_where` leaves out.
+        light = lax.map(one_side, jnp.arange(2, dtype=jnp.int32))
+        jump = (light[0] + light[1]) * jnp.where(segments.valid, samples.measure, 0)[:, None]
+        flows = jump[:, :, None] * segments.across[:, None, :]
+        samples = eqx.tree_at(lambda samples: samples.valid, samples, (flows != 0).any((1, 2)))
+        column, row = (segments.x[:, axis].astype(jnp.int32) for axis in (0, 1))
+        sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(1, 2)))
+        seen = row * camera.width + column, samples.edge, sizes, segments.speed
+        return Packed.of((samples, flows)), Packed.of(seen)
 
     def in_round(weights: jax.Array, number: jax.Array):
         per_round = chunks * size
@@ -132,14 +170,13 @@ def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks
         drawn = map_over(mesh, chunk, (world, camera, guiding), (keys, firsts))
 
         def refined(weights: jax.Array) -> jax.Array:
-            samples, segments, flows = drawn
-            sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(2, 3)))
+            _, edge, sizes, speed = drawn[1].unpacked()
             # By how much the pixel changes as the edge is lifted; and, for what moves it otherwise, as if all had one speed.
             total = jnp.sum(sizes)
-            mean_speed = jnp.sum(sizes * segments.speed) / jnp.where(total > 0, total, 1)
+            mean_speed = jnp.sum(sizes * speed) / jnp.where(total > 0, total, 1)
             mean_speed = jnp.where(mean_speed > 0, mean_speed, 1)  # seen from straight above, lifting moves nothing
-            sizes = sizes * (segments.speed + mean_speed)
-            return refined_weights(world, weights, samples.edge.ravel(), sizes.ravel())
+            sizes = sizes * (speed + mean_speed)
+            return refined_weights(world, weights, edge.ravel(), sizes.ravel())
 
         return lax.cond(number == 0, refined, lambda weights: weights, weights), drawn
 

@@ -266,7 +266,8 @@ class _Stage:
         with writing_film(output, 24) as add, bar(total=options.frames, unit=" frames") as shown:
             for camera, look in zip(cameras, looks, strict=True):
                 if ready is None or look != lit:
-                    ready, lit = prepare(self._scene(field, camera, look)), look
+                    scene, lit = self._scene(field, camera, look), look
+                    ready = prepare(scene) if ready is None else ready.with_lights(scene.lights)
                 image = photograph(ready, camera, look)
                 add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
                 shown.update()

@@ -1,5 +1,6 @@
 """Leaving out what none of the rays of a batch needs."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from .materialise import materialise
 from .types import Flag
 
 
@@ -41,6 +43,12 @@ def only_where(needed: Flag, fun: Callable[..., Any], *args: Any, skips: bool = 
         def nothing(_: Any) -> Any:
             return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-        return lax.cond(needed.any(), many, nothing, batched), jax.tree.map(lambda _: True, shapes)
+        return lax.cond(_any(needed), many, nothing, batched), jax.tree.map(lambda _: True, shapes)
 
     return run(needed, args)
+
+
+def _any(flags: jax.Array) -> jax.Array:
+    """Whether one of them is set: by one kernel, where XLA reduces an axis of more than 32 in two or three."""
+    sides = [32] * max(1, math.ceil(math.log(flags.size, 32)))
+    return materialise(jnp.pad(flags.ravel(), (0, math.prod(sides) - flags.size)).reshape(sides)).any()

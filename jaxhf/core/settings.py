@@ -52,11 +52,12 @@ class Settings:
     shading: Shading = field(
         default="smooth", metadata={"help": "smooth, by interpolated normals, or flat, by the triangle's own normal"}
     )
-    normals: NormalScheme = field(
-        default="six",
+    normals: NormalScheme | None = field(
+        default=None,
         metadata={
             "help": "normals at the vertices: central, of central differences; four, the mean of four triangles; the mean of "
             "the six that touch the vertex, weighted by area (six), by angle (six-angle) or equally (six-equal)",
+            "none": "six, but in a fit six-angle where its pictures of rough terrain show that",
             "metavar": "SCHEME",
         },
     )
@@ -105,7 +106,7 @@ class Settings:
 
     def __post_init__(self):
         for name, kind in (("traversal", Traversal), ("shading", Shading), ("normals", NormalScheme)):
-            if getattr(self, name) not in get_args(kind):
+            if getattr(self, name) not in get_args(kind) and (name, getattr(self, name)) != ("normals", None):
                 raise ArgumentError(
                     "Settings", name, f"must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}"
                 )

@@ -112,6 +112,7 @@ class Findings(NamedTuple):
       lights: how many directions light comes from, over all pictures.
       scaled: by what the noise was multiplied for the standard deviations; None: there are none.
       draws: asked for, made; None: none were asked for.
+      normals: the scheme that the fit chose in place of the default one; None: none.
     """
 
     result: Stop
@@ -125,6 +126,7 @@ class Findings(NamedTuple):
     lights: int
     scaled: float | None
     draws: tuple[int, int] | None
+    normals: str | None
 
 
 def warnings(found: Findings) -> tuple[str, ...]:
@@ -166,6 +168,11 @@ def warnings(found: Findings) -> tuple[str, ...]:
         said.append(
             f"the standard deviations allow for what is left unexplained: they are those of {found.scaled:.2g} times the noise "
             "(M-estimator's covariance, Huber, Robust statistics, 1981, section 7.6; see docs/concepts/recovery.md)"
+        )
+    if found.normals is not None:
+        said.append(
+            f"normals at vertices are weighted as Settings(normals={found.normals!r}) says, which explains the pictures better "
+            "than the default, 'six': render the heights with these, or give the normals that you know to be right"
         )
     if found.draws is not None and found.draws[1] < found.draws[0]:
         said.append(

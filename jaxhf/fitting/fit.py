@@ -1,7 +1,6 @@
 """Recovers heights from pictures."""
 
 import dataclasses
-import functools
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,23 +12,24 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float
 
-from ..core.compilation import compiled
 from ..core.errors import ArgumentError, require_kind
 from ..core.settings import Settings
 from ..core.types import AnyArray
 from ..io.errors import FileError
 from ..io.files import require_folder
 from ..scene.scene import Scene
-from ..trace.normals import vertex_normals
 from .basis import Unknowns
 from .diagnosis import FAR_FROM_ONE, Findings, Places, Region, warnings, where_residuals_are, worst_regions
 from .history import Draws, Step, Stop
 from .loop import FitLoop
+from .normals import share_of_normals
 from .options import Albedo, FitOptions, Loss, Solver
 from .problem import Problem, make_problem
-from .residuals import found_scenes, pictures_and_influence
+from .residuals import found_scenes
 from .solvers import BFGS_UNKNOWNS, count_unknowns
 from .uncertainty import require_small, standard_deviations, with_unexplained
+
+_OFF = 3.0  # standard deviations of the noise by which a background must be off to count
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,12 +46,14 @@ class Fit:
       exposures, offsets: of each picture; None where they were known.
       noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated.
       scenes: as they were given, with all that was found: heights, albedo, lights and cameras.
+      settings: those that were given, with all that was chosen: `render` with them makes `images` of `scenes`, but for the
+        pixels that a boundary crosses, which have more samples in a fit.
       images: the pictures as they would be measured, (h, w) or (h, w, c) each, as their targets.
       residuals: `images` - targets; 0 where a target has no weight.
       regions: the three blocks of the pictures with the largest residuals.
       warnings: what speaks against trusting the heights, a sentence each; empty where nothing does.
-      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals in units of `noise`, but for those
-        that are exactly 0: about 1 where `noise` is right and all is explained.
+      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals in units of `noise` and the error
+        of their samples, without a background that is explained: about 1 where `noise` is right and all is explained.
       history: a `Step` for each step.
     """
 
@@ -64,6 +66,7 @@ class Fit:
     offsets: Float[AnyArray, " pictures"] | None
     noise: Float[np.ndarray, " pictures"]
     scenes: tuple[Scene, ...]
+    settings: Settings
     images: tuple[np.ndarray, ...]
     residuals: tuple[np.ndarray, ...]
     regions: tuple[Region, ...]
@@ -121,7 +124,8 @@ def fit(
         with one channel is compared with the mean over a picture's channels.
       settings: how to render. Samples that it leaves open are 4 a pixel, or the scene's if that is more. Where it leaves
         `edge_samples` open, points on edges are taken where silhouettes, the terrain's border or shadows may be in sight, 2048
-        to 32768 by their length in the pictures; not where the albedo is unknown or a mirror in the scene.
+        to 32768 by their length in the pictures; not where the albedo is unknown or a mirror in the scene. Where it leaves
+        `normals` open, noise is given and pictures of terrain so rough tell, "six" or "six-angle", which explains them better.
       weights: for each picture None or a map (h, w) or (h, w, c), from 0 (masked: the target may be nan there)
         on; it divides the noise.
       noise: standard deviation of a target's values at weight 1, radiance; one number or one for each picture. None: each
@@ -156,7 +160,8 @@ def fit(
       levels: shares of the highest frequency up to which heights are varied, one after the other, the last being 1; None:
         from 8 modes a side, doubled each time, for "lm", all at once for the others.
       max_steps: over all levels.
-      inner_steps: LSMR iterations in one step of Levenberg-Marquardt, at most.
+      inner_steps: LSMR iterations in one step of Levenberg-Marquardt, at most; of conjugate gradients, where the pictures'
+        derivative is a sparse matrix, at most five times as many.
       tolerance: of the relative change of unknowns and residuals in one step at which the fit has converged. None: with "lm",
         when a step would lower the loss by less than 0.001 for each height, which moves heights by 0.05 of the deviation that
         the noise leaves them with; else 1e-4.
@@ -238,7 +243,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
     images: list[np.ndarray] = [np.zeros(())] * problem.count
     differences: list[np.ndarray] = [np.zeros(())] * problem.count
     in_noise: list[np.ndarray] = [np.zeros(())] * problem.count
-    pictures, influence = pictures_and_influence(unknowns, problem)
+    pictures, influence = loop.pictures_and_influence(unknowns)
     for group, simulated in zip(problem.groups, pictures, strict=True):
         simulated, weights = np.asarray(simulated), np.asarray(group.weights)
         difference = np.where(weights > 0, simulated - np.asarray(group.targets), 0)
@@ -246,12 +251,13 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
             shape = np.shape(targets[k])
             images[k], differences[k] = _in_shape(image, shape), _in_shape(values, shape)
             in_noise[k] = values * weight
-    # A background that is black in picture and target says nothing.
-    counted = np.concatenate([values[values != 0] for values in in_noise]).astype(np.float64)
+    counted = np.concatenate(
+        [values[informs | (np.abs(values) > _OFF)] for values, informs in zip(in_noise, _informing(problem), strict=True)]
+    ).astype(np.float64)
     with np.errstate(over="ignore"):
         regions, where = worst_regions(in_noise), where_residuals_are(in_noise, _places(problem))
         chi2 = float(np.mean(np.square(counted))) if len(counted) else 0.0
-    seen = np.asarray(influence) != 0
+    seen = influence != 0
     std, scaled, draws = None, None, None
     if options.uncertainty is not None and result is not Stop.NON_FINITE:
         borne_out, scaled = with_unexplained(problem, counted)
@@ -270,6 +276,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         strayed=_strayed(problem, np.asarray(heights), seen, options.prior_std),
         seen=seen,
         lights=_light_directions(problem),
+        normals=problem.settings.normals if options.settings.normals is None else None,
         scaled=scaled,
         draws=draws,
     )
@@ -290,6 +297,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         offsets=unknowns.offsets,
         noise=problem.noise,
         scenes=found_scenes(scenes, unknowns, problem),
+        settings=problem.settings,
         images=tuple(images),
         residuals=tuple(differences),
         regions=regions,
@@ -297,6 +305,18 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         stats=stats,
         history=tuple(loop.history),
     )
+
+
+def _informing(problem: Problem) -> list[Bool[np.ndarray, "h w c"]]:
+    """Which values of each picture depend on the heights; all of those with a weight where that is not known."""
+    found = [np.zeros((1, 1, 1), bool)] * problem.count
+    for number, group in enumerate(problem.groups):
+        informing = np.asarray(group.weights) > 0
+        if problem.linearised is not None:
+            informing &= np.asarray(problem.linearised[number].depends)[..., None]
+        for k, values in zip(group.indices, informing, strict=True):
+            found[k] = values
+    return found
 
 
 def _places(problem: Problem) -> list[Places]:
@@ -323,7 +343,7 @@ def _what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> str:
         return "loss='geman' lets pixels go that the scene cannot explain"
     if not problem.settings.edge_samples:
         return "Settings(edge_samples=None), the default, lets the fit move silhouettes, shadows and the terrain's border"
-    share = _share_of_normals(problem, heights)
+    share = share_of_normals(problem, heights)
     if share > 1:
         return (
             f"pictures of terrain as rough as this differ by {share:.2g} times the noise between normals weighted by area, the "
@@ -332,23 +352,6 @@ def _what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> str:
     if (problem.settings.samples or 1) < 16:
         return "Settings(samples=16) makes pictures of finer samples; if that changes nothing, mask those pixels by weights"
     return "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo)"
-
-
-def _share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> float:
-    """By about how much pictures change, in units of the noise, as normals are weighted by angle: the horizontal part of what
-    they turn by times the pictures' brightness; 0 where the settings are not the default ones."""
-    settings, field = problem.settings, problem.groups[0].shared.heightfields[0]
-    if (settings.normals, settings.shading) != ("six", "smooth"):
-        return 0.0
-    horizontal = _turned_normals(jnp.asarray(heights), field.dx, field.dy)[..., :2]
-    return float(np.sqrt(np.mean(np.square(horizontal))) * np.median(problem.brightness / problem.noise))
-
-
-@functools.partial(compiled, static_argnames=("dx", "dy"))
-def _turned_normals(heights: Float[jax.Array, "ny nx"], dx: float, dy: float) -> Float[jax.Array, "ny nx 3"]:
-    """By what unit normals differ that are weighted by angle from those by area."""
-    area, angle = (vertex_normals(heights, dx, dy, scheme) for scheme in ("six", "six-angle"))
-    return angle - area / jnp.linalg.norm(area, axis=-1, keepdims=True)
 
 
 def _strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: Any) -> float | None:

@@ -5,8 +5,8 @@ heights and normals at vertices, times that of these in the heights.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,16 +19,18 @@ from jaxtyping import Array, Float
 
 from ..boundary.term import resampled_side
 from ..core.compilation import compiled
+from ..core.devices import on_every_device
 from ..rendering.samples import PictureSamples
 from ..rendering.tiles import Tiling
 from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
 from ..trace.world import make_world
 from .basis import Unknowns
+from .groups import Group
 from .linearise import Linearised, vertex_values
-from .problem import Group, Problem
-from .residuals import completion, heights_of, picture_residuals, views
-from .robust import robust_weight
+from .problem import Problem
+from .residuals import completion, heights_of, simulate, views
+from .robust import robust_weight, soften
 
 sp: Any = scipy.sparse  # whose stubs miss much
 Sparse = Any
@@ -37,34 +39,39 @@ Sparse = Any
 _REACH = 3  # A vertex's normal depends on heights one row and one column off: of each 3 x 3 heights on one.
 
 
-def pictures_jacobian(unknowns: Unknowns, problem: Problem) -> Sparse:
-    """The derivative of the pictures' residuals, each times the root of its robust weight.
+def images_jacobian(unknowns: Unknowns, problem: Problem) -> Sparse:
+    """The derivative of the pictures in the heights, without exposures and weights.
 
     Args:
       unknowns: whose albedo is known.
       problem: `linearised` there.
 
     Returns:
-      A row for each value of each picture, a column for each height without padding, then for each of `other_unknowns`.
+      A row for each value of each picture, in the order of `in_rows`, a column for each height without padding.
     """
     assert problem.linearised is not None
     heights = heights_of(unknowns, problem.basis)
-    slopes, weights, others = jax.tree.map(np.asarray, _dense_parts(heights, unknowns, problem))
-    blocks = []
-    for n, (group, known) in enumerate(zip(problem.groups, problem.linearised, strict=True)):
+    slopes, blocks = _slopes(*on_every_device((heights, unknowns, problem), problem.mesh)), []
+    for group, known, here in zip(problem.groups, problem.linearised, slopes, strict=True):
         scene = group.complete(group.scenes, heights)
-        of_heights = vertices_by_heights(np.asarray(slopes[n], np.float64), scene)
+        of_heights = vertices_by_heights(np.asarray(here, np.float64), scene)
         for k in range(len(group.indices)):
-            here = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], known)
-            samples = PictureSamples(scene.camera, problem.settings, None if here.edges is None else here.edges.resampled)
-            weight = np.asarray(weights[n][k], np.float64)
-            more = np.asarray(others[n][:, k], np.float64).reshape(-1, *weight.shape)
-            for channel in range(weight.shape[-1]):
-                rows = picture_by_vertices(here, samples, channel, of_heights.shape[0])
-                by_heights = sp.diags_array(weight[..., channel].ravel()) @ (rows @ of_heights)
-                by_others = more[..., channel].reshape(len(more), rows.shape[0]).T
-                blocks.append(sp.hstack([by_heights, sp.csr_array(by_others)]))
+            one = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], known)
+            samples = PictureSamples(scene.camera, problem.settings, None if one.edges is None else one.edges.resampled)
+            for channel in range(group.targets.shape[-1]):
+                blocks.append(picture_by_vertices(one, samples, channel, of_heights.shape[0]) @ of_heights)
     return sp.vstack(blocks, format="csr")
+
+
+def in_rows(pictures: Sequence[Any]) -> Float[np.ndarray, " rows"]:
+    """Values of the pictures of each group, (n, h, w, c), one after the other: picture by picture, channel by channel."""
+    return np.concatenate([np.moveaxis(np.asarray(part), -1, 1).ravel() for part in pictures]).astype(np.float64)
+
+
+def scaled_rows(matrix: Sparse, factors: Float[np.ndarray, " rows"]) -> Sparse:
+    """A matrix with each row multiplied."""
+    values = matrix.data * np.repeat(factors, np.diff(matrix.indptr))
+    return sp.csr_array((values, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 def other_unknowns(unknowns: Unknowns) -> Any:
@@ -72,22 +79,59 @@ def other_unknowns(unknowns: Unknowns) -> Any:
     return eqx.tree_at(lambda unknowns: unknowns.coefficients, unknowns, None)
 
 
+class PictureValues(NamedTuple):
+    """The pictures and their part of the loss; each list has an array for each group.
+
+    Attributes:
+      images: the pictures as they would be measured, see `simulate`.
+      softened: residuals whose half squares are the robust loss.
+      slopes: their derivatives in the residuals.
+      roots: of the residuals' robust weights.
+      factors: derivatives of the residuals in the pictures: weights times exposures.
+      others: derivatives of the residuals in each of `other_unknowns`.
+    """
+
+    images: list[Float[Array, "n h w c"]]
+    softened: list[Float[Array, "n h w c"]]
+    slopes: list[Float[Array, "n h w c"]]
+    roots: list[Float[Array, "n h w c"]]
+    factors: list[Float[Array, "n h w c"]]
+    others: list[Float[Array, "k n h w c"]]
+
+
+def picture_values(unknowns: Unknowns, problem: Problem) -> PictureValues:
+    """See there; the problem is `linearised` at these unknowns."""
+    return _picture_values(*on_every_device((unknowns, problem), problem.mesh))
+
+
 @functools.partial(compiled, jit=eqx.filter_jit)
-def _dense_parts(
-    heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem
-) -> tuple[list[Float[Array, "9 vertices m"]], list[Float[Array, "n h w c"]], list[Float[Array, "k n h w c"]]]:
-    """For each group the `vertex_slopes`, what the derivative of each of its pictures' values is multiplied by, and the
-    derivatives of the weighted residuals in the other unknowns."""
-    residuals, pictures = jax.linearize(lambda u: picture_residuals(u, problem), unknowns)
-    roots = [jnp.sqrt(robust_weight(part, problem.loss, problem.loss_scale)) for part in residuals]
+def _picture_values(unknowns: Unknowns, problem: Problem) -> PictureValues:
     flat, unflat = jax.flatten_util.ravel_pytree(unknowns)  # coefficients are the first of them
     beyond = unknowns.coefficients.size + jnp.arange(flat.size - unknowns.coefficients.size)
 
-    def column(k: Array) -> list[Array]:
-        changes = pictures(unflat(jnp.zeros_like(flat).at[k].set(1)))
-        return [root * change for root, change in zip(roots, changes, strict=True)]
+    def compared(unknowns: Unknowns) -> tuple[list[Array], list[Array]]:
+        images = simulate(unknowns, problem)
+        return [group.weights * (image - group.targets) for group, image in zip(problem.groups, images, strict=True)], images
 
-    others = lax.map(column, beyond) if beyond.size else [jnp.zeros((0, *root.shape), root.dtype) for root in roots]
+    if beyond.size:
+        residuals, changes, images = jax.linearize(compared, unknowns, has_aux=True)
+        others = lax.map(lambda k: changes(unflat(jnp.zeros_like(flat).at[k].set(1))), beyond)
+    else:
+        residuals, images = compared(unknowns)
+        others = [jnp.zeros((0, *part.shape), part.dtype) for part in residuals]
+    factors = []
+    for group in problem.groups:
+        exposures = 1 if unknowns.exposures is None else unknowns.exposures[jnp.array(group.indices)].reshape(-1, 1, 1, 1)
+        factors.append(group.weights * exposures)
+    soft = functools.partial(soften, loss=problem.loss, scale=problem.loss_scale)
+    pairs = [jax.jvp(soft, (part,), (jnp.ones_like(part),)) for part in residuals]
+    roots = [jnp.sqrt(robust_weight(part, problem.loss, problem.loss_scale)) for part in residuals]
+    return PictureValues(images, [value for value, _ in pairs], [slope for _, slope in pairs], roots, factors, others)
+
+
+@functools.partial(compiled, jit=eqx.filter_jit)
+def _slopes(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem) -> list[Float[Array, "9 vertices m"]]:
+    """For each group the `vertex_slopes`."""
     slopes = []
     for group in problem.groups:
         first = jax.tree.map(lambda leaf: leaf[0], views(unknowns, problem, group))
@@ -96,11 +140,7 @@ def _dense_parts(
             return vertex_values(make_world(completion(unknowns, group, heights)(scene), problem.settings))
 
         slopes.append(vertex_slopes(values, heights))
-    weights = []
-    for group, root in zip(problem.groups, roots, strict=True):
-        exposures = 1 if unknowns.exposures is None else unknowns.exposures[jnp.array(group.indices)].reshape(-1, 1, 1, 1)
-        weights.append(group.weights * root * exposures)
-    return slopes, weights, others
+    return slopes
 
 
 def vertex_slopes(

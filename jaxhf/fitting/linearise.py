@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..boundary.guiding import edge_sets
 from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
-from ..boundary.term import default_key, draw_boundaries
+from ..boundary.term import Packed, default_key, draw_boundaries
 from ..core.autodiff import with_tangent
 from ..core.devices import map_over, on_every_device
 from ..core.materialise import materialise
@@ -40,7 +40,7 @@ from .view import KNOWN, View, motion, moved
 _TOGETHER = 1024
 # Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
 _POINTS_PER_PIXEL = 4
-_SAMPLING_ERROR = 0.7
+_SAMPLING_ERROR = 0.25
 
 
 class Linearised(eqx.Module):
@@ -139,32 +139,50 @@ def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int, stil
     sampled = functools.partial(_samples, channels)
     light, slopes, vertices, view = map_over(mesh, sampled, (world, camera, still), samples.positions())
     image, edges = samples.in_pixels(light), None
-    sampling = samples.in_pixels(light, _sampling_error)
+    sampling = _sampling_error(samples.in_rows(light), math.isqrt(world.settings.samples or 1))
     if drawn is not None:
         followed = functools.partial(_boundary_samples, channels)
-        edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, (world, camera, still), (drawn.samples, drawn.flows))
-        kind = jnp.where(drawn.samples.valid, jnp.where(drawn.samples.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
+        edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, (world, camera, still), drawn.contributions)
+        points, _ = drawn.contributions.unpacked()
+        kind = jnp.where(points.valid, jnp.where(points.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
         edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled, edge_view)
         finer = samples.of_resampled(light)
+        side = math.isqrt(finer.shape[1])
+        error = jax.vmap(lambda pixel: _sampling_error(pixel.reshape(side, side, channels), side)[0, 0])(finer)
         image, sampling = (
             known.reshape(-1, channels).at[drawn.resampled].set(new, unique_indices=True).reshape(image.shape)
-            for known, new in ((image, finer.mean(1)), (sampling, _sampling_error(finer)))
+            for known, new in ((image, finer.mean(1)), (sampling, error))
         )
     moving = (slopes != 0).any(axis=(1, 2)).astype(light.dtype)[..., None]
     depends = samples.in_pixels(moving)[..., 0] > 0
     return Linearised(image, depends, jnp.sqrt(jnp.mean(sampling * sampling, axis=-1)), slopes, vertices, edges, view)
 
 
-def _sampling_error(samples: Float[jax.Array, "pixels n c"]) -> Float[jax.Array, "pixels c"]:
-    """The standard deviation of the means of regular n x n samples, for pixels that a boundary crosses.
+def _sampling_error(samples: Float[jax.Array, "rows columns c"], side: int) -> Float[jax.Array, "h w c"]:
+    """The standard deviation of the means over squares of side x side samples, of rows and columns of regular samples.
 
-    It falls as n^(-3/4) (Mitchell, Consequences of stratified sampling in graphics, SIGGRAPH 1996); the factor was measured on
-    pictures of 1024 samples: 0.6 to 1.0 where a boundary crosses a pixel, for n of 4, 16 and 64, less elsewhere.
+    It is 0.25 / side times the root mean square of the second differences in such a square. Where the picture is smooth these
+    follow its curvature, on which the error depends (midpoint rule), not its slope; where a boundary crosses, it falls as
+    n^(-3/4), n = side² (Mitchell, Consequences of stratified sampling in graphics, SIGGRAPH 1996). The factor was measured on
+    pictures of 1024 samples, see docs/measurements/fits.md.
     """
-    n = samples.shape[1]
-    if n == 1:
-        return jnp.zeros_like(samples[:, 0])
-    return _SAMPLING_ERROR * n**-0.75 * jnp.std(samples, axis=1, ddof=1)
+    if side == 1:
+        return jnp.zeros_like(samples)
+    along_x, along_y = (_second_differences(rows, side) for rows in (samples, samples.swapaxes(0, 1)))
+    squares = along_x * along_x + (along_y * along_y).swapaxes(0, 1)
+    h, w = (n // side for n in squares.shape[:2])
+    return _SAMPLING_ERROR / side * jnp.sqrt(squares.reshape(h, side, w, side, -1).mean((1, 3)))
+
+
+def _second_differences(samples: Float[jax.Array, "rows columns c"], side: int) -> Float[jax.Array, "rows columns c"]:
+    """Sizes of second differences along the rows; the first and last of a square as large as its neighbour's there at most.
+
+    So a boundary between two squares counts for neither.
+    """
+    padded = jnp.pad(samples, ((0, 0), (1, 1), (0, 0)), mode="edge")
+    size = jnp.abs(padded[:, 2:] + padded[:, :-2] - 2 * samples).reshape(samples.shape[0], -1, side, samples.shape[2])
+    first, last = (jnp.minimum(size[:, :, a], size[:, :, b])[:, :, None] for a, b in ((0, 1), (-1, -2)))
+    return jnp.concatenate([first, size[:, :, 1:-1], last], axis=2).reshape(samples.shape)
 
 
 def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "h w c"]:
@@ -242,10 +260,10 @@ def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
     return vertices
 
 
-def _boundary_samples(channels: int, seen: tuple[World, Camera, View], drawn: tuple[BoundarySample, Float[jax.Array, "n 3 2"]]):
+def _boundary_samples(channels: int, seen: tuple[World, Camera, View], drawn: Packed[tuple[BoundarySample, jax.Array]]):
     """Slopes, vertices and view of boundary samples, see `LinearisedEdges`."""
     world, camera, still = seen
-    samples, flows = drawn
+    samples, flows = drawn.unpacked()
     flows = jnp.moveaxis(_channels(jnp.moveaxis(flows, 1, -1), channels), -1, 0)
 
     def position(sample: BoundarySample, perturbation: jax.Array, view: View) -> jax.Array:

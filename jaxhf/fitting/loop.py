@@ -1,11 +1,10 @@
 """The loop of a fit: step after step through its stages, watched, kept and resumed."""
 
 import dataclasses
-import hashlib
 import itertools
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +19,18 @@ from ..io.checkpoint import load_arrays, load_facts, save_checkpoint
 from ..io.errors import FileError
 from ..scene.heightfield import Heightfield
 from .basis import Unknowns, balanced_units, make_basis
+from .curvature import mode_curvature
+from .fingerprint import fingerprint
 from .history import Step, Stop, print_progress
-from .normal_matrix import is_sparse
-from .options import FitOptions
-from .problem import Problem, mode_curvature
-from .residuals import heights_of, linearised, pictures_and_influence, surface_of
-from .solvers import (
-    DEFAULT_TOLERANCE,
-    FIRST_DAMPING,
-    Outcome,
-    advance,
-    evaluated_at,
-    init_state,
-    make_solver,
-    reset_state,
-    with_rejections,
-)
+from .jacobian import Sparse, in_rows, picture_values
+from .known import Known, KnownPictures, jacobian_at, pictures_and_influence, spreads_of
+from .normal_equations import NormalEquations, advance, has_damping, init_state, reset_state, step_size, with_rejections
+from .normals import evidence_for_angles
+from .options import FitOptions, make_stages
+from .problem import Problem
+from .quadratic import is_sparse
+from .residuals import surface_of
+from .solvers import DEFAULT_TOLERANCE, FIRST_DAMPING, Outcome, evaluated_at, make_solver
 
 _REJECTIONS = 2  # in a row, at a coarse level: the next one may do better
 _HALVINGS = 50  # in a row, in a line search, whose first step is the whole gradient
@@ -44,20 +39,10 @@ _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviati
 _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
 _LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
-_LAST_STAGES = 3  # at most, over which the scale of a robust loss comes down to its own, and the noise is estimated
+_TRIAL_STEPS = 6  # with other normals
+_EVIDENCE = 3.0  # for these, standard deviations, to try them: another program is compiled
+_FAR = 3.0  # standard deviations of the noise: a residual that is larger counts as this
 _PROBES = 8  # of the pictures' curvature
-
-
-def make_stages(shape: tuple[int, ...], options: FitOptions) -> list[float]:
-    """The share of the highest frequency that each stage varies.
-
-    The levels, then 1 while the loss is sharpened and the noise estimated.
-    """
-    levels = options.levels
-    if levels is None:
-        doublings = max(0, math.floor(math.log2(max(shape) / 8))) if options.solver == "lm" else 0
-        levels = [0.5**k for k in range(doublings, -1, -1)]
-    return [*levels, *[1.0] * (0 if options.loss == "squares" and options.noise is not None else _LAST_STAGES)]
 
 
 class FitLoop:
@@ -81,14 +66,13 @@ class FitLoop:
         self.snapshot: tuple[dict[str, Any], Any] | None = None  # for the next checkpoint
         self.final_loss_scale = None if problem.loss_scale is None else float(problem.loss_scale)
         self.units: np.ndarray | None = None  # see `make_basis`
-        self.views: list[tuple[list[np.ndarray], Any]] = []  # linearised pictures, with the unknowns that they belong to
+        self.pictures = KnownPictures()
         self.seconds = 0.0  # spent before a resumption
 
     def run(self) -> Stop:
         self.started = time.perf_counter()
-        self.fingerprint = _fingerprint(self.problem, self.unknowns, self.options) if self.path else ""
-        self.initial_state = init_state(self.solver, self.unknowns, self.known(self.unknowns))
-        self.state = self.initial_state
+        self.fingerprint = fingerprint(self.problem, self.unknowns, self.options) if self.path else ""
+        self.state = self.initial_state = self._initial_state(self.unknowns)
         if self.path and self.options.resume and self.path.exists():
             self._load()
         else:
@@ -111,18 +95,24 @@ class FitLoop:
 
     def known(self, unknowns: Unknowns) -> Problem:
         """The problem, `linearised` at these unknowns; the pictures of the best unknowns and of the last ones are kept."""
-        at, best = self._place(unknowns), self._place(self.best[1])
-        found = next((found for place, found in self.views if _same_place(place, at)), None)
-        if found is None:
-            found = linearised(unknowns, self.problem).linearised
-        kept = [view for view in self.views if view[1] is not found and _same_place(view[0], best)]
-        self.views = [(at, found), *kept]
-        return dataclasses.replace(self.problem, linearised=found)
+        return dataclasses.replace(self.problem, linearised=self._known(unknowns).linearised)
 
-    def _place(self, unknowns: Unknowns) -> list[np.ndarray]:
-        """The heights and the other unknowns, on which pictures depend; not how the heights are made of modes."""
-        others = eqx.tree_at(lambda u: u.coefficients, unknowns, None, is_leaf=lambda leaf: leaf is None)
-        return [np.asarray(heights_of(unknowns, self.problem.basis)), *map(np.asarray, jax.tree.leaves(others))]
+    def _known(self, unknowns: Unknowns) -> Known:
+        return self.pictures.at(unknowns, self.problem, self.best[1])
+
+    def pictures_and_influence(self, unknowns: Unknowns, key: int = 0) -> tuple[list[jax.Array], Float[np.ndarray, "ny nx"]]:
+        """Those of `known` unknowns, see there."""
+        return pictures_and_influence(unknowns, self.known(unknowns), key, self._jacobian(unknowns))
+
+    def _jacobian(self, unknowns: Unknowns) -> Callable[[], Sparse]:
+        return lambda: jacobian_at(unknowns, self.problem, self._known(unknowns))
+
+    def _initial_state(self, unknowns: Unknowns) -> Any:
+        """The solver's state before its first step; Levenberg-Marquardt is by normal equations where that can be."""
+        known = self.known(unknowns)
+        if self.options.solver == "lm" and is_sparse(known):
+            self.solver = NormalEquations(self.options.tolerance or DEFAULT_TOLERANCE, self.options.inner_steps)
+        return init_state(self.solver, unknowns, known)
 
     def elapsed(self) -> float:
         """Seconds since the fit began, with those before a resumption."""
@@ -139,14 +129,10 @@ class FitLoop:
         surface = np.asarray(surface_of(unknowns, self.problem.basis))
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, jnp.zeros_like(unknowns.coefficients))
         share, repeats = self.stages[self.stage + 1], self.stage >= 0 and self.stages[self.stage] == 1
-        known = self.known(self.best[1])
-        refined = repeats and self._take_more_edges(surface)
-        if refined:
-            known = self.known(self.best[1])
-        pictures, _ = pictures_and_influence(self.best[1], known)
-        spreads = _spreads(pictures, known)  # radiance
+        refined = repeats and self._take_other_settings(surface)
+        known, spreads = self.known(self.best[1]), self._spreads(self.best[1])
         noise = self._estimated_noise(spreads, share)
-        spread = float(np.sqrt(np.mean(np.square(spreads / noise))))
+        spread = _rms(spreads / noise)
         scale = None
         if self.final_loss_scale is not None:
             scale = max(self.final_loss_scale, 3 * spread)
@@ -167,24 +153,59 @@ class FitLoop:
         if scale is not None:
             self.problem = dataclasses.replace(self.problem, loss_scale=jnp.asarray(scale, self.field.heights.dtype))
         self.best = (self.best[0], self.unknowns)
-        step_size = jnp.asarray(1 / (FIRST_DAMPING * curvature), self.field.heights.dtype)
-        self.state = reset_state(self.initial_state, self.unknowns, step_size if self._damped() else None)
+        first = jnp.asarray(1 / (FIRST_DAMPING * curvature), self.field.heights.dtype)
+        self.state = reset_state(self.initial_state, self.unknowns, first if self._damped() else None)
         self._take_snapshot()
         return True
 
-    def _take_more_edges(self, surface: np.ndarray) -> bool:
-        """Whether the heights that were found call for many more points on edges than those of the start did."""
-        heights = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype)
-        problem = self.problem.with_edge_samples(heights, self.options)
-        if problem.settings == self.problem.settings:
-            return False
-        self._set_settings(problem.settings)
-        return True
+    def _spreads(self, unknowns: Unknowns) -> Float[np.ndarray, " pictures"]:
+        """Of what these unknowns leave of the pictures, radiance."""
+        pictures, _ = self.pictures_and_influence(unknowns)
+        return spreads_of(pictures, self.known(unknowns))
+
+    def _tried(self, steps: int) -> Unknowns:
+        """Where some steps from the best unknowns lead, which are not taken: heights that were fitted with other normals make
+        up for these."""
+        at, (_, curvature) = self.best[1], self._measured_units(self.best[1])
+        size = jnp.asarray(1 / (FIRST_DAMPING * curvature), self.field.heights.dtype)
+        state = reset_state(self.initial_state, at, size)
+        for _ in range(1 + steps):
+            there = evaluated_at(at, state)
+            at, state, _ = advance(with_rejections(self.solver, 0, self._jacobian(there)), at, state, self.known(there))
+        return at
+
+    def _take_other_settings(self, surface: np.ndarray) -> bool:
+        """Whether the heights that were found call for many more points on edges than those of the start did, or other normals
+        explain the pictures better, after some steps."""
+        heights, before = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype), self.problem.settings
+        settings = self.problem.with_edge_samples(heights, self.options).settings
+        left_open = settings.normals is None and settings.shading == "smooth" and self._damped()
+        if left_open and self._evidence_for_angles(heights) > _EVIDENCE:
+            left = self._left(self.best[1])
+            self._set_settings(dataclasses.replace(settings, normals="six-angle"))
+            if self._left(self._tried(_TRIAL_STEPS)) < left:
+                return True
+        if settings != self.problem.settings:
+            self._set_settings(settings)
+        return settings != before
+
+    def _evidence_for_angles(self, heights: jax.Array) -> float:
+        """See there; 0 where the pictures' derivatives are not known."""
+        known = self.known(self.best[1])
+        return evidence_for_angles(known, heights, picture_values(self.best[1], known).images) if is_sparse(known) else 0.0
+
+    def _left(self, unknowns: Unknowns) -> float:
+        """What these unknowns leave of the pictures: the sum of squared residuals in units of the noise, of large ones less."""
+        known = self.known(unknowns)
+        pairs = zip(known.groups, picture_values(unknowns, known).images, strict=True)
+        residuals = in_rows([group.weights * (image - group.targets) for group, image in pairs])
+        return float(np.sum(np.minimum(residuals * residuals, _FAR**2)))
 
     def _set_settings(self, settings: Settings) -> None:
         """Renders otherwise; the solver's state has another structure then."""
-        self.problem, self.views = dataclasses.replace(self.problem, settings=settings, linearised=None), []
-        self.initial_state = init_state(self.solver, self.best[1], self.known(self.best[1]))
+        self.problem = dataclasses.replace(self.problem, settings=settings, linearised=None)
+        self.pictures = KnownPictures()
+        self.initial_state = self._initial_state(self.best[1])
 
     def _loss_scale(self) -> float | None:
         return None if self.problem.loss_scale is None else float(self.problem.loss_scale)
@@ -213,8 +234,7 @@ class FitLoop:
 
     def _measured_units(self, unknowns: Unknowns) -> tuple[np.ndarray, float]:
         """Units of the modes by the curvature of the loss at these unknowns, and that curvature, see `balanced_units`."""
-        known = self.known(unknowns)
-        influences = [np.asarray(pictures_and_influence(unknowns, known, key)[1]) for key in range(_PROBES)]
+        influences = [self.pictures_and_influence(unknowns, key)[1] for key in range(_PROBES)]
         basis = make_basis(self.field, np.asarray(self.problem.basis.base))
         curvature = mode_curvature(self.problem, influences)
         return balanced_units(np.asarray(basis.scale, np.float64), curvature, mean_only=self.options.solver != "lm")
@@ -230,10 +250,13 @@ class FitLoop:
         self.unknowns = eqx.tree_at(lambda u: u.coefficients, self.unknowns, jnp.zeros_like(self.unknowns.coefficients))
 
     def _step(self) -> None:
-        solver = with_rejections(self.solver, self._rejections())
-        known = self.known(evaluated_at(self.unknowns, self.state))
-        self.unknowns, self.state, outcome = advance(solver, self.unknowns, self.state, known)
+        self.unknowns, self.state, outcome = self._advance(self._rejections())
         self._record(outcome)
+
+    def _advance(self, rejections: int) -> tuple[Unknowns, Any, Outcome]:
+        at = evaluated_at(self.unknowns, self.state)
+        solver = with_rejections(self.solver, rejections, self._jacobian(at))
+        return advance(solver, self.unknowns, self.state, self.known(at))
 
     def _rejections(self) -> int:
         """How many of this stage's steps were rejected since the last accepted one."""
@@ -280,7 +303,7 @@ class FitLoop:
 
     def _damped(self) -> bool:
         """Whether rejected steps raise a λ."""
-        return hasattr(self.initial_state, "num_steps_since_acceptance")
+        return has_damping(self.initial_state)
 
     def _flat(self, steps: Sequence[Step], fine: bool) -> bool:
         """Whether accepted steps hardly lower the loss any more."""
@@ -303,7 +326,7 @@ class FitLoop:
 
     def _arrays(self) -> Any:
         """The arrays of a checkpoint; of the state of Levenberg-Marquardt only 1 / λ, as one step makes the rest anew."""
-        state = self.state.search_state.step_size if self._damped() else eqx.filter(self.state, eqx.is_array)
+        state = step_size(self.state) if self._damped() else eqx.filter(self.state, eqx.is_array)
         place = (self.problem.basis.base, self.problem.loss_scale, self.problem.noise, self.units)
         return self.unknowns, self.best[1], place, state
 
@@ -323,6 +346,7 @@ class FitLoop:
             "converged": self.converged,
             "predicted": self.predicted,
             "edge_samples": self.problem.settings.edge_samples,
+            "normals": self.problem.settings.normals,
             "seconds": self.elapsed(),
             "history": [list(step) for step in self.history],
         }
@@ -338,7 +362,7 @@ class FitLoop:
         facts = load_facts(self.path)
         if facts["fingerprint"] != self.fingerprint:
             raise FileError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
-        settings = dataclasses.replace(self.problem.settings, edge_samples=facts["edge_samples"])
+        settings = dataclasses.replace(self.problem.settings, edge_samples=facts["edge_samples"], normals=facts["normals"])
         if settings != self.problem.settings:
             self._set_settings(settings)
         self.units = np.zeros(self.problem.basis.base.shape)
@@ -353,56 +377,10 @@ class FitLoop:
         if self._damped():
             self.state = reset_state(self.initial_state, self.unknowns, state)
             if len(self.history) > self.stage_start:
-                solver = with_rejections(self.solver, 0)
-                known = self.known(evaluated_at(self.unknowns, self.state))
-                self.unknowns, self.state, _ = advance(solver, self.unknowns, self.state, known)
+                self.unknowns, self.state, _ = self._advance(0)
         else:
             self.state = eqx.combine(state, self.initial_state)
 
 
-def _same_place(one: Sequence[np.ndarray], other: Sequence[np.ndarray]) -> bool:
-    return all(map(np.array_equal, one, other))
-
-
-def _spreads(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarray, " pictures"]:
-    """The standard deviation of each picture's values at weight 1, by the median of its residuals; radiance.
-
-    Pixels that do not change with the heights, such as the background, do not count, nor the half of the others whose samples
-    differ most.
-    """
-    spreads = np.zeros(problem.count)
-    for number, (picture, group) in enumerate(zip(pictures, problem.groups, strict=True)):
-        given = np.asarray(group.given)
-        residuals = np.abs(given * (np.asarray(picture) - np.asarray(group.targets)))
-        known = None if problem.linearised is None else problem.linearised[number]
-        depends, sampling = (None, None) if known is None else (np.asarray(known.depends), np.asarray(known.sampling))
-        for position, k in enumerate(group.indices):
-            counted = given[position] > 0
-            if depends is not None and sampling is not None:
-                shown = counted & depends[position][..., None]
-                if shown.any():
-                    error = np.broadcast_to(sampling[position][..., None], shown.shape)
-                    counted = shown & (error <= np.median(error[shown]))
-            spreads[k] = 1.4826 * np.median(residuals[position][counted])
-    return spreads
-
-
-def _fingerprint(problem: Problem, unknowns: Unknowns, options: FitOptions) -> str:
-    """A hash of all that decides on the steps: fits of the same fingerprint take the same ones, in whatever process.
-
-    Args:
-      problem, unknowns: those at the start; the structure of their pytrees says of what classes and sizes all parts are, and
-        how many samples a scene asks for. The mesh does not count: another machine may go on.
-      options: for what is not in the problem.
-    """
-    parts: dict[bool, list[Any]] = {True: [], False: []}
-    for field in dataclasses.fields(problem):
-        if field.name != "mesh":
-            parts[field.metadata.get("static", False)].append(getattr(problem, field.name))
-    leaves, structure = jax.tree.flatten((parts[False], unknowns))
-    levels = None if options.levels is None else list(options.levels)
-    choices = (parts[True], structure, options.solver, levels, options.inner_steps, options.tolerance)
-    digest = hashlib.sha256(repr(choices).encode())
-    for leaf in map(np.asarray, leaves):
-        digest.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
-    return digest.hexdigest()
+def _rms(values: Float[np.ndarray, " n"]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -15,21 +15,15 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from .basis import Basis, Unknowns
-from .jacobian import Sparse, other_unknowns, pictures_jacobian, sp
+from .jacobian import Sparse, images_jacobian, other_unknowns, picture_values, sp
 from .problem import Problem
+from .quadratic import Quadratic, laplacian_matrix
 
 fft: Any = scipy.fft
 
-MOST_HEIGHTS = 2**17
-"""With their padding. The factors of 512 x 512 take 5 GB."""
 _DEGREE = 3  # of the polynomial in the Laplacian that stands for a prior in the preconditioner
 _TOLERANCE = 1e-4  # of a draw's residual; the draw is then right to a thousandth
 _MOST_ITERATIONS = 300
-
-
-def is_sparse(problem: Problem) -> bool:
-    """Whether the pictures' derivatives are known as sparse matrices, of a size to be factorised."""
-    return problem.linearised is not None and problem.basis.base.size <= MOST_HEIGHTS
 
 
 class NormalMatrix:
@@ -48,26 +42,13 @@ class NormalMatrix:
     def __init__(self, unknowns: Unknowns, problem: Problem):
         basis = problem.basis
         self.basis, self.shape = basis, basis.base.shape
-        within = np.asarray(basis.crop(np.arange(basis.base.size).reshape(self.shape))).ravel()
-        pictures = pictures_jacobian(unknowns, problem)
+        images, values = images_jacobian(unknowns, problem), picture_values(unknowns, problem)
+        self.model = Quadratic(unknowns, problem, images, values, reweighted=True)
         known = _other_precision(unknowns, problem)
-        padded = basis.base.size
-        places = np.concatenate([within, padded + np.arange(known.size)])
-        selection = sp.csr_array((np.ones(places.size), (np.arange(places.size), places)), (places.size, padded + known.size))
-        rows = [pictures @ selection, sp.hstack([sp.csr_array((known.size, padded)), sp.diags_array(np.sqrt(known))])]
-        if problem.smoothness is not None:
-            smooth = float(problem.smoothness) * _laplacian(problem.basis.crop(np.asarray(basis.base)).shape, (1.0, 1.0))
-            rows.append(sp.hstack([smooth, sp.csr_array((within.size, known.size))]) @ selection)
-        self.jacobian = sp.vstack(rows, format="csr")
-        self.sparse_part = (self.jacobian.T @ self.jacobian).tocsc()
-        # Pairs: what a height is multiplied by, and then its cosine transform, for a residual of deviation 1.
-        self.priors = [(np.ones(self.shape), 1 / np.asarray(basis.scale * basis.prior_amplitude, np.float64))]
-        if problem.prior is not None:
-            stiffness = problem.prior.stiffness
-            stiffness = np.ones(self.shape) if stiffness is None else np.asarray(stiffness, np.float64)
-            self.priors.append((np.asarray(problem.prior.weight, np.float64), stiffness))
-        near = self.sparse_part
-        for weight, stiffness in self.priors:
+        self.model.precision[basis.base.size :] = known
+        self.model.priors.insert(0, (np.ones(self.shape), 1 / np.asarray(basis.scale * basis.prior_amplitude, np.float64)))
+        near = self.model.matrix + sp.diags_array(self.model.precision)
+        for weight, stiffness in self.model.priors:
             scaled = sp.diags_array(weight.ravel())
             near = near + _on_heights(scaled @ _polynomial(stiffness**2, basis) @ scaled, known.size)
         self.factors = sp.linalg.splu(
@@ -80,29 +61,22 @@ class NormalMatrix:
         (Papandreou and Yuille, Gaussian sampling by local perturbations, NIPS 2010, section 3.)
         """
         rng = np.random.default_rng(seed)
-        right = self.jacobian.T @ rng.standard_normal(self.jacobian.shape[0])
-        for weight, stiffness in self.priors:
+        right = self.model.jacobian.T @ rng.standard_normal(self.model.jacobian.shape[0])
+        right += np.sqrt(self.model.precision) * rng.standard_normal(right.size)
+        for weight, stiffness in self.model.priors:
             moved = weight * fft.idctn(stiffness * rng.standard_normal(self.shape), norm="ortho")
             right[: moved.size] += moved.ravel()
         return self.basis.crop(self._solved(right)[: math.prod(self.shape)].reshape(self.shape))
 
     def variance(self) -> Float[np.ndarray, "ny nx"]:
         """The diagonal of H⁻¹ by a dense inverse: the variances of the heights without their padding."""
-        dense = np.stack([self._product(row) for row in np.eye(self.jacobian.shape[1])])
+        dense = np.stack([self.model.product(row) for row in np.eye(self.model.precision.size)])
         inverse = scipy.linalg.cho_solve(scipy.linalg.cho_factor(dense), np.eye(len(dense)))
         return self.basis.crop(np.diag(inverse)[: math.prod(self.shape)].reshape(self.shape))
 
-    def _product(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        result = self.sparse_part @ x
-        heights = x[: math.prod(self.shape)].reshape(self.shape)
-        for weight, stiffness in self.priors:
-            modes = stiffness**2 * fft.dctn(weight * heights, norm="ortho")
-            result[: heights.size] += (weight * fft.idctn(modes, norm="ortho")).ravel()
-        return result
-
     def _solved(self, right: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         n = right.size
-        product = sp.linalg.LinearOperator((n, n), self._product, dtype=np.float64)
+        product = sp.linalg.LinearOperator((n, n), self.model.product, dtype=np.float64)
         inverse = sp.linalg.LinearOperator((n, n), self.factors.solve, dtype=np.float64)
         return sp.linalg.cg(product, right, rtol=_TOLERANCE, maxiter=_MOST_ITERATIONS, M=inverse)[0]
 
@@ -138,17 +112,8 @@ def _polynomial(precision: Float[np.ndarray, "my mx"], basis: Basis) -> Sparse:
     size = relative.max(axis=0)
     coefficients = scipy.optimize.nnls(relative / size, np.ones(len(chosen)))[0] / size
     spacing = tuple(weight * ((n - 1) / np.pi) ** 2 / largest for weight, n in zip(weights, precision.shape, strict=True))
-    laplacian = _laplacian(precision.shape, spacing)
+    laplacian = laplacian_matrix(precision.shape, spacing)
     result = coefficients[-1] * sp.eye_array(precision.size)
     for coefficient in coefficients[-2::-1]:
         result = result @ laplacian + coefficient * sp.eye_array(precision.size)
     return result.tocsr()
-
-
-def _laplacian(shape: tuple[int, ...], weights: tuple[float, float]) -> Sparse:
-    """Minus the sum of second differences along y and x, with these weights, between neighbours that there are."""
-    along = [
-        weight * sp.diags_array([np.r_[1.0, np.full(n - 2, 2.0), 1.0], -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1])
-        for n, weight in zip(shape, weights, strict=True)
-    ]
-    return (sp.kron(along[0], sp.eye_array(shape[1])) + sp.kron(sp.eye_array(shape[0]), along[1])).tocsr()

@@ -17,6 +17,8 @@ Albedo = Literal["known", "constant", "map"]
 Loss = Literal["squares", "huber", "cauchy", "geman"]
 Solver = Literal["lm", "bfgs", "lbfgs", "adam"]
 
+_LAST_STAGES = 3  # at most, over which the scale of a robust loss comes down to its own, and the noise is estimated
+
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class FitOptions:
@@ -92,3 +94,15 @@ class FitOptions:
             )
         if self.resume and self.checkpoint is None:
             raise ArgumentError("fit", "resume", "must come with a checkpoint to go on from")
+
+
+def make_stages(shape: tuple[int, ...], options: FitOptions) -> list[float]:
+    """The share of the highest frequency that each stage varies.
+
+    The levels, then 1 while the loss is sharpened and the noise estimated.
+    """
+    levels = options.levels
+    if levels is None:
+        doublings = max(0, math.floor(math.log2(max(shape) / 8))) if options.solver == "lm" else 0
+        levels = [0.5**k for k in range(doublings, -1, -1)]
+    return [*levels, *[1.0] * (0 if options.loss == "squares" and options.noise is not None else _LAST_STAGES)]

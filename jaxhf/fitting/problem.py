@@ -16,13 +16,12 @@ from ..core.devices import local_mesh
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..scene.light import Sky
-from ..scene.localise import localise
 from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
-from ..trace.world import resolve_settings
 from .basis import Basis, Unknowns, make_basis, make_heights, pad
 from .defaults import choose_edge_samples, choose_samples
+from .groups import Group, make_groups, require_scenes
 from .linearise import Linearised
 from .options import FitOptions
 from .prior import Prior, make_prior, prior_padding
@@ -32,30 +31,6 @@ _FIRST_NOISE = 0.01  # of a picture's brightness, where none is given
 _DARK = 0.03  # of a picture's brightness: what lies in shadow
 _DARK_SHARE = 0.003  # of its pixels
 _LEAST_NOISE = 5e-4  # of it: about the rounding of a picture with 8 bits
-
-
-class Group(eqx.Module):
-    """Pictures whose scenes differ in numbers only; they are rendered one after the other by one program.
-
-    Attributes:
-      scenes: what differs from picture to picture: a scene whose leaves have a leading axis of n pictures, None for the others.
-      shared: those others, once for all pictures. The heights that are sought are None in both.
-      targets: shape (n, h, w, c), c = 1 for grey.
-      given: the user's weights, by which the noise is divided, zero where a value does not count, shape (n, h, w, c).
-      weights: 1 / standard deviation of each value, zero where there is none, shape (n, h, w, c).
-      indices: the pictures' positions among the caller's.
-    """
-
-    scenes: Scene
-    shared: Scene
-    targets: Float[Array, "n h w c"]
-    given: Float[Array, "n h w c"]
-    weights: Float[Array, "n h w c"]
-    indices: tuple[int, ...] = eqx.field(static=True)
-
-    def complete(self, scene: Scene, heights: Float[Array, "ny nx"]) -> Scene:
-        """One picture's leaves of `scenes`, with those that are shared and these heights."""
-        return _with_heights(eqx.combine(scene, self.shared), heights)
 
 
 class Problem(eqx.Module):
@@ -216,58 +191,6 @@ def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny
     return heights
 
 
-def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any]) -> None:
-    """Checks that there is a scene for each picture, and that all have the same first heightfield but for its heights."""
-    if len(scenes) == 0:
-        raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
-    if len(targets) != len(scenes):
-        raise ArgumentError(
-            "fit", "targets", f"must hold a picture for each of the {len(scenes)} scenes, they are {len(targets)}"
-        )
-    for k, scene in enumerate(scenes):
-        _require_alike(k, scene, scenes[0])
-
-
-def make_groups(
-    scenes: Sequence[Scene],
-    targets: Sequence[Any],
-    noise: Float[np.ndarray, " pictures"],
-    options: FitOptions,
-    settings: Settings,
-) -> tuple[Group, ...]:
-    """Checks pictures, and gathers those that one program can render with these settings."""
-    weights = options.weights
-    if weights is not None and len(weights) != len(scenes):
-        raise ArgumentError("fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(weights)}")
-    found: dict[Any, list[tuple[int, Scene, Any, Any]]] = {}
-    for k, scene in enumerate(scenes):
-        target, weight = _picture(k, scene, targets[k], None if weights is None else weights[k])
-        local = _with_heights(localise(scene), None)
-        leaves, structure = jax.tree.flatten(local)
-        kind = (
-            structure,
-            resolve_settings(settings, scene).samples,
-            tuple(leaf.shape for leaf in leaves),
-            target.shape,
-        )
-        found.setdefault(kind, []).append((k, local, target, weight))
-    dtype = scenes[0].heights.dtype
-    groups = []
-    for members in found.values():
-        given = np.stack([weight for *_, weight in members])
-        indices = tuple(k for k, *_ in members)
-        groups.append(
-            Group(
-                *_stacked([local for _, local, _, _ in members]),
-                jnp.asarray(np.stack([target for *_, target, _ in members]), dtype),
-                jnp.asarray(given, dtype),
-                jnp.asarray(given / noise[list(indices)].reshape(-1, 1, 1, 1), dtype),
-                indices,
-            )
-        )
-    return tuple(groups)
-
-
 def _shadows_in(group: Group) -> bool:
     """Whether pictures without a sky have dark places."""
     if any(isinstance(light, Sky) for light in group.scenes.lights):
@@ -291,121 +214,6 @@ def _brightness(targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
     """Of each picture, the value that 1 % of it exceeds; 1 for a black one."""
     bright = [np.nanpercentile(np.asarray(target, np.float64), 99) for target in targets]
     return np.where(np.asarray(bright) > 0, bright, 1.0)
-
-
-def _with_heights(scene: Scene, heights: Array | None) -> Scene:
-    """`scene` over other heights of its first heightfield; None where they are to be filled in later."""
-    return eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights, is_leaf=lambda leaf: leaf is None)
-
-
-def _stacked(scenes: Sequence[Scene]) -> tuple[Scene, Scene]:
-    """Cameras, lights and what else differs, stacked; and what all scenes share bit for bit: leaves are None in the other."""
-    first = scenes[0]
-
-    def same(leaf: Any, *others: Any) -> bool:
-        return all(leaf is other or np.asarray(leaf).tobytes() == np.asarray(other).tobytes() for other in others)
-
-    shared = jax.tree.map(same, *scenes)
-    # A loop over pictures needs something to go through also where there is but one.
-    views = jax.tree.map(lambda _: False, (first.camera, first.lights))
-    shared = eqx.tree_at(lambda scene: (scene.camera, scene.lights), shared, views)
-    stacked = jax.tree.map(
-        lambda *leaves: jnp.asarray(np.stack(leaves)), *(eqx.filter(scene, shared, inverse=True) for scene in scenes)
-    )
-    return stacked, jax.tree.map(jnp.asarray, eqx.filter(first, shared))
-
-
-def _require_alike(k: int, scene: Scene, first: Scene) -> None:
-    """All scenes have the same first heightfield, but for the heights."""
-    if not isinstance(scene, Scene):
-        raise ArgumentError("fit", f"scenes[{k}]", f"must be a Scene, it is a {type(scene).__name__}")
-    if not scene.heightfields:
-        raise ArgumentError("fit", f"scenes[{k}]", "must have a heightfield, there is none among its objects")
-    field, other = scene.heightfields[0], first.heightfields[0]
-    for name in ("shape", "dtype"):
-        mine, theirs = getattr(field.heights, name), getattr(other.heights, name)
-        if mine != theirs:
-            raise ArgumentError(
-                "fit", f"scenes[{k}]", f": the heights must have the {name} of the first scene's, {theirs}; it is {mine}"
-            )
-    for name in ("dx", "dy", "x0", "y0"):
-        mine, theirs = getattr(field, name), getattr(other, name)
-        if mine != theirs:
-            raise ArgumentError(
-                "fit", f"scenes[{k}]", f": {name} must be that of the first scene's heightfield, {theirs}; it is {mine}"
-            )
-
-
-def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Target and weight of one picture, shape (h, w, c); what has no weight is zero."""
-    size = (scene.camera.height, scene.camera.width)
-    target = np.asarray(target)
-    if target.dtype.kind not in "fV":  # the latter are bfloat16 and its like
-        rule = f"must hold linear radiance in floats, 1 being white; it holds {target.dtype} (load_image decodes a picture)"
-        raise ArgumentError("fit", f"targets[{k}]", rule)
-    target = target.astype(np.float64)
-    if target.shape not in (size, (*size, 1), (*size, 3)):
-        raise ArgumentError(
-            "fit", f"targets[{k}]", f"must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}"
-        )
-    target = target.reshape(*size, -1)
-    weight = np.ones(size) if weight is None else np.asarray(weight, np.float64)
-    if weight.shape not in (size, target.shape):
-        raise ArgumentError("fit", f"weights[{k}]", f"must have shape {size}, its shape is {weight.shape}")
-    if not np.isfinite(weight).all() or weight.min() < 0 or weight.max() == 0:
-        raise ArgumentError(
-            "fit", f"weights[{k}]", f"must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}"
-        )
-    weight = np.broadcast_to(weight.reshape(*size, -1), target.shape)
-    if target.shape[-1] == 3 and _is_grey(target, weight):
-        target, weight = target[..., :1], weight[..., :1]
-    bad = ~np.isfinite(target) & (weight > 0)
-    if bad.any():
-        y, x, c = np.argwhere(bad)[0]
-        raise ArgumentError(
-            "fit", f"targets[{k}]", f"must be finite where it has a weight; row {y} column {x} channel {c} is {target[y, x, c]}"
-        )
-    return np.where(weight > 0, target, 0), weight
-
-
-def _is_grey(target: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w 3"]) -> bool:
-    """Whether its channels are one measurement, stored three times."""
-    counts = (weight > 0).all(axis=-1)
-    return bool(np.all(target[counts] == target[counts][:, :1]) and np.all(weight == weight[..., :1]))
-
-
-def mode_curvature(problem: Problem, influences: Sequence[np.ndarray]) -> Float[np.ndarray, "my mx"]:
-    """The curvature of the loss along each DCT mode of unit height.
-
-    That of the pictures, the diagonal of JᵀJ, is the mean square of Jᵀz over draws of z, and over neighbouring modes; in that
-    of the prior, weights count by their mean square.
-
-    Args:
-      problem: see there.
-      influences: Jᵀz in the heights, (ny, nx) each, see `pictures_and_influence`.
-    """
-    basis = problem.basis
-    rows, columns = np.asarray(basis.rows, np.float64), np.asarray(basis.columns, np.float64)
-    padding = [(n, n) for n in basis.padding]
-    squares = np.mean([(rows @ np.pad(influence, padding) @ columns.T) ** 2 for influence in influences], axis=0)
-    curvature = _over_neighbours(squares)
-    curvature[0, 0] = squares[0, 0]  # unlike any other
-    if problem.prior is not None:
-        weight = float(np.mean(np.square(np.asarray(problem.prior.weight))))
-        stiffness = 1.0 if problem.prior.stiffness is None else np.asarray(problem.prior.stiffness, np.float64)
-        curvature += weight * stiffness**2
-    if problem.smoothness is not None:
-        y, x = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in curvature.shape)
-        curvature += (float(problem.smoothness) * (y[:, None] + x[None, :])) ** 2
-    return curvature
-
-
-def _over_neighbours(values: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "my mx"]:
-    """The mean over 3 x 3 values, without [0, 0] but in its own."""
-    padded = np.pad(values, 1, mode="reflect")
-    padded[1, 1] = np.mean([values[0, 1], values[1, 0]])
-    ny, nx = values.shape
-    return np.mean([padded[y : y + ny, x : x + nx] for y in range(3) for x in range(3)], axis=0)
 
 
 def first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, options: FitOptions) -> Unknowns:

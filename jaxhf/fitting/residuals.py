@@ -19,8 +19,9 @@ from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
 from .basis import Basis, Unknowns
+from .groups import Group
 from .linearise import Linearised, can_be_linearised, linearise_each, picture_each
-from .problem import Group, Problem
+from .problem import Problem
 from .robust import soften
 from .view import moved
 

@@ -22,7 +22,10 @@ from .residuals import half_squares, linearised, residuals
 # BFGS keeps a dense matrix of this many rows at most: 128 MiB in double precision.
 BFGS_UNKNOWNS = 4096
 FIRST_DAMPING = 1e-2  # as a share of the loss's curvature along a mode
-_REJECTED = 0.1  # by which 1 / λ is multiplied at a rejected step, the first in a row
+REJECTED = 0.1  # by which 1 / λ is multiplied at a rejected step, the first in a row
+LEAST_GAIN = 0.01  # of what was predicted: a step that lowers the loss by less is rejected
+GOOD = 0.75  # of it: after a step that lowers the loss by more, 1 / λ is multiplied by HIGHER
+HIGHER = 4.0
 # Of LSMR, as a share of the matrix's Frobenius norm. That is far above what a height changes that no picture shows: where a
 # prior is to say how high it is, such heights wandered off with 1e-3, and came back over twice as many steps as with 1e-4.
 _INNER_TOLERANCE = 1e-3
@@ -65,7 +68,9 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         # LSMR (Fong and Saunders 2011) works on J itself; conjugate gradients on JᵀJ, whose condition is squared, went
         # non-finite in single precision. Its limit on the condition is lifted: the damping bounds it.
         self.descent = _Damped(linear_solver=lx.LSMR(rtol=inner_tolerance, atol=0.0, max_steps=inner_steps, conlim=1e16))
-        self.search = optx.ClassicalTrustRegion(high_cutoff=0.75, low_cutoff=0.01, high_constant=4.0, low_constant=_REJECTED)
+        self.search = optx.ClassicalTrustRegion(
+            high_cutoff=GOOD, low_cutoff=LEAST_GAIN, high_constant=HIGHER, low_constant=REJECTED
+        )
         self.verbose = _silent
 
 
@@ -116,7 +121,7 @@ def with_rejections(solver: Any, rejections: int) -> Any:
     """
     if not isinstance(solver, LevenbergMarquardt):
         return solver
-    return eqx.tree_at(lambda solver: solver.search.low_constant, solver, jnp.asarray(_REJECTED / 2**rejections))
+    return eqx.tree_at(lambda solver: solver.search.low_constant, solver, jnp.asarray(REJECTED / 2**rejections))
 
 
 def _silent(**_: Any) -> None:

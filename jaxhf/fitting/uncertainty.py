@@ -19,8 +19,9 @@ from ..core.errors import ArgumentError
 from .basis import Unknowns
 from .history import Draws
 from .linearise import can_be_linearised
-from .normal_matrix import NormalMatrix, is_sparse
+from .normal_matrix import NormalMatrix
 from .problem import Problem
+from .quadratic import is_sparse
 from .residuals import linearised, picture_residuals, prior_residuals
 from .robust import influence_function, robust_weight
 from .solvers import count_unknowns
@@ -94,7 +95,7 @@ def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tu
 
     Args:
       problem: of the fit.
-      residuals: of the pictures, in units of the noise, without those of a background that is black in picture and target.
+      residuals: of the pictures, in units of the noise, without those of a background that is explained.
     """
     if len(residuals) == 0:
         return problem, 1.0

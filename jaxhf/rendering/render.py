@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import PurePath
 from typing import Any, overload
 
@@ -24,10 +24,11 @@ from ..core.errors import UserError, require_kind, require_progress
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
+from ..scene.light import Light
 from ..scene.localise import localise, localise_camera
 from ..scene.scene import Scene
 from ..trace.grid import Grid
-from ..trace.world import World, make_surface, make_world, resolve_settings
+from ..trace.world import World, make_ceilings, make_surface, make_world, resolve_settings
 from .aovs import known_aovs
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, trace_tiles
@@ -53,6 +54,15 @@ class Prepared(eqx.Module):
     def with_camera(self, camera: Camera) -> "Prepared":
         """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
         return dataclasses.replace(self, scene=self.scene.with_camera(camera))
+
+    def with_lights(self, lights: Iterable[Light]) -> "Prepared":
+        """The same in another light; normals, bounds and what hides the sky are kept, see `Scene.with_lights`."""
+        scene = self.scene.with_lights(lights)
+        if scene.sky_occlusion != self.scene.sky_occlusion:
+            return prepare(scene, self.settings, mesh=self.mesh)
+        local = on_every_device(localise(scene).lights, self.mesh)
+        ceilings = _make_ceilings(self._world.surfaces, local, self.settings)
+        return dataclasses.replace(self, scene=scene, _world=dataclasses.replace(self._world, lights=local, ceilings=ceilings))
 
 
 class PreparedHeightfield(eqx.Module):
@@ -140,13 +150,13 @@ def render(
         world, mesh = scene._world, scene.mesh
         camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:
-            outputs = _trace_prepared(world, camera, aovs, mesh, _key(key, world.settings, mesh))
+            outputs = _trace_prepared(world, camera, aovs, mesh, _key(key, world.settings, mesh), not is_traced())
         else:
             outputs = _trace_in_parts(world, camera, aovs, mesh, progress)
     else:
         settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("render", mesh)
         local = on_every_device(localise(scene), mesh)
-        outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh))
+        outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh), not is_traced())
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -184,31 +194,31 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         resolved = resolve_settings(settings, scene)
-        return _trace_all(on_every_device(scene, mesh), resolved, (), mesh, default_key(None, resolved, mesh))["image"]
+        return _trace_all(on_every_device(scene, mesh), resolved, (), mesh, default_key(None, resolved, mesh), False)["image"]
 
     return lax.map(one, scenes)
 
 
-@functools.partial(compiled, static_argnames=("settings", "aovs", "mesh"))
+@functools.partial(compiled, static_argnames=("settings", "aovs", "mesh", "alone"))
 def _trace_all(
-    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None, alone: bool = False
 ) -> dict[str, jax.Array]:
-    return _trace_world(make_world(scene, settings), scene.camera, aovs, mesh, key)
+    return _trace_world(make_world(scene, settings), scene.camera, aovs, mesh, key, alone)
 
 
 def _trace_world(
-    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None, alone: bool = False
 ) -> dict[str, jax.Array]:
     if key is not None and edge_sets(world):
-        others = _trace_picture(world, camera, aovs, mesh) if aovs else {}
+        others = _trace_picture(world, camera, aovs, mesh, alone) if aovs else {}
         drawn = draw_boundaries(world, camera, key, mesh)
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
-    return _trace_picture(world, camera, aovs, mesh)
+    return _trace_picture(world, camera, aovs, mesh, alone)
 
 
-def _trace_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh) -> dict[str, jax.Array]:
+def _trace_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, alone: bool) -> dict[str, jax.Array]:
     tiling = Tiling(camera, world.settings)
-    tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
+    tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32), alone)
     return jax.tree.map(tiling.assemble, tiles)
 
 
@@ -240,9 +250,10 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
     return lax.map(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights)
 
 
-_trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh"))
-_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
+_trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh", "alone"))
+_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs", "alone"))
 _make_world = compiled(make_world, static_argnames=("settings",))
+_make_ceilings = compiled(make_ceilings, static_argnames=("settings",))
 _make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
 
 
@@ -256,6 +267,6 @@ def _trace_in_parts(
     parts = []
     for first in range(0, tiling.count, size):
         tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
-        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, aovs, np.asarray(tiles, np.int32))))
+        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, aovs, np.asarray(tiles, np.int32), True)))
         progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
     return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)

@@ -1,7 +1,6 @@
 """All samples of a picture, in chunks of one size, and what they add up to."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -55,16 +54,21 @@ class PictureSamples(NamedTuple):
         more = [jnp.pad(values, (0, -values.shape[0] % size), mode="edge").reshape(-1, size) for values in more]
         return jnp.concatenate([x, more[0]]), jnp.concatenate([y, more[1]])
 
-    def in_pixels(
-        self,
-        values: Float[jax.Array, "chunks n c"],
-        summary: Callable[[jax.Array], jax.Array] = lambda values: jnp.mean(values, axis=1),
-    ) -> Float[jax.Array, "h w c"]:
-        """The means over the samples of each pixel, or another summary of theirs."""
+    def in_pixels(self, values: Float[jax.Array, "chunks n c"]) -> Float[jax.Array, "h w c"]:
+        """The means over the samples of each pixel."""
         tiling = Tiling(self.camera, self.settings)
-        tiles = values[: tiling.count * self._samples].reshape(tiling.count, self._samples, *values.shape[1:])
-        pixels = jnp.moveaxis(tiles, 1, 2).reshape(-1, self._samples, values.shape[-1])
-        return tiling.assemble(summary(pixels).reshape(tiling.count, *values.shape[1:]))
+        return tiling.assemble(self._in_tiles(values).mean(1))
+
+    def in_rows(self, values: Float[jax.Array, "chunks n c"]) -> Float[jax.Array, "rows columns c"]:
+        """The picture's samples where they lie, row by row: each pixel is a square of them."""
+        tiling, side = Tiling(self.camera, self.settings), math.isqrt(self._samples)
+        pixels = tiling.assemble(jnp.moveaxis(self._in_tiles(values), 1, 2))
+        h, w, _, c = pixels.shape
+        return pixels.reshape(h, w, side, side, c).swapaxes(1, 2).reshape(h * side, w * side, c)
+
+    def _in_tiles(self, values: Float[jax.Array, "chunks n c"]) -> Float[jax.Array, "tiles samples n c"]:
+        count = Tiling(self.camera, self.settings).count
+        return values[: count * self._samples].reshape(count, self._samples, *values.shape[1:])
 
     def of_resampled(self, values: Float[jax.Array, "chunks n c"]) -> Float[jax.Array, "pixels samples c"]:
         """The samples of the pixels that are sampled once more."""

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from ..core.autodiff import recomputed
 from ..core.devices import map_over
+from ..core.kernel import one_kernel
 from ..core.materialise import materialise
 from ..core.sampling import sample_offset
 from ..core.settings import Settings
@@ -46,10 +47,20 @@ class Tiling:
 
 
 def trace_tiles(
-    mesh: Mesh, world: World, camera: Camera, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]
+    mesh: Mesh, world: World, camera: Camera, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"], alone: bool
 ) -> dict[str, jax.Array]:
-    """The picture ("image") and AOVs of tiles, traced one after the other; (n, side * side, ...) each."""
-    return map_over(mesh, lambda seen, tile: _trace_tile(seen[0], seen[1], aovs, tile), (world, camera), tiles)
+    """The picture ("image") and AOVs of tiles, traced one after the other; (n, side * side, ...) each.
+
+    `alone` says that nothing is differentiated or transformed: each tile then is one kernel.
+    """
+
+    def of_tile(world: World, camera: Camera, tile: jax.Array) -> dict[str, jax.Array]:
+        return _trace_tile(world, camera, aovs, tile)
+
+    def one(seen: tuple[World, Camera], tile: jax.Array) -> dict[str, jax.Array]:
+        return one_kernel(of_tile, *seen, tile) if alone else of_tile(*seen, tile)
+
+    return map_over(mesh, one, (world, camera), tiles)
 
 
 @recomputed

@@ -25,7 +25,7 @@ from .grid import Grid
 
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
 _TILE = 32  # vertices along its side
-_STRETCH = 32  # cells, along the axis on which a direction moves faster
+_STRETCH = 24  # cells, along the axis on which a direction moves faster; up to `_TOGETHER` crossings longer
 _TOGETHER = 8  # crossings in one pass over a tile
 _GRAIN = 8  # cells from one of the windows whose highest points are kept to the next
 _MARGIN = _TILE + 1
@@ -39,7 +39,7 @@ Summary = Callable[[Float[jax.Array, "k *at"]], jax.Array]
 
 
 class _Crossings(eqx.Module):
-    """Crossings of one direction with the edges of a grid, from a vertex outwards; an entry each.
+    """Crossings of one direction with the edges of a grid, from a vertex outwards; an entry each, those at a vertex once.
 
     Attributes:
       inverse: 1 / the horizontal distance, falling; 0 at entries without a crossing.
@@ -120,9 +120,12 @@ def _crossings(shape: tuple[int, int], direction: Float[jax.Array, "2"]) -> _Cro
     families = (*columns, columns_x, columns_y), (*rows, rows_x, rows_y), (*diagonals, diagonals_x, diagonals_x - number)
     entries = [jnp.concatenate(parts) for parts in zip(*families, strict=True)]
     order = jnp.argsort(-entries[0])
-    missing = -order.size % _TOGETHER
-    inverse, share, kind, x, y = (jnp.pad(values[order], (0, missing)) for values in entries)
-    share = share.at[order.size :].set(jnp.nan)
+    inverse, share, kind, x, y = (values[order] for values in entries)
+    again = (kind[1:] == _VERTEX) & (kind[:-1] == _VERTEX) & (x[1:] == x[:-1]) & (y[1:] == y[:-1])
+    inverse = jnp.where(jnp.pad(again, (1, 0)), 0, inverse)
+    order, missing = jnp.argsort(-inverse), -inverse.size % _TOGETHER
+    inverse, share, kind, x, y = (jnp.pad(values[order], (0, missing)) for values in (inverse, share, kind, x, y))
+    share = jnp.where(inverse > 0, share, jnp.nan)
     second = jnp.asarray(_TO_SECOND)[kind]
     return _Crossings(inverse, share, kind, x, y, x + second[:, 0], y + second[:, 1])
 
@@ -216,9 +219,10 @@ class HorizonView(eqx.Module):
       heights: with a margin, nan beyond the grid.
       edges: for each kind, heights at the first vertices of edges, with a margin; nan where no cell of the surface has it.
       windows: the highest vertex of squares that begin at every multiple of `_GRAIN`, from `_reach()` of them before the grid.
+      holed: whether these have a hole.
       crossings: of each direction.
       bounds: between stretches, the horizontal distances.
-      begins: the first entry of the crossings beyond each.
+      begins: the first of the groups of crossings that are beyond each.
       end: the distance at which a direction has left the grid, wherever it began.
       first_window: where a stretch begins in the least x and in the least y, from the vertex, cells.
     """
@@ -226,6 +230,7 @@ class HorizonView(eqx.Module):
     heights: Float[jax.Array, "rows columns"]
     edges: Float[jax.Array, "4 rows columns"]
     windows: Float[jax.Array, "window_rows window_columns"]
+    holed: Bool[jax.Array, "window_rows window_columns"]
     crossings: Any  # a `_Crossings` with a leading axis
     bounds: Float[jax.Array, "k bounds"]
     begins: Int[jax.Array, "k bounds"]
@@ -240,16 +245,23 @@ class HorizonView(eqx.Module):
 
         def along(direction: jax.Array) -> tuple[_Crossings, jax.Array, jax.Array, jax.Array, jax.Array]:
             crossings, size = _crossings((ny, nx), direction), jnp.abs(direction)
-            bounds = jnp.arange(count + 1, dtype=dtype) * (_STRETCH / jnp.max(size))
+            even = jnp.arange(count, dtype=dtype) * (_STRETCH / jnp.max(size))
             end = jnp.min(jnp.array([nx - 1, ny - 1], dtype) / jnp.maximum(size, jnp.finfo(dtype).tiny))
-            begins = jnp.searchsorted(-crossings.inverse, -1 / bounds, side="right").astype(jnp.int32)
-            begins = jnp.minimum(begins, jnp.sum(crossings.inverse * end > 0.999, dtype=jnp.int32))
+            beyond = jnp.searchsorted(-crossings.inverse, -1 / even, side="right").astype(jnp.int32)
+            last = jnp.sum(crossings.inverse * end > 0.999, dtype=jnp.int32)
+            groups = (last + _TOGETHER - 1) // _TOGETHER
+            begins = jnp.append(jnp.where(beyond < last, beyond // _TOGETHER, groups), groups)
+            first = jnp.minimum(begins * _TOGETHER, crossings.inverse.size - 1)
+            bounds = jnp.minimum(1 / crossings.inverse[first], end)
             ends = jnp.outer(bounds, direction)
-            return crossings, bounds, begins, end, jnp.floor(jnp.minimum(ends[:-1], ends[1:])).astype(jnp.int32)
+            # One cell less: a hole beside an edge takes a cell from it.
+            return crossings, bounds, begins, end, jnp.floor(jnp.minimum(ends[:-1], ends[1:])).astype(jnp.int32) - 1
 
-        padded = jnp.pad(z, margin, constant_values=jnp.nan)
+        hole = jnp.isnan(z)
+        heights = jnp.pad(z, margin, constant_values=jnp.nan)
         edges = jnp.pad(_edges(z), ((0, 0), *margin), constant_values=jnp.nan)
-        return HorizonView(padded, edges, _windows(z), *lax.map(along, directions))
+        highest, holed = _windows(jnp.where(hole, -jnp.inf, z)), _windows(jnp.where(hole, 0, -jnp.inf).astype(dtype)) == 0
+        return HorizonView(heights, edges, highest, holed, *lax.map(along, directions))
 
 
 def _from_tile(
@@ -275,19 +287,21 @@ def _from_tile(
     z = moved(view.heights, jnp.zeros_like(x), jnp.zeros_like(y))
     window = [(at + first[:, k]) // _GRAIN + _reach() for k, at in enumerate((x, y))]
     column, row = (jnp.clip(at, 0, n - 1) for at, n in zip(window, view.windows.shape[::-1], strict=True))
-    top = view.windows[row, column]
+    top, holed = view.windows[row, column], view.holed[row, column]
     top_from_here = lax.cummax(top, reverse=True)
 
     def rises(top: Scalar, slopes: jax.Array, near: Scalar, far: Scalar) -> Bool[jax.Array, ""]:
         """Whether a point of this height, between two distances, could stand above the slope of some vertex."""
         return (top - z > slopes * jnp.where(slopes >= 0, near, far)).any()
 
-    def look(group: Index, carry: tuple[jax.Array, jax.Array | None]) -> tuple[jax.Array, jax.Array | None]:
+    def look(holed: bool, group: Index, carry: tuple[jax.Array, jax.Array | None]) -> tuple[jax.Array, jax.Array | None]:
         slopes, found = carry
         for k in range(_TOGETHER):
             n = group * _TOGETHER + k
             at = way, n
-            low = moved_edges(crossings.kind[at], crossings.x[at], crossings.y[at])
+            # Else from one array in place of five, whose memory pages are more than the processor keeps at hand.
+            from_x, from_y = crossings.x[at], crossings.y[at]
+            low = moved_edges(crossings.kind[at], from_x, from_y) if holed else moved(view.heights, from_x, from_y)
             high = moved(view.heights, crossings.x2[at], crossings.y2[at])
             slope = ((low - z) + crossings.share[at] * (high - low)) * crossings.inverse[at]
             steeper = slope > slopes  # never where it is nan
@@ -297,11 +311,12 @@ def _from_tile(
 
     def walk(carry: tuple[Index, Any, Any]) -> tuple[Index, Any, Any]:
         k, _, seen = carry
-        groups = begins[k] // _TOGETHER, (begins[k + 1] + _TOGETHER - 1) // _TOGETHER
         needed = rises(top[k], seen[0], bounds[k], bounds[k + 1])
+        looks = (functools.partial(look, of) for of in (False, True))
+        plain, holey = (functools.partial(lax.fori_loop, begins[k], begins[k + 1], one) for one in looks)
         return k + 1, *lax.cond(
             needed,
-            lambda seen: (jnp.ones((), bool), lax.fori_loop(*groups, look, seen)),
+            lambda seen: (jnp.ones((), bool), lax.cond(holed[k], holey, plain, seen)),
             lambda seen: (rises(top_from_here[k], seen[0], bounds[k], end), seen),
             seen,
         )
@@ -323,13 +338,13 @@ def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
 
 def _reach() -> int:
     """Windows side by side that a tile moves over within a stretch, wherever between their beginnings it begins."""
-    return math.ceil((_TILE + _STRETCH + 2) / _GRAIN) + 1
+    return math.ceil((_TILE + _STRETCH + _TOGETHER + 4) / _GRAIN) + 1
 
 
-def _windows(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "window_rows window_columns"]:
-    ny, nx = z.shape
-    reach, padding = _reach(), ((0, -ny % _GRAIN), (0, -nx % _GRAIN))
-    known = jnp.pad(jnp.where(jnp.isnan(z), -jnp.inf, z), padding, constant_values=-jnp.inf)
+def _windows(values: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "window_rows window_columns"]:
+    """The largest in each window, see `HorizonView`; -inf beyond the grid."""
+    (ny, nx), reach = values.shape, _reach()
+    known = jnp.pad(values, ((0, -ny % _GRAIN), (0, -nx % _GRAIN)), constant_values=-jnp.inf)
     blocks = known.reshape(known.shape[0] // _GRAIN, _GRAIN, -1, _GRAIN).max((1, 3))
     blocks = jnp.pad(blocks, reach, constant_values=-jnp.inf)
     rows, columns = (n - reach + 1 for n in blocks.shape)

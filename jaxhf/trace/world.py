@@ -76,16 +76,23 @@ def make_world(scene: Scene, settings: Settings) -> World:
     """Prepares what does not depend on the ray; `scene` must be `localise`d."""
     settings = resolve_settings(settings, scene)
     surfaces = tuple(make_surface(obj.shape, obj.world_from_object, settings) for obj in scene.objects)
-    # A walk whose steps are counted is not to be spared.
-    spared = settings.shadows and settings.early_exit and settings.max_steps is None
     return World(
         surfaces=surfaces,
         materials=tuple(obj.material for obj in scene.objects),
         lights=scene.lights,
-        ceilings=tuple(tuple(_make_ceiling(surface, light, spared) for surface in surfaces) for light in scene.lights),
+        ceilings=make_ceilings(surfaces, scene.lights, settings),
         sky=tuple(_visible_sky(surface, scene) for surface in surfaces),
         settings=settings,
     )
+
+
+def make_ceilings(
+    surfaces: tuple[Surface, ...], lights: tuple[Light, ...], settings: Settings
+) -> tuple[tuple[Ceiling | None, ...], ...]:
+    """See `World`: all of it that depends on the lights, beside these."""
+    # A walk whose steps are counted is not to be spared.
+    spared = settings.shadows and settings.early_exit and settings.max_steps is None
+    return tuple(tuple(_make_ceiling(surface, light, spared) for surface in surfaces) for light in lights)
 
 
 def _visible_sky(surface: Surface, scene: Scene) -> Float[jax.Array, "_ 3"] | None:
@@ -103,7 +110,7 @@ def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: S
     """A shape made ready for tracing; the scheme of its normals and the levels of its bounds are those of the settings."""
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
-        normals = settings.normals if settings.shading == "smooth" else None
+        normals = (settings.normals or "six") if settings.shading == "smooth" else None
         levels = 0 if settings.traversal == "dda" else None
         return make_grid(shape, world, normals, levels, settings.early_exit)
     return make_walls(shape, world) if isinstance(shape, Skirt) else make_tube(shape, world)

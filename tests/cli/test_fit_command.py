@@ -112,7 +112,7 @@ def pretended(options: dict, ends: bool = True):
             albedo=jnp.linspace(0, 1, 6).reshape(3, 2, 1), exposures=jnp.array([1.25]), offsets=None,
             scenes=tuple(map(elsewhere, scenes)), images=(image,), residuals=(0 * image,), history=steps,
             stats={"steps": 3, "accepted": 2, "seconds": 1.5, "loss": 0.001, "chi2": 0.99}, noise=np.array([0.0123]),
-            regions=(), warnings=("chi2 is 9",),
+            regions=(), warnings=("chi2 is 9",), settings=jaxhf.Settings(),
         )  # fmt: skip
 
     return fit

@@ -153,6 +153,13 @@ def test_conversion_keeps_heights_and_place(tmp_path, capsys):
     assert ".npy holds the heights alone" in capsys.readouterr().out
 
 
+def test_conversion_to_exr_says_what_is_left_out(tmp_path, capsys):
+    pytest.importorskip("OpenEXR")
+    jaxhf.save_heights(tmp_path / "plane.npz", plane(0, 0))
+    assert main(["convert", str(tmp_path / "plane.npz"), str(tmp_path / "plane.exr")]) == 0
+    assert capsys.readouterr().out.endswith(" (.exr holds the heights alone)\n")
+
+
 def test_conversion_refuses_before_it_reads(tmp_path, capsys):
     assert main(["convert", str(tmp_path / "missing.tif"), str(tmp_path / "out.jpg")]) == 2
     assert "cannot write heights with the ending '.jpg'" in capsys.readouterr().err

@@ -31,7 +31,14 @@ def test_options_are_used_at_the_top_level_alone():
     assert compiler_options() is not None
 
 
-@pytest.mark.parametrize("others", [{}, {"xla_cpu_prefer_vector_width": 512}])
+def test_the_options_leave_functions_right():
+    """Wide vectors and XLA's newer emitters do not, in jaxlib 0.10 and 0.11."""
+    x = np.linspace(-4, 4, 1000, dtype=np.float32)
+    for newer in (False, True):
+        np.testing.assert_allclose(compiled(jnp.arctan, newer=newer)(x), np.arctan(x), rtol=1e-5)
+
+
+@pytest.mark.parametrize("others", [{}, {"xla_cpu_enable_fast_math": False}])
 def test_an_option_that_xla_does_not_know_is_left_out(others, monkeypatch):
     compiler_options.cache_clear()
     monkeypatch.setattr(compilation, "_OPTIONS", {"xla_cpu_no_such_option": False, **others})

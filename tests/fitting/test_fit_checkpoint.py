@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.fitting import fit as _fit, loop as _loop
+from jaxhf.fitting import fit as _fit, known as _known, loop as _loop
+from jaxhf.fitting.fingerprint import fingerprint as fit_fingerprint
 from jaxhf.fitting.options import FitOptions
 from jaxhf.fitting.problem import make_problem
 from jaxhf.fitting.solvers import Outcome
@@ -178,8 +179,8 @@ def test_a_checkpoint_that_cannot_be_kept_is_refused_first(tmp_path, monkeypatch
 def without_pictures(setattr: Callable[..., None]) -> None:
     """Replaces all that renders in a fit: steps add to the coefficients what a counter, the solver's state, says."""
 
-    def pictures(unknowns, problem, key=0):
-        return [jnp.zeros_like(group.targets) for group in problem.groups], jnp.zeros((9, 9))
+    def pictures(unknowns, problem, *_):
+        return [jnp.zeros_like(group.targets) for group in problem.groups], np.zeros((9, 9))
 
     def advance(solver, unknowns, state, problem):
         unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, unknowns.coefficients + jnp.sin(state))
@@ -188,10 +189,9 @@ def without_pictures(setattr: Callable[..., None]) -> None:
 
     setattr(_loop, "init_state", lambda solver, unknowns, problem: jnp.zeros(()))
     setattr(_loop, "reset_state", lambda initial, unknowns, step_size: initial)
-    setattr(_loop, "linearised", lambda unknowns, problem: problem)
+    setattr(_known, "linearised", lambda unknowns, problem: problem)
     setattr(_loop, "advance", advance)
     setattr(_loop, "pictures_and_influence", pictures)
-    setattr(_fit, "pictures_and_influence", pictures)
 
 
 def test_a_killed_process_loses_at_most_one_interval(tmp_path, monkeypatch):
@@ -226,7 +226,7 @@ def fingerprint(size=(4, 6), material: jaxhf.Matte | jaxhf.Mirror | None = None,
     scene = jaxhf.Scene([terrain], camera, [jaxhf.Directional((1, 2, 3))], samples=samples)
     defaults = {name: option.default for name, option in list(inspect.signature(jaxhf.fit).parameters.items())[2:]}
     chosen = FitOptions(**{**defaults, "settings": jaxhf.Settings(), **options})
-    return _loop._fingerprint(*make_problem([scene], [np.zeros(size)], chosen), chosen)
+    return fit_fingerprint(*make_problem([scene], [np.zeros(size)], chosen), chosen)
 
 
 def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():

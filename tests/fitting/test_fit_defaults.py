@@ -12,11 +12,12 @@ import jaxhf
 from jaxhf.fitting import defaults as _defaults, uncertainty as _uncertainty
 from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
-from jaxhf.fitting.fit import _share_of_normals
 from jaxhf.fitting.history import Draws
+from jaxhf.fitting.known import spreads_of
 from jaxhf.fitting.normal_matrix import NormalMatrix
+from jaxhf.fitting.normals import evidence_for_angles, share_of_normals
 from jaxhf.fitting.problem import make_problem
-from jaxhf.fitting.residuals import picture_residuals
+from jaxhf.fitting.residuals import linearised, picture_residuals, simulate
 from jaxhf.fitting.robust import influence_function, soften
 from jaxhf.fitting.uncertainty import with_unexplained
 from jaxhf.scene.localise import localise
@@ -38,17 +39,61 @@ def test_noise_that_is_not_given_is_estimated():
     assert any("chi2 is" in warning and "picture 0 rows 0-3" in warning for warning in found.warnings)
 
 
+def test_the_noise_of_rounded_pictures_is_their_root_mean_square():
+    """Rounding leaves errors that are evenly spread: their median would be a quarter too large for a deviation."""
+    step = 0.05
+    problem, _ = make_problem(scenes(), [step * np.round(picture / step) for picture in pictures()], fit_options())
+    exact = [
+        jnp.stack([jnp.asarray(pictures()[k]).reshape(group.targets.shape[1:]) for k in group.indices])
+        for group in problem.groups
+    ]
+    np.testing.assert_allclose(spreads_of(exact, problem), step / np.sqrt(12), rtol=0.1)
+
+
 def test_normals_of_another_renderer_are_named_where_they_matter():
     """By how much they turn: hardly any on the smooth terrain, by 20 degrees on steps of a cell's width."""
     steps = np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0)
     found = [
-        _share_of_normals(
+        share_of_normals(
             make_problem(scenes(), pictures(), fit_options(settings=settings, noise=0.02))[0], jnp.asarray(heights)
         )
         for settings, heights in ((SETTINGS, TRUTH), (SETTINGS, steps), (jaxhf.Settings(normals="six-angle"), steps))
     ]
     assert found[0] < 0.5 < 2 < found[1]
     assert found[2] == 0
+
+
+def test_a_fit_takes_the_normals_that_explain_rough_terrain():
+    """Where they are left open; those that are given stay, and the others are named."""
+    rng = np.random.default_rng(2)
+    rough = TRUTH + 0.02 * rng.standard_normal(TRUTH.shape)
+    angle = dataclasses.replace(SETTINGS, normals="six-angle")
+    measured = [np.asarray(jaxhf.render(scene, angle))[..., 0] for scene in scenes(rough)]
+    measured = [picture + 0.002 * rng.standard_normal(picture.shape) for picture in measured]
+    known = {"noise": 0.002, "levels": [1.0], "prior": TRUTH, "prior_std": 0.02}
+    chosen = jaxhf.fit(scenes(TRUTH), measured, settings=SETTINGS, **known)
+    assert chosen.settings.normals == "six-angle"
+    assert any("Settings(normals='six-angle') says" in warning for warning in chosen.warnings)
+    given = jaxhf.fit(scenes(TRUTH), measured, settings=dataclasses.replace(SETTINGS, normals="six"), **known)
+    assert given.settings.normals == "six"
+    assert rms(chosen.heights - rough) < 0.5 * rms(given.heights - rough)
+
+
+def test_evidence_for_other_normals_is_in_the_pictures():
+    """Many deviations where they are by angle, none where they are by area."""
+    rng = np.random.default_rng(2)
+    rough = TRUTH + 0.02 * rng.standard_normal(TRUTH.shape)
+    found = {}
+    for scheme in ("six", "six-angle"):
+        rendered = [
+            np.asarray(jaxhf.render(scene, dataclasses.replace(SETTINGS, normals=scheme)))[..., 0] for scene in scenes(rough)
+        ]
+        measured = [picture + 0.002 * rng.standard_normal(picture.shape) for picture in rendered]
+        problem, unknowns = make_problem(scenes(rough), measured, fit_options(noise=0.002, start=rough))
+        known = linearised(unknowns, problem)
+        found[scheme] = evidence_for_angles(known, jnp.asarray(rough), simulate(unknowns, known))
+    assert found["six"] < 3
+    assert found["six-angle"] > 20
 
 
 def test_a_grey_picture_with_three_channels_is_one_measurement():
@@ -176,7 +221,7 @@ def test_it_says_where_residuals_are():
 
 GOOD = Findings(
     result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), help="try this", strayed=0.9,
-    seen=np.ones((4, 5), bool), lights=3, scaled=1.0, draws=(20, 20),
+    seen=np.ones((4, 5), bool), lights=3, scaled=1.0, draws=(20, 20), normals=None,
 )  # fmt: skip
 
 
@@ -194,6 +239,7 @@ GOOD = Findings(
         ({"strayed": None, "lights": 1}, "same light and there is no prior"),
         ({"scaled": 1.8}, "1.8 times the noise"),
         ({"draws": (20, 7)}, "interrupted after 7 of 20"),
+        ({"normals": "six-angle"}, "weighted as Settings(normals='six-angle') says"),
     ],
 )
 def test_warnings_say_what_speaks_against_the_heights(change, said):

@@ -229,3 +229,40 @@ def test_what_a_mirror_shows_has_no_such_matrix():
     assert can_be_linearised(terrains("one"), jaxhf.Settings())
     assert not can_be_linearised(mirrored, jaxhf.Settings())
     assert can_be_linearised(mirrored, jaxhf.Settings(max_depth=0))
+
+
+def samples_of(picture, side: int, pixels: int = 24) -> np.ndarray:
+    """A picture's regular samples, row by row; x to the right, y down, a pixel is 1 wide."""
+    y, x = (np.mgrid[0 : pixels * side, 0 : pixels * side] + 0.5) / side
+    return picture(x, y)[..., None].astype(np.float64)
+
+
+@pytest.mark.parametrize("side", [2, 4, 8])
+@pytest.mark.parametrize(
+    ("picture", "least", "most"),
+    [
+        (lambda x, y: np.sin(0.9 * x + 0.3 * y) + np.cos(0.5 * y - 0.2 * x), 0.3, 1.5),
+        (lambda x, y: np.where(np.hypot(x - 11.7, y - 12.2) < 9.3, 0.8, 0.1), 0.5, 1.5),
+    ],
+    ids=["smooth", "disc"],
+)
+def test_errors_of_few_samples_are_known(picture, least, most, side):
+    """The root mean squares of errors and of what is expected of them, against 64 x 64 samples, where they are not 0."""
+    known = np.asarray(_linearise._sampling_error(jnp.asarray(samples_of(picture, side)), side))[..., 0]
+    fine, few = (samples_of(picture, n).reshape(24, n, 24, n).mean((1, 3)) for n in (64, side))
+    told = known > 0
+    assert least < rms((few - fine)[told]) / rms(known[told]) < most
+    assert rms((few - fine)[~told]) <= 0.02
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else 0.0
+
+
+def test_slopes_and_boundaries_between_pixels_make_no_error():
+    tilted = samples_of(lambda x, y: 3 * x - 2 * y, 4)
+    np.testing.assert_allclose(_linearise._sampling_error(jnp.asarray(tilted), 4)[1:-1, 1:-1], 0, atol=1e-12)
+    step = samples_of(lambda x, y: np.where(x < 11, 1.0, 0.0), 2)
+    np.testing.assert_array_equal(_linearise._sampling_error(jnp.asarray(step), 2), 0)
+    within = samples_of(lambda x, y: np.where(x < 11.5, 1.0, 0.0), 2)
+    assert (np.asarray(_linearise._sampling_error(jnp.asarray(within), 2))[:, 11] > 0.1).all()

@@ -8,9 +8,12 @@ from test_fit import HALF, OPTIONS, TRUTH, fit_options, pictures, rms, scenes
 
 from jaxhf.core.errors import ArgumentError
 from jaxhf.fitting import uncertainty as _uncertainty
+from jaxhf.fitting.jacobian import images_jacobian, picture_values
+from jaxhf.fitting.normal_equations import _solved
 from jaxhf.fitting.normal_matrix import NormalMatrix
 from jaxhf.fitting.problem import make_problem
-from jaxhf.fitting.residuals import linearised
+from jaxhf.fitting.quadratic import Quadratic, loss_at
+from jaxhf.fitting.residuals import half_squares, linearised
 from jaxhf.fitting.uncertainty import _operator, require_small, standard_deviations
 
 EVERYTHING = {
@@ -31,9 +34,33 @@ def test_it_is_the_square_of_the_residuals_derivative():
 
     basis, n = problem.basis, unknowns.coefficients.size
     heights = basis.surface(jnp.asarray(change[:n].reshape(basis.base.shape))) - basis.base
-    product = matrix._product(np.concatenate([np.ravel(heights), change[n:]]))
+    product = matrix.model.product(np.concatenate([np.ravel(heights), change[n:]]))
     modes = basis.scale * basis.transform(jnp.asarray(product[:n].reshape(basis.base.shape)))
     np.testing.assert_allclose(np.concatenate([np.ravel(modes), product[n:]]), expected, rtol=1e-9, atol=1e-9 * rms(expected))
+
+
+def test_a_step_solves_the_damped_equations_of_the_loss_itself():
+    """Its gradient is JAX's own of the robust loss with all priors; so is the loss."""
+    problem, unknowns = make_problem(scenes(TRUTH + 0.001), pictures(), fit_options(**(OPTIONS | EVERYTHING)))
+    problem, basis = linearised(unknowns, problem), problem.basis
+    values = picture_values(unknowns, problem)
+    model = Quadratic(unknowns, problem, images_jacobian(unknowns, problem), values)
+    loss, gradient = jax.value_and_grad(lambda unknowns: half_squares(unknowns, problem)[0])(unknowns)
+    np.testing.assert_allclose(loss_at(unknowns, problem, values), loss, rtol=1e-9)
+
+    def in_modes(surface: np.ndarray) -> np.ndarray:
+        heights = jnp.asarray(surface[: basis.base.size].reshape(basis.base.shape))
+        return np.concatenate([np.ravel(basis.scale * basis.transform(heights)), surface[basis.base.size :]])
+
+    expected, _ = jax.flatten_util.ravel_pytree(gradient)
+    np.testing.assert_allclose(in_modes(model.gradient), expected, rtol=1e-8, atol=1e-8 * rms(expected))
+    step, predicted = _solved(model, basis, 10.0, 2000)
+    n = basis.base.size
+    modes = jnp.asarray(step[:n].reshape(basis.base.shape))
+    change = np.concatenate([np.ravel(basis.surface(modes) - basis.base), step[n:]])
+    left = in_modes(model.product(change)) + 10 * step + expected
+    assert rms(left) < 1e-3 * rms(expected)
+    assert predicted > 0
 
 
 def test_draws_have_its_inverse_as_their_covariance(monkeypatch):

@@ -5,6 +5,7 @@ import pytest
 
 import jaxhf
 from jaxhf.io.procedural import fractal
+from jaxhf.rendering import render
 
 CORNER = (5e6, 4.5e6)  # far from the origin: the camera has to be moved in double precision
 SETTINGS = jaxhf.Settings(normals="four", chunk=256)
@@ -41,10 +42,27 @@ def test_another_camera_compiles_nothing_and_moves_the_picture(compilations):
     assert np.abs(np.asarray(moved) - np.asarray(jaxhf.render(scene(), SETTINGS))).max() > 0.1
 
 
+@pytest.mark.unoptimised
+def test_another_light_keeps_the_hidden_sky(monkeypatch):
+    """The same bits as the scene in that light prepared anew; another occlusion is looked for."""
+    looks, make = [], render._make_world_with_horizons
+    monkeypatch.setattr(render, "_make_world_with_horizons", lambda *args, **named: looks.append(args) or make(*args, **named))
+    sky = jaxhf.Sky(0.5, occlusion=4)
+    first, then = (scene().with_lights([jaxhf.Directional((x, -1, 0.3)), sky]) for x in (1, -1))
+    prepared = jaxhf.prepare(first, SETTINGS)
+    moved = prepared.with_lights(then.lights)
+    assert len(looks) == 1
+    image = jaxhf.render(moved)
+    np.testing.assert_array_equal(image, jaxhf.render(jaxhf.prepare(then, SETTINGS)))
+    assert np.abs(image - jaxhf.render(prepared)).max() > 0.1
+    assert moved.with_lights(scene().lights).scene.sky_occlusion is None
+    assert moved.with_lights(scene().lights)._world.sky == (None,)
+
+
 def test_settings_of_a_prepared_scene_stay():
     prepared = jaxhf.prepare(scene(), SETTINGS)
     np.testing.assert_array_equal(jaxhf.render(prepared, SETTINGS), jaxhf.render(prepared))
     with pytest.raises(ValueError, match=r"prepared with Settings\(.*normals='four'.*cannot be rendered with .*max_depth=2"):
         jaxhf.render(prepared, jaxhf.Settings(max_depth=2))
-    with pytest.raises(ValueError, match=r"cannot be rendered with .*normals='six'"):
+    with pytest.raises(ValueError, match=r"cannot be rendered with .*normals=None"):
         jaxhf.render(prepared, jaxhf.Settings())

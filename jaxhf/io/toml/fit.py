@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
 
 import numpy as np
 from jaxtyping import Float32
@@ -63,7 +63,7 @@ _FIT: Keys = {
 }
 _WHOLE_OR_FLAG = {int: whole, int | None: whole, bool: flag}
 _SETTINGS: Keys = {
-    name: Key(word if get_origin(hint) is Literal else _WHOLE_OR_FLAG[hint], None)
+    name: Key(word if Literal in {get_origin(part) for part in (hint, *get_args(hint))} else _WHOLE_OR_FLAG[hint], None)
     for name, hint in get_type_hints(Settings).items()
 }
 

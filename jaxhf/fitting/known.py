@@ -1,0 +1,105 @@
+"""The pictures of a fit that are known, with their derivatives, by the unknowns that they belong to."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from . import residuals
+from .basis import Unknowns
+from .jacobian import Sparse, images_jacobian, in_rows, picture_values
+from .problem import Problem
+from .quadratic import is_sparse
+from .residuals import heights_of, linearised
+
+
+@dataclasses.dataclass
+class Known:
+    """Linearised pictures.
+
+    Attributes:
+      place: of the unknowns that they belong to, see `place_of`.
+      linearised: see `Problem.linearised`.
+      images: their derivative as a sparse matrix, once it was asked for.
+    """
+
+    place: list[np.ndarray]
+    linearised: Any
+    images: Sparse | None = None
+
+    def is_at(self, place: Sequence[np.ndarray]) -> bool:
+        return all(map(np.array_equal, self.place, place))
+
+
+def place_of(unknowns: Unknowns, problem: Problem) -> list[np.ndarray]:
+    """The heights and the other unknowns, on which pictures depend; not how the heights are made of modes."""
+    others = eqx.tree_at(lambda u: u.coefficients, unknowns, None, is_leaf=lambda leaf: leaf is None)
+    return [np.asarray(heights_of(unknowns, problem.basis)), *map(np.asarray, jax.tree.leaves(others))]
+
+
+class KnownPictures:
+    """Those of the unknowns that were asked for last, and of the best ones, so that no surface is rendered twice."""
+
+    def __init__(self):
+        self.kept: list[Known] = []
+
+    def at(self, unknowns: Unknowns, problem: Problem, best: Unknowns) -> Known:
+        """The pictures at `unknowns`; from now on they are kept, and of the others only those at `best`."""
+        here, there = place_of(unknowns, problem), place_of(best, problem)
+        found = next((known for known in self.kept if known.is_at(here)), None)
+        if found is None:
+            found = Known(here, linearised(unknowns, problem).linearised)
+        self.kept = [found, *(known for known in self.kept if known is not found and known.is_at(there))]
+        return found
+
+
+def jacobian_at(unknowns: Unknowns, problem: Problem, known: Known) -> Sparse:
+    """The `images_jacobian`, kept with the pictures."""
+    if known.images is None:
+        known.images = images_jacobian(unknowns, dataclasses.replace(problem, linearised=known.linearised))
+    return known.images
+
+
+def pictures_and_influence(
+    unknowns: Unknowns, problem: Problem, key: int, jacobian: Callable[[], Sparse]
+) -> tuple[list[jax.Array], Float[np.ndarray, "ny nx"]]:
+    """See `residuals.pictures_and_influence`; by the `images_jacobian` where there can be one."""
+    if not is_sparse(problem):
+        pictures, influence = residuals.pictures_and_influence(unknowns, problem, key)
+        return pictures, np.asarray(influence)
+    weights = in_rows([group.weights for group in problem.groups])
+    draw = weights * np.random.default_rng(key).standard_normal(weights.size)
+    shape = problem.basis.crop(np.asarray(problem.basis.base)).shape
+    return picture_values(unknowns, problem).images, (jacobian().T @ draw).reshape(shape)
+
+
+def spreads_of(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarray, " pictures"]:
+    """The standard deviation of each picture's values at weight 1, by its residuals; radiance.
+
+    By their median, as some are unexplained, or by their root mean square, which is less where they are all of one size, as
+    those from rounding to 8 bits.
+
+    Pixels that do not change with the heights, such as the background, do not count, nor the half of the others whose samples
+    differ most.
+    """
+    spreads = np.zeros(problem.count)
+    for number, (picture, group) in enumerate(zip(pictures, problem.groups, strict=True)):
+        given = np.asarray(group.given)
+        errors = np.abs(given * (np.asarray(picture) - np.asarray(group.targets)))
+        known = None if problem.linearised is None else problem.linearised[number]
+        depends, sampling = (None, None) if known is None else (np.asarray(known.depends), np.asarray(known.sampling))
+        for position, k in enumerate(group.indices):
+            counted = given[position] > 0
+            if depends is not None and sampling is not None:
+                shown = counted & depends[position][..., None]
+                if shown.any():
+                    error = np.broadcast_to(sampling[position][..., None], shown.shape)
+                    counted = shown & (error <= np.median(error[shown]))
+            left = errors[position][counted].astype(np.float64)
+            with np.errstate(over="ignore"):
+                spreads[k] = min(1.4826 * np.median(left), np.sqrt(np.mean(left * left)))
+    return spreads

@@ -1,0 +1,76 @@
+"""What the scheme of the normals at vertices changes in the pictures of a fit."""
+
+import functools
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..core.compilation import compiled
+from ..core.types import AnyArray
+from ..rendering.samples import PictureSamples
+from ..scene.heightfield import Heightfield
+from ..trace.normals import vertex_normals
+from .jacobian import picture_by_vertices
+from .problem import Problem
+
+_FAR = 3.0  # standard deviations: a residual that is larger counts as this
+
+
+def share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> float:
+    """By about how much pictures change, in units of the noise, as normals are weighted by angle, not by area: the horizontal
+    part of what they turn by times the pictures' brightness; 0 where the settings are not the default ones."""
+    if problem.settings.normals not in (None, "six") or problem.settings.shading != "smooth":
+        return 0.0
+    horizontal = _turned(problem, heights)[0][..., :2]
+    return float(np.sqrt(np.mean(np.square(horizontal))) * np.median(problem.brightness / problem.noise))
+
+
+def evidence_for_angles(
+    problem: Problem, heights: Float[AnyArray, "ny nx"], images: Sequence[Float[AnyArray, "n h w c"]]
+) -> float:
+    """What the pictures say for normals weighted by angle in place of area: about N(0, 1) where these change nothing.
+
+    It is the product of what is left of the pictures with their change by such normals, to first order, over the norm of that
+    change, all in units of the noise. Heights that were fitted make up for a part of it, never for more than all.
+
+    Args:
+      problem: `linearised`, with smooth shading.
+      heights: at which it is.
+      images: of each group, see `picture_values`.
+    """
+    assert problem.linearised is not None
+    turned, lengths = _turned(problem, heights)
+    turned = np.pad(turned * lengths, ((0, 0), (0, 0), (1, 0)))  # heights stay
+    product = square = 0.0
+    for group, known, image in zip(problem.groups, problem.linearised, images, strict=True):
+        scene = group.complete(group.scenes, heights)
+        shapes = [obj.shape.heights.shape[-2:] for obj in scene.objects if isinstance(obj.shape, Heightfield)]
+        parts = [turned.ravel() if shape == turned.shape[:2] else np.zeros(4 * math.prod(shape)) for shape in shapes]
+        change = np.concatenate(parts)
+        for k in range(len(group.indices)):
+            one = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], known)
+            samples = PictureSamples(scene.camera, problem.settings, None if one.edges is None else one.edges.resampled)
+            weights = np.asarray(group.weights[k], np.float64)
+            left = np.clip(weights * (np.asarray(group.targets[k]) - np.asarray(image[k])), -_FAR, _FAR)
+            for channel in range(left.shape[-1]):
+                changes = weights[..., channel].ravel() * (picture_by_vertices(one, samples, channel, change.size) @ change)
+                product += float(changes @ left[..., channel].ravel())
+                square += float(changes @ changes)
+    return product / math.sqrt(square) if square else 0.0
+
+
+def _turned(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> tuple[np.ndarray, np.ndarray]:
+    """By what unit normals differ that are weighted by angle from those by area, and the lengths of the latter."""
+    field = problem.groups[0].shared.heightfields[0]
+    area, angle = (np.asarray(normals, np.float64) for normals in _by_area_and_angle(jnp.asarray(heights), field.dx, field.dy))
+    lengths = np.linalg.norm(area, axis=-1, keepdims=True)
+    return angle - area / lengths, lengths
+
+
+@functools.partial(compiled, static_argnames=("dx", "dy"))
+def _by_area_and_angle(heights: Float[jax.Array, "ny nx"], dx: float, dy: float) -> list[Float[jax.Array, "ny nx 3"]]:
+    return [vertex_normals(heights, dx, dy, scheme) for scheme in ("six", "six-angle")]
