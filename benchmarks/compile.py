@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 PROGRAMS = {
-    "frame": "a picture, 1 sample a pixel",
+    "frame": "a picture, 1 sample a pixel, as `jaxhf.render` makes it by itself",
+    "inside": "the same within a `jax.jit`",
     "gradient": "a picture, 4 samples, and the gradient of a loss in the heights",
     "edges": "the same with 1e4 points on edges",
     "linearise": "a fit's picture with its derivative, with points on edges",
@@ -85,8 +86,17 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
         solver = solvers.make_solver(options)
         state = solvers.init_state(solver, unknowns, known)
         return arrays_only(solvers._advance, solver, unknowns, state, known)
+    if name == "frame":
+        from jaxhf.core.devices import local_mesh, on_every_device
+        from jaxhf.rendering import render
+        from jaxhf.scene.localise import localise
+        from jaxhf.trace.world import resolve_settings
+
+        scene, mesh = make_scene(heights, 512), local_mesh(1)
+        resolved, local = resolve_settings(jaxhf.Settings(), scene), on_every_device(localise(scene), mesh)
+        return arrays_only(render._trace_all, local, resolved, (), mesh, None, True)
     settings = {
-        "frame": jaxhf.Settings(),
+        "inside": jaxhf.Settings(),
         "gradient": jaxhf.Settings(samples=4),
         "edges": jaxhf.Settings(samples=4, edge_samples=10_000),
     }[name]
@@ -95,7 +105,7 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
     def picture(heights: Any) -> Any:
         return jaxhf.render(scene.with_heights(heights), settings)
 
-    function = picture if name == "frame" else jax.value_and_grad(lambda heights: jnp.sum(picture(heights) ** 2))
+    function = picture if name == "inside" else jax.value_and_grad(lambda heights: jnp.sum(picture(heights) ** 2))
     return jax.jit(function), (jnp.asarray(heights),)
 
 

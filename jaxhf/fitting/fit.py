@@ -125,7 +125,7 @@ def fit(
       settings: how to render. Samples that it leaves open are 4 a pixel, or the scene's if that is more. Where it leaves
         `edge_samples` open, points on edges are taken where silhouettes, the terrain's border or shadows may be in sight, 2048
         to 32768 by their length in the pictures; not where the albedo is unknown or a mirror in the scene. Where it leaves
-        `normals` open, noise is given and pictures of terrain so rough tell, "six" or "six-angle", which explains them better.
+        `normals` open: "six", or "six-angle" where the pictures tell.
       weights: for each picture None or a map (h, w) or (h, w, c), from 0 (masked: the target may be nan there)
         on; it divides the noise.
       noise: standard deviation of a target's values at weight 1, radiance; one number or one for each picture. None: each
