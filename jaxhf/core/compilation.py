@@ -73,8 +73,9 @@ def _is_known(option: dict[str, Any]) -> bool:
 
 def _is_right(name: str) -> bool:
     """Whether an option does no harm: with wide vectors the newer emitters of jaxlib 0.10 and 0.11 compile a wrong arctan."""
-    older_emitters = _is_known({"xla_cpu_use_fusion_emitters": False})
-    return name != "xla_cpu_prefer_vector_width" or older_emitters or jaxlib.version.__version_info__ >= (0, 12)
+    if name != "xla_cpu_prefer_vector_width" or jaxlib.version.__version_info__ >= (0, 12):
+        return True
+    return _is_known({"xla_cpu_use_fusion_emitters": False})
 
 
 def compiled(

@@ -57,7 +57,7 @@ class Settings:
         metadata={
             "help": "normals at the vertices: central, of central differences; four, the mean of four triangles; the mean of "
             "the six that touch the vertex, weighted by area (six), by angle (six-angle) or equally (six-equal)",
-            "none": "six, but in a fit six-angle where its pictures of rough terrain show that",
+            "none": "six, but in a fit six-angle where its pictures show that",
             "metavar": "SCHEME",
         },
     )

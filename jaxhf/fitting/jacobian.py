@@ -5,7 +5,7 @@ heights and normals at vertices, times that of these in the heights.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -52,15 +52,23 @@ def images_jacobian(unknowns: Unknowns, problem: Problem) -> Sparse:
     assert problem.linearised is not None
     heights = heights_of(unknowns, problem.basis)
     slopes, blocks = _slopes(*on_every_device((heights, unknowns, problem), problem.mesh)), []
-    for group, known, here in zip(problem.groups, problem.linearised, slopes, strict=True):
-        scene = group.complete(group.scenes, heights)
-        of_heights = vertices_by_heights(np.asarray(here, np.float64), scene)
-        for k in range(len(group.indices)):
-            one = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], known)
-            samples = PictureSamples(scene.camera, problem.settings, None if one.edges is None else one.edges.resampled)
-            for channel in range(group.targets.shape[-1]):
-                blocks.append(picture_by_vertices(one, samples, channel, of_heights.shape[0]) @ of_heights)
+    for number, (group, here) in enumerate(zip(problem.groups, slopes, strict=True)):
+        of_heights = vertices_by_heights(np.asarray(here, np.float64), group.complete(group.scenes, heights))
+        blocks += [rows @ of_heights for rows in group_by_vertices(problem, number, heights, of_heights.shape[0])]
     return sp.vstack(blocks, format="csr")
+
+
+def group_by_vertices(problem: Problem, number: int, heights: Float[Array, "ny nx"], columns: int) -> Iterator[Sparse]:
+    """The derivatives of the pictures of one group, which are `linearised` at these heights, in what stands at the vertices:
+    `picture_by_vertices` in the order of `in_rows`."""
+    assert problem.linearised is not None
+    group, known = problem.groups[number], problem.linearised[number]
+    camera = group.complete(group.scenes, heights).camera
+    for k in range(len(group.indices)):
+        one = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], known)
+        samples = PictureSamples(camera, problem.settings, None if one.edges is None else one.edges.resampled)
+        for channel in range(group.targets.shape[-1]):
+            yield picture_by_vertices(one, samples, channel, columns)
 
 
 def in_rows(pictures: Sequence[Any]) -> Float[np.ndarray, " rows"]:

@@ -181,9 +181,10 @@ class FitLoop:
         settings = self.problem.with_edge_samples(heights, self.options).settings
         left_open = settings.normals is None and settings.shading == "smooth" and self._damped()
         if left_open and self._evidence_for_angles(heights) > _EVIDENCE:
-            left = self._left(self.best[1])
+            before_trial = self._left(self.best[1])
             self._set_settings(dataclasses.replace(settings, normals="six-angle"))
-            if self._left(self._tried(_TRIAL_STEPS)) < left:
+            after = self._left(self._tried(_TRIAL_STEPS))
+            if after @ after < before_trial @ before_trial:
                 return True
         if settings != self.problem.settings:
             self._set_settings(settings)
@@ -192,14 +193,13 @@ class FitLoop:
     def _evidence_for_angles(self, heights: jax.Array) -> float:
         """See there; 0 where the pictures' derivatives are not known."""
         known = self.known(self.best[1])
-        return evidence_for_angles(known, heights, picture_values(self.best[1], known).images) if is_sparse(known) else 0.0
+        return evidence_for_angles(known, heights, self._left(self.best[1])) if is_sparse(known) else 0.0
 
-    def _left(self, unknowns: Unknowns) -> float:
-        """What these unknowns leave of the pictures: the sum of squared residuals in units of the noise, of large ones less."""
+    def _left(self, unknowns: Unknowns) -> Float[np.ndarray, " rows"]:
+        """What these unknowns leave of the pictures, in units of the noise; far off at most `_FAR`."""
         known = self.known(unknowns)
         pairs = zip(known.groups, picture_values(unknowns, known).images, strict=True)
-        residuals = in_rows([group.weights * (image - group.targets) for group, image in pairs])
-        return float(np.sum(np.minimum(residuals * residuals, _FAR**2)))
+        return np.clip(in_rows([group.weights * (image - group.targets) for group, image in pairs]), -_FAR, _FAR)
 
     def _set_settings(self, settings: Settings) -> None:
         """Renders otherwise; the solver's state has another structure then."""

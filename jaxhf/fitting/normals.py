@@ -2,7 +2,6 @@
 
 import functools
 import math
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,13 +10,10 @@ from jaxtyping import Float
 
 from ..core.compilation import compiled
 from ..core.types import AnyArray
-from ..rendering.samples import PictureSamples
 from ..scene.heightfield import Heightfield
 from ..trace.normals import vertex_normals
-from .jacobian import picture_by_vertices
+from .jacobian import group_by_vertices, in_rows
 from .problem import Problem
-
-_FAR = 3.0  # standard deviations: a residual that is larger counts as this
 
 
 def share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> float:
@@ -29,9 +25,7 @@ def share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> flo
     return float(np.sqrt(np.mean(np.square(horizontal))) * np.median(problem.brightness / problem.noise))
 
 
-def evidence_for_angles(
-    problem: Problem, heights: Float[AnyArray, "ny nx"], images: Sequence[Float[AnyArray, "n h w c"]]
-) -> float:
+def evidence_for_angles(problem: Problem, heights: Float[AnyArray, "ny nx"], left: Float[np.ndarray, " rows"]) -> float:
     """What the pictures say for normals weighted by angle in place of area: about N(0, 1) where these change nothing.
 
     It is the product of what is left of the pictures with their change by such normals, to first order, over the norm of that
@@ -40,27 +34,23 @@ def evidence_for_angles(
     Args:
       problem: `linearised`, with smooth shading.
       heights: at which it is.
-      images: of each group, see `picture_values`.
+      left: picture - target in units of the noise, in the order of `in_rows`.
     """
-    assert problem.linearised is not None
     turned, lengths = _turned(problem, heights)
     turned = np.pad(turned * lengths, ((0, 0), (0, 0), (1, 0)))  # heights stay
-    product = square = 0.0
-    for group, known, image in zip(problem.groups, problem.linearised, images, strict=True):
-        scene = group.complete(group.scenes, heights)
-        shapes = [obj.shape.heights.shape[-2:] for obj in scene.objects if isinstance(obj.shape, Heightfield)]
+    changes = []
+    for number, group in enumerate(problem.groups):
+        shapes = [
+            obj.shape.heights.shape[-2:]
+            for obj in group.complete(group.scenes, heights).objects
+            if isinstance(obj.shape, Heightfield)
+        ]
         parts = [turned.ravel() if shape == turned.shape[:2] else np.zeros(4 * math.prod(shape)) for shape in shapes]
         change = np.concatenate(parts)
-        for k in range(len(group.indices)):
-            one = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], known)
-            samples = PictureSamples(scene.camera, problem.settings, None if one.edges is None else one.edges.resampled)
-            weights = np.asarray(group.weights[k], np.float64)
-            left = np.clip(weights * (np.asarray(group.targets[k]) - np.asarray(image[k])), -_FAR, _FAR)
-            for channel in range(left.shape[-1]):
-                changes = weights[..., channel].ravel() * (picture_by_vertices(one, samples, channel, change.size) @ change)
-                product += float(changes @ left[..., channel].ravel())
-                square += float(changes @ changes)
-    return product / math.sqrt(square) if square else 0.0
+        changes += [rows @ change for rows in group_by_vertices(problem, number, heights, change.size)]
+    change = in_rows([group.weights for group in problem.groups]) * np.concatenate(changes)
+    square = change @ change
+    return float(-(change @ left) / math.sqrt(square)) if square else 0.0
 
 
 def _turned(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> tuple[np.ndarray, np.ndarray]:
