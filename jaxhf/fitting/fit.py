@@ -276,7 +276,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         strayed=_strayed(problem, np.asarray(heights), seen, options.prior_std),
         seen=seen,
         lights=_light_directions(problem),
-        normals=problem.settings.normals if options.settings.normals is None else None,
+        normals=problem.found_settings.normals if options.settings.normals is None else None,
         scaled=scaled,
         draws=draws,
     )
@@ -297,7 +297,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         offsets=unknowns.offsets,
         noise=problem.noise,
         scenes=found_scenes(scenes, unknowns, problem),
-        settings=problem.settings,
+        settings=problem.found_settings,
         images=tuple(images),
         residuals=tuple(differences),
         regions=regions,

@@ -25,6 +25,7 @@ from ..core.autodiff import with_tangent
 from ..core.devices import map_over, on_every_device
 from ..core.materialise import materialise
 from ..core.settings import Settings
+from ..core.types import Flag
 from ..rendering.samples import PictureSamples
 from ..scene.camera import Camera
 from ..scene.light import Sun
@@ -33,7 +34,7 @@ from ..shade.radiance import direct, has_mirrors
 from ..trace.grid import Grid
 from ..trace.hit import Hit
 from ..trace.triangle import Corners, triangle_vertices
-from ..trace.world import World, make_world, resolve_settings
+from ..trace.world import World, make_world
 from .view import KNOWN, View, motion, moved
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
@@ -100,7 +101,13 @@ def can_be_linearised(scene: Scene, settings: Settings) -> bool:
 
 
 def linearise_each(
-    scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh, channels: int, still: View = KNOWN
+    scenes: Scene,
+    change: Callable[[Scene], Scene],
+    settings: Settings,
+    mesh: Mesh,
+    channels: int,
+    still: View = KNOWN,
+    by_angle: Flag | None = None,
 ) -> Linearised:
     """Pictures of scenes that differ in numbers only, one after the other, and their derivatives in the heights, and in the
     light and the camera that `still` names.
@@ -112,25 +119,40 @@ def linearise_each(
       mesh: the devices that share the work.
       channels: 3, or 1 for their mean.
       still: zeros, (2,) for a light and (6,) for a camera in which the derivative is taken.
+      by_angle: see `make_world`.
 
     Returns:
       Leaves with a leading axis of n pictures.
     """
-    return lax.map(lambda scene: _linearise(on_every_device(change(scene), mesh), settings, mesh, channels, still), scenes)
+
+    def one(scene: Scene) -> Linearised:
+        scene = on_every_device(change(scene), mesh)
+        return _linearise(make_world(scene, settings, by_angle), scene.camera, mesh, channels, still)
+
+    return lax.map(one, scenes)
 
 
 def picture_each(
-    known: Linearised, scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh
+    known: Linearised,
+    scenes: Scene,
+    change: Callable[[Scene], Scene],
+    settings: Settings,
+    mesh: Mesh,
+    by_angle: Flag | None = None,
 ) -> Float[jax.Array, "n h w c"]:
     """The pictures that are known, with their derivatives in the heights, light and camera that `change` gives to the scenes.
 
     Those must be the ones at which `linearise_each` was called.
     """
-    return lax.map(lambda pair: _picture(pair[0], on_every_device(change(pair[1]), mesh), settings, mesh), (known, scenes))
+
+    def one(pair: tuple[Linearised, Scene]) -> Float[jax.Array, "h w c"]:
+        scene = on_every_device(change(pair[1]), mesh)
+        return _picture(pair[0], scene, make_world(scene, settings, by_angle), mesh)
+
+    return lax.map(one, (known, scenes))
 
 
-def _linearise(scene: Scene, settings: Settings, mesh: Mesh, channels: int, still: View) -> Linearised:
-    world, camera = make_world(scene, settings), scene.camera
+def _linearise(world: World, camera: Camera, mesh: Mesh, channels: int, still: View) -> Linearised:
     key = default_key(None, world.settings, mesh)
     drawn = None
     if key is not None and edge_sets(world):
@@ -185,13 +207,12 @@ def _second_differences(samples: Float[jax.Array, "rows columns c"], side: int) 
     return jnp.concatenate([first, size[:, :, 1:-1], last], axis=2).reshape(samples.shape)
 
 
-def _picture(known: Linearised, scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "h w c"]:
-    settings = resolve_settings(settings, scene)
-    at_vertices = vertex_values(make_world(scene, settings))
+def _picture(known: Linearised, scene: Scene, world: World, mesh: Mesh) -> Float[jax.Array, "h w c"]:
+    at_vertices = vertex_values(world)
     numbers = motion(scene.lights, scene.camera, known.view)
     of_samples = _product(mesh, at_vertices, known.slopes, known.vertices)
     of_samples = _with_view(of_samples, known.view, numbers)
-    samples = PictureSamples(scene.camera, settings, None if known.edges is None else known.edges.resampled)
+    samples = PictureSamples(scene.camera, world.settings, None if known.edges is None else known.edges.resampled)
     change = samples.in_pixels(of_samples)
     if known.edges is not None:
         edges, flat = known.edges, change.reshape(-1, change.shape[-1])

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.settings import Settings
 from ..io.checkpoint import load_arrays, load_facts, save_checkpoint
 from ..io.errors import FileError
 from ..scene.heightfield import Heightfield
@@ -40,7 +39,7 @@ _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
 _LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
 _TRIAL_STEPS = 6  # with other normals
-_EVIDENCE = 3.0  # for these, standard deviations, to try them: another program is compiled
+_EVIDENCE = 3.0  # for these, standard deviations, to try them
 _FAR = 3.0  # standard deviations of the noise: a residual that is larger counts as this
 _PROBES = 8  # of the pictures' curvature
 
@@ -177,18 +176,19 @@ class FitLoop:
     def _take_other_settings(self, surface: np.ndarray) -> bool:
         """Whether the heights that were found call for many more points on edges than those of the start did, or other normals
         explain the pictures better, after some steps."""
-        heights, before = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype), self.problem.settings
-        settings = self.problem.with_edge_samples(heights, self.options).settings
-        left_open = settings.normals is None and settings.shading == "smooth" and self._damped()
+        heights, before = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype), self.problem
+        finer = before.with_edge_samples(heights, self.options)
+        left_open = before.by_angle is not None and not bool(before.by_angle)
         if left_open and self._evidence_for_angles(heights) > _EVIDENCE:
-            before_trial = self._left(self.best[1])
-            self._set_settings(dataclasses.replace(settings, normals="six-angle"))
-            after = self._left(self._tried(_TRIAL_STEPS))
-            if after @ after < before_trial @ before_trial:
+            left = self._left(self.best[1])
+            self._set_problem(dataclasses.replace(finer, by_angle=jnp.asarray(True)))
+            left_by_angle = self._left(self._tried(_TRIAL_STEPS))
+            if left_by_angle @ left_by_angle < left @ left:
                 return True
-        if settings != self.problem.settings:
-            self._set_settings(settings)
-        return settings != before
+            self._set_problem(before)
+        if finer.settings != before.settings:
+            self._set_problem(finer)
+        return finer.settings != before.settings
 
     def _evidence_for_angles(self, heights: jax.Array) -> float:
         """See there; 0 where the pictures' derivatives are not known."""
@@ -201,9 +201,9 @@ class FitLoop:
         pairs = zip(known.groups, picture_values(unknowns, known).images, strict=True)
         return np.clip(in_rows([group.weights * (image - group.targets) for group, image in pairs]), -_FAR, _FAR)
 
-    def _set_settings(self, settings: Settings) -> None:
-        """Renders otherwise; the solver's state has another structure then."""
-        self.problem = dataclasses.replace(self.problem, settings=settings, linearised=None)
+    def _set_problem(self, problem: Problem) -> None:
+        """Renders otherwise; the solver's state may have another structure then."""
+        self.problem = dataclasses.replace(problem, linearised=None)
         self.pictures = KnownPictures()
         self.initial_state = self._initial_state(self.best[1])
 
@@ -346,7 +346,7 @@ class FitLoop:
             "converged": self.converged,
             "predicted": self.predicted,
             "edge_samples": self.problem.settings.edge_samples,
-            "normals": self.problem.settings.normals,
+            "by_angle": None if self.problem.by_angle is None else bool(self.problem.by_angle),
             "seconds": self.elapsed(),
             "history": [list(step) for step in self.history],
         }
@@ -362,9 +362,10 @@ class FitLoop:
         facts = load_facts(self.path)
         if facts["fingerprint"] != self.fingerprint:
             raise FileError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
-        settings = dataclasses.replace(self.problem.settings, edge_samples=facts["edge_samples"], normals=facts["normals"])
-        if settings != self.problem.settings:
-            self._set_settings(settings)
+        settings = dataclasses.replace(self.problem.settings, edge_samples=facts["edge_samples"])
+        by_angle = None if facts["by_angle"] is None else jnp.asarray(facts["by_angle"])
+        if settings != self.problem.settings or by_angle:
+            self._set_problem(dataclasses.replace(self.problem, settings=settings, by_angle=by_angle))
         self.units = np.zeros(self.problem.basis.base.shape)
         self.unknowns, best, (base, loss_scale, noise, self.units), state = load_arrays(self.path, self._arrays())
         self.stage, self.stage_start, self.converged = facts["stage"], facts["stage_start"], facts["converged"]

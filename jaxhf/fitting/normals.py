@@ -19,7 +19,8 @@ from .problem import Problem
 def share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> float:
     """By about how much pictures change, in units of the noise, as normals are weighted by angle, not by area: the horizontal
     part of what they turn by times the pictures' brightness; 0 where the settings are not the default ones."""
-    if problem.settings.normals not in (None, "six") or problem.settings.shading != "smooth":
+    settings = problem.found_settings
+    if settings.normals not in (None, "six") or settings.shading != "smooth":
         return 0.0
     horizontal = _turned(problem, heights)[0][..., :2]
     return float(np.sqrt(np.mean(np.square(horizontal))) * np.median(problem.brightness / problem.noise))

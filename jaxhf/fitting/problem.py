@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from ..core.devices import local_mesh
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
+from ..core.types import Flag
 from ..scene.light import Sky
 from ..scene.material import Matte
 from ..scene.scene import Scene
@@ -22,7 +23,7 @@ from ..scene.texture import ImageTexture
 from .basis import Basis, Unknowns, make_basis, make_heights, pad
 from .defaults import choose_edge_samples, choose_samples
 from .groups import Group, make_groups, require_scenes
-from .linearise import Linearised
+from .linearise import Linearised, can_be_linearised
 from .options import FitOptions
 from .prior import Prior, make_prior, prior_padding
 from .view import KNOWN, View, sun
@@ -52,6 +53,7 @@ class Problem(eqx.Module):
         evaluated; None: evaluating residuals renders the pictures.
       view_unit: of the numbers of `Unknowns.view`, radians and world units, shapes (2,) and (6,).
       view_weight: 1 / the standard deviations of their priors, in these units.
+      by_angle: whether normals are weighted by angle, for the pictures to tell; None: that is not open, or they cannot.
     """
 
     groups: tuple[Group, ...]
@@ -68,6 +70,14 @@ class Problem(eqx.Module):
     linearised: tuple[Linearised, ...] | None = None
     view_unit: View = KNOWN
     view_weight: View = KNOWN
+    by_angle: Flag | None = None
+
+    @property
+    def found_settings(self) -> Settings:
+        """The settings, with the normals that the pictures told."""
+        if self.by_angle is None or not bool(self.by_angle):
+            return self.settings
+        return dataclasses.replace(self.settings, normals="six-angle")
 
     @property
     def least_noise(self) -> Float[np.ndarray, " pictures"]:
@@ -146,8 +156,16 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
         local_mesh() if options.mesh is None else options.mesh,
         None,
         *_view_priors(scenes, options),
+        jnp.asarray(False) if _open_normals(groups, settings, options) else None,
     )
     return problem.with_edge_samples(jnp.asarray(heights, dtype), options), unknowns
+
+
+def _open_normals(groups: Sequence[Group], settings: Settings, options: FitOptions) -> bool:
+    """Whether pictures are to tell how normals are weighted, as far as steps know their derivatives."""
+    known = options.solver == "lm" and options.albedo == "known"
+    known = known and all(can_be_linearised(group.scenes, settings) for group in groups)
+    return known and settings.normals is None and settings.shading == "smooth"
 
 
 def _view_priors(scenes: Sequence[Scene], options: FitOptions) -> tuple[View, View]:

@@ -100,6 +100,7 @@ def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Pro
             problem.mesh,
             group.targets.shape[-1],
             still,
+            problem.by_angle,
         )
         for group in problem.groups
     )
@@ -134,7 +135,7 @@ def _simulate(
 ) -> Float[Array, "n h w c"]:
     n, change, scenes = len(group.indices), completion(unknowns, group, heights), views(unknowns, problem, group)
     if linear is not None:
-        image = picture_each(linear, scenes, change, problem.settings, problem.mesh)
+        image = picture_each(linear, scenes, change, problem.settings, problem.mesh, problem.by_angle)
     else:
         image = render_each(scenes, change, problem.settings, problem.mesh)
         if group.targets.shape[-1] == 1:

@@ -68,7 +68,7 @@ class Grid(eqx.Module):
 def make_grid(
     field: Heightfield,
     world_from_object: Affine | None,
-    normals: NormalScheme | None,
+    normals: NormalScheme | Flag | None,
     levels: int | None = None,
     early_exit: bool = True,
 ) -> Grid:
@@ -77,7 +77,7 @@ def make_grid(
     Args:
       field: its x0 and y0 must be 0, see `localise`.
       world_from_object: None for the identity.
-      normals: the scheme at the vertices; None for none.
+      normals: the scheme at the vertices, see `vertex_normals`; None for none.
       levels: of the pyramid, above its finest; None for all.
       early_exit: see `Grid`.
     """

@@ -9,12 +9,13 @@ import pytest
 from test_fit import OPTIONS, SETTINGS, TRUTH, fit_options, pictures, rms, scenes
 
 import jaxhf
-from jaxhf.fitting import defaults as _defaults, uncertainty as _uncertainty
+from jaxhf.fitting import defaults as _defaults, residuals as _residuals, uncertainty as _uncertainty
 from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.jacobian import in_rows
 from jaxhf.fitting.known import spreads_of
+from jaxhf.fitting.linearise import linearise_each
 from jaxhf.fitting.normal_matrix import NormalMatrix
 from jaxhf.fitting.normals import evidence_for_angles, share_of_normals
 from jaxhf.fitting.problem import make_problem
@@ -64,16 +65,22 @@ def test_normals_of_another_renderer_are_named_where_they_matter():
     assert found[2] == 0
 
 
-def test_a_fit_takes_the_normals_that_explain_rough_terrain():
-    """Where they are left open; those that are given stay, and the others are named."""
+def test_a_fit_takes_the_normals_that_explain_rough_terrain(tmp_path, monkeypatch):
+    """Where they are left open, by one program for both, also when it is resumed; those that are given stay."""
     rng = np.random.default_rng(2)
     rough = TRUTH + 0.02 * rng.standard_normal(TRUTH.shape)
     angle = dataclasses.replace(SETTINGS, normals="six-angle")
     measured = [np.asarray(jaxhf.render(scene, angle))[..., 0] for scene in scenes(rough)]
     measured = [picture + 0.002 * rng.standard_normal(picture.shape) for picture in measured]
     known = {"noise": 0.002, "levels": [1.0], "prior": TRUTH, "prior_std": 0.02}
-    chosen = jaxhf.fit(scenes(TRUTH), measured, settings=SETTINGS, **known)
+    traced = []
+    monkeypatch.setattr(_residuals, "linearise_each", lambda *args: (traced.append(0), linearise_each(*args))[1])
+    chosen = jaxhf.fit(scenes(TRUTH), measured, settings=SETTINGS, checkpoint=tmp_path / "fit.npz", **known)
+    assert len(traced) <= 1  # or a test before has compiled it
     assert chosen.settings.normals == "six-angle"
+    resumed = jaxhf.fit(scenes(TRUTH), measured, settings=SETTINGS, checkpoint=tmp_path / "fit.npz", resume=True, **known)
+    assert resumed.settings == chosen.settings
+    np.testing.assert_array_equal(resumed.heights, chosen.heights)
     assert any("Settings(normals='six-angle') says" in warning for warning in chosen.warnings)
     given = jaxhf.fit(scenes(TRUTH), measured, settings=dataclasses.replace(SETTINGS, normals="six"), **known)
     assert given.settings.normals == "six"

@@ -224,6 +224,13 @@ def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(derivatives, 
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
+def test_normals_that_are_known_as_the_program_runs_are_those_of_the_settings():
+    scene = terrains("one")
+    for by_angle, settings in ((True, jaxhf.Settings(normals="six-angle")), (False, jaxhf.Settings(normals="six"))):
+        found = vertex_values(make_world(scene, jaxhf.Settings(), jnp.asarray(by_angle)))
+        np.testing.assert_allclose(found, vertex_values(make_world(scene, settings)), rtol=1e-14)
+
+
 def test_what_a_mirror_shows_has_no_such_matrix():
     mirrored = terrains("one", jaxhf.Mirror((0.7, 0.8, 0.9)))
     assert can_be_linearised(terrains("one"), jaxhf.Settings())
