@@ -1,7 +1,7 @@
 """The pictures of a fit that are known, with their derivatives, by the unknowns that they belong to."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -24,12 +24,14 @@ class Known:
     Attributes:
       place: of the unknowns that they belong to, see `place_of`.
       linearised: see `Problem.linearised`.
-      images: their derivative as a sparse matrix, once it was asked for.
+      images: the pictures as they would be measured, see `simulate`, once they were asked for.
+      jacobian: their derivative as a sparse matrix, once it was asked for.
     """
 
     place: list[np.ndarray]
     linearised: Any
-    images: Sparse | None = None
+    images: list[jax.Array] | None = None
+    jacobian: Sparse | None = None
 
     def is_at(self, place: Sequence[np.ndarray]) -> bool:
         return all(map(np.array_equal, self.place, place))
@@ -59,22 +61,25 @@ class KnownPictures:
 
 def jacobian_at(unknowns: Unknowns, problem: Problem, known: Known) -> Sparse:
     """The `images_jacobian`, kept with the pictures."""
-    if known.images is None:
-        known.images = images_jacobian(unknowns, dataclasses.replace(problem, linearised=known.linearised))
-    return known.images
+    if known.jacobian is None:
+        known.jacobian = images_jacobian(unknowns, dataclasses.replace(problem, linearised=known.linearised))
+    return known.jacobian
 
 
 def pictures_and_influence(
-    unknowns: Unknowns, problem: Problem, key: int, jacobian: Callable[[], Sparse]
+    unknowns: Unknowns, problem: Problem, key: int, known: Known
 ) -> tuple[list[jax.Array], Float[np.ndarray, "ny nx"]]:
     """See `residuals.pictures_and_influence`; by the `images_jacobian` where there can be one."""
+    problem = dataclasses.replace(problem, linearised=known.linearised)
     if not is_sparse(problem):
         pictures, influence = residuals.pictures_and_influence(unknowns, problem, key)
         return pictures, np.asarray(influence)
     weights = in_rows([group.weights for group in problem.groups])
     draw = weights * np.random.default_rng(key).standard_normal(weights.size)
     shape = problem.basis.crop(np.asarray(problem.basis.base)).shape
-    return picture_values(unknowns, problem).images, (jacobian().T @ draw).reshape(shape)
+    if known.images is None:
+        known.images = picture_values(unknowns, problem).images
+    return known.images, (jacobian_at(unknowns, problem, known).T @ draw).reshape(shape)
 
 
 def spreads_of(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarray, " pictures"]:

@@ -101,7 +101,7 @@ class FitLoop:
 
     def pictures_and_influence(self, unknowns: Unknowns, key: int = 0) -> tuple[list[jax.Array], Float[np.ndarray, "ny nx"]]:
         """Those of `known` unknowns, see there."""
-        return pictures_and_influence(unknowns, self.known(unknowns), key, self._jacobian(unknowns))
+        return pictures_and_influence(unknowns, self.problem, key, self._known(unknowns))
 
     def _jacobian(self, unknowns: Unknowns) -> Callable[[], Sparse]:
         return lambda: jacobian_at(unknowns, self.problem, self._known(unknowns))
