@@ -13,6 +13,7 @@ from jaxhf.cli.view import _sun, _sun_path
 from jaxhf.core.errors import UserError
 from jaxhf.io.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.terrain import Terrain
+from jaxhf.rendering import render as _render
 
 pytestmark = pytest.mark.unoptimised
 
@@ -50,7 +51,10 @@ def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, capsys
 
 
 def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch):
+    """Each film prepares its terrain once."""
     framing, views = jaxhf.Perspective.framing, []
+    prepare, prepared = _render.prepare, []
+    monkeypatch.setattr(_render, "prepare", lambda scene: (prepared.append(scene), prepare(scene))[1])
 
     def recorded(field, azimuth, *rest, **options):
         views.append((azimuth, options["around"]))
@@ -67,6 +71,7 @@ def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch):
     lit = imageio.imread(sunny, plugin="pyav").astype(int)
     assert lit.shape == (3, 32, 48, 3)
     assert views[3:] == [(205, False)]  # the camera stands still
+    assert len(prepared) == 2
     for film in (frames, lit):
         assert (np.abs(np.diff(film, axis=0)).max(-1) > 15).mean() > 0.05
     shape = np.abs(lit - lit[:, :1, :1]).max(-1) > 60  # the terrain stands still
