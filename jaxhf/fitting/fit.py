@@ -12,14 +12,16 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float
 
-from ..core.errors import ArgumentError, require_kind
+from ..core.errors import ArgumentError, kind_of
 from ..core.settings import Settings
 from ..core.types import AnyArray
 from ..io.errors import FileError
 from ..io.files import require_folder
+from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
 from .basis import Unknowns
 from .diagnosis import FAR_FROM_ONE, Findings, Places, Region, warnings, where_residuals_are, worst_regions
+from .groups import masked_targets
 from .history import Draws, Step, Stop
 from .loop import FitLoop
 from .normals import share_of_normals
@@ -185,15 +187,12 @@ def fit(
       KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
     for name, values in (("scenes", scenes), ("targets", targets)):
-        if isinstance(values, Scene | str):
-            raise ArgumentError("fit", name, f"must be a list, one for each picture, it is a {type(values).__name__}")
+        if isinstance(values, Scene | str) or not hasattr(values, "__iter__"):
+            raise ArgumentError("fit", name, f"must be a list, one for each picture, it is {kind_of(values)}")
     scenes, targets = tuple(scenes), tuple(targets)
-    for k, target in enumerate(targets):
-        if isinstance(target, str | Path):
-            raise ArgumentError("fit", f"targets[{k}]", f"must be an image, it is a name: jaxhf.load_image({str(target)!r})")
-    require_kind("fit", "settings", settings or Settings(), Settings, "a jaxhf.Settings")
     options = FitOptions(
-        settings=settings or Settings(), weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
+        settings=Settings() if settings is None else settings, weights=weights, noise=noise, start=start, prior=prior,
+        prior_std=prior_std,
         prior_length=prior_length, prior_exponent=prior_exponent, smoothness=smoothness, albedo=albedo,
         albedo_smoothness=albedo_smoothness, exposures=exposures, offsets=offsets, light_std=light_std, camera_std=camera_std,
         loss=loss, loss_scale=loss_scale,
@@ -203,17 +202,20 @@ def fit(
     )  # fmt: skip
     if checkpoint is not None:
         _require_place(Path(checkpoint), resume)
+    targets = masked_targets(scenes, targets, options.weights)
     problem, unknowns = make_problem(scenes, targets, options)
-    _require_solvable(problem, unknowns, options)
     field = scenes[0].heightfields[0]
+    _require_solvable(problem, unknowns, field, options)
     loop = FitLoop(problem, unknowns, field, options)
     result = loop.run()
     loop.set_all_modes()
     return _report(loop, result, scenes, targets)
 
 
-def _require_solvable(problem: Problem, unknowns: Unknowns, options: FitOptions) -> None:
+def _require_solvable(problem: Problem, unknowns: Unknowns, field: Heightfield, options: FitOptions) -> None:
     """Refuses what the solver or the standard deviations cannot do with a problem of this size and precision."""
+    if options.camera_std is not None:
+        _require_near(options.camera_std[0], field)
     if options.solver == "bfgs" and count_unknowns(unknowns) > BFGS_UNKNOWNS:
         raise ArgumentError(
             "fit", "solver", f"bfgs takes at most {BFGS_UNKNOWNS} unknowns, there are {count_unknowns(unknowns)}; take lbfgs"
@@ -225,6 +227,19 @@ def _require_solvable(problem: Problem, unknowns: Unknowns, options: FitOptions)
         raise ArgumentError("fit", "scenes", "must have float64 heights where JAX's x64 mode is on, theirs are float32")
     if options.uncertainty == "exact":
         require_small(unknowns, problem)
+
+
+def _require_near(deviation: float | int, field: Heightfield) -> None:
+    """Refuses cameras that may be farther off than the terrain is long, such as by a deviation in another unit."""
+    side = max((n - 1) * d for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True))
+    if deviation > side:
+        cells = deviation / min(field.dx, field.dy)
+        raise ArgumentError(
+            "fit",
+            "camera_std",
+            f"must have a position that is off by at most the terrain's longer side, {side:.6g}; it is {deviation:.6g}, or "
+            f"{cells:.3g} cells. It is in the unit of dx and dy",
+        )
 
 
 def _require_place(checkpoint: Path, resume: bool) -> None:
