@@ -106,6 +106,7 @@ class Findings(NamedTuple):
       noise_given: whether the noise is the user's, not estimated.
       where: see `where_residuals_are`.
       regions: see `worst_regions`.
+      unlike_noise: what is left although it is no noise, in words; None: nothing.
       help: what to try where the pictures are not explained.
       strayed: root mean square of (heights - prior) / prior_std over the heights that are seen; None: no prior.
       seen: which heights the pictures show.
@@ -120,6 +121,7 @@ class Findings(NamedTuple):
     noise_given: bool
     where: str
     regions: Sequence[Region]
+    unlike_noise: str | None
     help: str
     strayed: float | None
     seen: Bool[np.ndarray, "ny nx"]
@@ -144,6 +146,8 @@ def warnings(found: Findings) -> tuple[str, ...]:
             f"chi2 is {found.chi2:.3g}, not about 1: the noise that was given is {found.chi2**-0.5:.2g} times what is left, so "
             "standard deviations are too large and the prior counts for too much; without a noise the fit estimates it"
         )
+    if found.unlike_noise is not None:
+        said.append(found.unlike_noise)
     if found.result is Stop.MAX_STEPS:
         said.append("the fit was stopped by max_steps before it had converged: allow it more")
     elif found.result is Stop.NON_FINITE:

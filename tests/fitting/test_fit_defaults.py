@@ -12,6 +12,7 @@ import jaxhf
 from jaxhf.fitting import defaults as _defaults, uncertainty as _uncertainty
 from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
+from jaxhf.fitting.findings import Left, neighbour_correlation, unlike_noise, what_may_help
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.jacobian import in_rows
 from jaxhf.fitting.known import spreads_of
@@ -38,6 +39,7 @@ def test_noise_that_is_not_given_is_estimated():
     assert found.regions[0].picture == 0
     assert found.regions[0].row == 0
     assert any("chi2 is" in warning and "picture 0 rows 0-3" in warning for warning in found.warnings)
+    assert not any("is no noise" in warning for warning in found.warnings)
 
 
 def test_the_noise_of_rounded_pictures_is_their_root_mean_square():
@@ -200,6 +202,25 @@ def test_samples_can_be_stopped_with_what_is_there(monkeypatch):
         _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
 
 
+def test_a_noise_that_is_given_too_small_is_told_from_what_the_scene_lacks():
+    problem, _ = make_problem(scenes(), pictures(), fit_options(noise=0.01))
+    noise = np.random.default_rng(0).standard_normal((24, 24, 1))
+    given = fit_options(noise=0.01)
+    assert "leave noise out" in what_may_help(problem, jnp.asarray(TRUTH), [left(10 * noise)] * 3, given)
+    noise[:5] = 30.0
+    assert "leave noise out" not in what_may_help(problem, jnp.asarray(TRUTH), [left(noise)] * 3, given)
+    assert "leave noise out" not in what_may_help(problem, jnp.asarray(TRUTH), [left(10 * noise)] * 3, fit_options())
+
+
+def test_normals_that_the_fit_has_tried_are_not_advised():
+    """Where they are left open it has asked its pictures, and found those by area to be better."""
+    steps = jnp.asarray(np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0))
+    for normals, advised in ((None, False), ("six", True)):
+        options = fit_options(settings=dataclasses.replace(SETTINGS, edge_samples=64, normals=normals), noise=0.02)
+        problem, _ = make_problem(scenes(), pictures(), options)
+        assert ("six-angle" in what_may_help(problem, steps, [left(np.zeros((24, 24, 1)))], options)) == advised
+
+
 def test_the_worst_regions_are_named():
     residual = np.full((64, 32, 1), 0.1)
     residual[8:12, 4:8] = 5.0
@@ -221,9 +242,43 @@ def test_it_says_where_residuals_are():
     assert where_residuals_are([residual], [Places(silhouettes, None)]).startswith("18% of their squares lie beside")
 
 
+def left(residual: np.ndarray, **values) -> Left:
+    """What a fit leaves of a picture of 0.5, in units of a noise of 0.05."""
+    image = np.full((24, 24, 1), 0.5)
+    changes = {"image": image, "target": image - 0.05 * residual, "informing": np.ones(image.shape, bool), **values}
+    return Left(residual=residual, noise=0.05, brightness=0.5, **changes)
+
+
+def test_what_is_left_of_pictures_is_noise_or_is_not():
+    """Neighbours of noise have nothing in common, whatever its size and however far off some pixels are."""
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((24, 24, 1))
+    noise[5:9, 5:9] = 500.0
+    smooth = 3 * np.sin(np.linspace(0, 9, 24))[:, None, None] + noise
+    correlation, spread = neighbour_correlation(noise, np.ones(noise.shape, bool))
+    assert abs(correlation) < 0.1
+    np.testing.assert_allclose(spread, 1, rtol=0.1)
+    for multiple in (0.1, 1, 10):
+        assert unlike_noise([left(multiple * noise)], fit_options()) is None
+    said = unlike_noise([left(noise), left(smooth)], fit_options(prior=0.0, prior_std=1.0))
+    assert said is not None
+    assert said.startswith("what is left of picture 1 is no noise: neighbouring pixels are off alike (correlation 0.")
+    assert "prior_std may be too small" in said
+    assert unlike_noise([left(smooth)._replace(noise=1e-3)], fit_options()) is None  # as rounding is
+    assert unlike_noise([left(smooth, informing=np.zeros((24, 24, 1), bool))], fit_options()) is None
+
+
+def test_a_picture_of_another_brightness_is_said_to_be_one():
+    """Such as one of values up to 255, or of an albedo that is off: its noise is estimated to be as large, and chi2 is 1."""
+    image = np.linspace(0.2, 0.5, 576).reshape(24, 24, 1)
+    found = left((image - 1.5 * image) / 0.05, image=image, target=1.5 * image)
+    assert "it is 1.5 times as bright as the scene: exposures=True" in str(unlike_noise([found], fit_options()))
+    assert "exposures=True" not in str(unlike_noise([found], fit_options(exposures=True)))
+
+
 GOOD = Findings(
-    result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), help="try this", strayed=0.9,
-    seen=np.ones((4, 5), bool), lights=3, scaled=1.0, draws=(20, 20), normals=None,
+    result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, help="try this",
+    strayed=0.9, seen=np.ones((4, 5), bool), lights=3, scaled=1.0, draws=(20, 20), normals=None,
 )  # fmt: skip
 
 
@@ -233,6 +288,7 @@ GOOD = Findings(
         ({"chi2": 4.3}, "differ from the measured ones by 2.1 times the noise"),
         ({"chi2": 4.3}, "came no nearer: try this"),
         ({"chi2": 4.3, "result": jaxhf.Stop.STALLED}, "it stalled: try this"),
+        ({"unlike_noise": "what is left is no noise"}, "what is left is no noise"),
         ({"chi2": 0.25}, "the noise that was given is 2 times what is left"),
         ({"result": jaxhf.Stop.MAX_STEPS}, "stopped by max_steps"),
         ({"strayed": 2.5}, "2.5 times prior_std"),
