@@ -248,6 +248,9 @@ def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():
         fingerprint(loss="huber"),
     ]
     assert len(set(found)) == len(found)
+    # What is chosen at first may be what another fit is given: 1 % of the brightness, 2048 points.
+    assert fingerprint(noise=0.01) != found[0]
+    assert fingerprint(settings=jaxhf.Settings(edge_samples=2048)) != found[0]
     assert fingerprint(max_steps=7, checkpoint_every=3, uncertainty=5) == found[0]  # what does not decide on the steps
 
 
