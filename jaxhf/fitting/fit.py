@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from ..core.errors import ArgumentError, kind_of
 from ..core.settings import Settings
 from ..core.types import AnyArray
+from ..io.checkpoint import load_facts
 from ..io.errors import FileError
 from ..io.files import require_folder
 from ..scene.heightfield import Heightfield
@@ -244,7 +245,9 @@ def _require_near(deviation: float | int, field: Heightfield) -> None:
 
 def _require_place(checkpoint: Path, resume: bool) -> None:
     require_folder(checkpoint, "a checkpoint")
-    if checkpoint.exists() and not resume:
+    if checkpoint.exists() and resume:
+        load_facts(checkpoint)  # refuses what is damaged or no checkpoint
+    elif checkpoint.exists():
         raise FileError(f"{checkpoint}: this checkpoint is there already; resume=True goes on from it, to begin anew remove it")
 
 

@@ -173,6 +173,8 @@ def test_a_checkpoint_that_cannot_be_kept_is_refused_first(tmp_path, monkeypatch
     path.write_bytes(b"hours of work")
     with pytest.raises(ValueError, match=r"fit\.checkpoint: this checkpoint is there already; resume=True goes on from it"):
         jaxhf.fit(*problem(), **OPTIONS, checkpoint=path)
+    with pytest.raises(ValueError, match=r"fit\.checkpoint: this is not a checkpoint of jaxhf's"):
+        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True)
     assert path.read_bytes() == b"hours of work"
 
 
