@@ -152,7 +152,7 @@ def warnings(found: Findings) -> tuple[str, ...]:
         said.append("the fit was stopped by max_steps before it had converged: allow it more")
     elif found.result is Stop.NON_FINITE:
         said.append("a loss was not finite; the heights are those before it")
-    elif unexplained:
+    elif unexplained and found.unlike_noise is None:  # which names a cause
         said.append(f"{'it stalled' if found.result is Stop.STALLED else 'it came no nearer'}: {found.help}")
     if found.strayed is not None and found.strayed > _STRAYED:
         said.append(

@@ -18,7 +18,8 @@ _LIKE_NOISE = 0.2  # below which they may be
 _LEAST_PAIRS = 100  # from which it is taken
 _LEAST_SIZE = 0.01  # of a picture's brightness: smaller residuals are rounding and other trifles
 _FAR = 4.5  # times the median: three standard deviations of normal errors
-_EXPLAINED = 0.5  # share of the squared residuals that a factor on the picture must explain
+_EXPLAINED = 0.5  # share of the squared residuals that a factor or an offset of the picture must explain
+_TRIFLE = 0.1  # a factor or, over the brightness, an offset that is too small to be a cause
 _WIDER = 1.2  # the spread of residuals over the noise, above which that may be larger
 
 
@@ -80,9 +81,12 @@ def unlike_noise(pictures: Sequence[Left], options: FitOptions) -> str | None:
 
 def _cause(left: Left, options: FitOptions) -> str:
     image, target = (values[left.informing].astype(np.float64) for values in (left.image, left.target))
-    factor = float(image @ target / max(image @ image, 1e-30))
-    remains = np.sum((target - factor * image) ** 2) / max(np.sum((target - image) ** 2), 1e-30)
-    if not options.exposures and factor > 0 and remains < 1 - _EXPLAINED:
+    factor, offset = float(image @ target / max(image @ image, 1e-30)), float(np.mean(target - image))
+    most = (1 - _EXPLAINED) * np.sum((target - image) ** 2)
+    scaled, moved = np.sum((target - factor * image) ** 2), np.sum((target - image - offset) ** 2)
+    if not options.offsets and moved < min(most, scaled) and abs(offset) > _TRIFLE * left.brightness:
+        return f"it is brighter than the scene by {offset:.3g}: offsets=True finds what haze or the sensor adds"
+    if not options.exposures and factor > 0 and scaled < most and abs(factor - 1) > _TRIFLE:
         return (
             f"it is {factor:.3g} times as bright as the scene: exposures=True finds such factors, if the exposure, the light "
             "or the albedo is not known"

@@ -271,9 +271,22 @@ def test_what_is_left_of_pictures_is_noise_or_is_not():
 def test_a_picture_of_another_brightness_is_said_to_be_one():
     """Such as one of values up to 255, or of an albedo that is off: its noise is estimated to be as large, and chi2 is 1."""
     image = np.linspace(0.2, 0.5, 576).reshape(24, 24, 1)
-    found = left((image - 1.5 * image) / 0.05, image=image, target=1.5 * image)
-    assert "it is 1.5 times as bright as the scene: exposures=True" in str(unlike_noise([found], fit_options()))
-    assert "exposures=True" not in str(unlike_noise([found], fit_options(exposures=True)))
+
+    def said(target: np.ndarray, **options) -> str:
+        return str(unlike_noise([left((image - target) / 0.05, image=image, target=target)], fit_options(**options)))
+
+    assert "it is 1.5 times as bright as the scene: exposures=True" in said(1.5 * image)
+    assert "exposures=True" not in said(1.5 * image, exposures=True)
+    assert "it is brighter than the scene by 0.1: offsets=True" in said(image + 0.1)
+    assert "offsets=True" not in said(image + 0.1, offsets=True)
+    assert "light_std, camera_std" in said(1.05 * image)
+    assert "light_std, camera_std" in said(image[::-1])
+
+
+def test_one_thing_to_try_is_enough():
+    said = warnings(GOOD._replace(chi2=4.3, unlike_noise="it is 1.5 times as bright"))
+    assert len(said) == 2
+    assert not any("try this" in warning for warning in said)
 
 
 GOOD = Findings(
