@@ -135,6 +135,7 @@ def warnings(found: Findings) -> tuple[str, ...]:
     """What a user should know before trusting the heights; empty where nothing speaks against it."""
     said = []
     unexplained = found.chi2 > FAR_FROM_ONE
+    strays = found.strayed is not None and found.strayed > _STRAYED
     if unexplained:
         worst = "; ".join(map(str, found.regions))
         said.append(
@@ -152,9 +153,9 @@ def warnings(found: Findings) -> tuple[str, ...]:
         said.append("the fit was stopped by max_steps before it had converged: allow it more")
     elif found.result is Stop.NON_FINITE:
         said.append("a loss was not finite; the heights are those before it")
-    elif unexplained and found.unlike_noise is None:  # which names a cause
+    elif unexplained and found.unlike_noise is None and not strays:  # which name a cause
         said.append(f"{'it stalled' if found.result is Stop.STALLED else 'it came no nearer'}: {found.help}")
-    if found.strayed is not None and found.strayed > _STRAYED:
+    if strays:
         said.append(
             f"the heights differ from the prior by {found.strayed:.2g} times prior_std, root mean square: either prior_std is "
             "too small or the heights are wrong"

@@ -283,8 +283,9 @@ def test_a_picture_of_another_brightness_is_said_to_be_one():
     assert "light_std, camera_std" in said(image[::-1])
 
 
-def test_one_thing_to_try_is_enough():
-    said = warnings(GOOD._replace(chi2=4.3, unlike_noise="it is 1.5 times as bright"))
+@pytest.mark.parametrize("cause", [{"unlike_noise": "it is 1.5 times as bright"}, {"strayed": 2.5}])
+def test_one_thing_to_try_is_enough(cause):
+    said = warnings(GOOD._replace(chi2=4.3, **cause))
     assert len(said) == 2
     assert not any("try this" in warning for warning in said)
 
