@@ -11,6 +11,7 @@ from .history import Stop
 FAR_FROM_ONE = 1.5  # by which factor chi2 may differ from 1
 _STRAYED = 2.0  # standard deviations of the prior, root mean square
 _UNSEEN = 0.01  # share of the heights
+_NOISY = 0.1  # of the brightness
 _REGIONS = 3
 _BLOCKS = 16  # along a picture's longer side
 _LEAST_BLOCK = 4  # pixels
@@ -110,6 +111,8 @@ class Findings(NamedTuple):
       help: what to try where the pictures are not explained.
       strayed: root mean square of (heights - prior) / prior_std over the heights that are seen; None: no prior.
       seen: which heights the pictures show.
+      mean_shown: whether pictures change as all heights move up together.
+      noise_share: the least noise of a picture over its brightness.
       lights: how many directions light comes from, over all pictures.
       scaled: by what the noise was multiplied for the standard deviations; None: there are none.
       draws: asked for, made; None: none were asked for.
@@ -125,6 +128,8 @@ class Findings(NamedTuple):
     help: str
     strayed: float | None
     seen: Bool[np.ndarray, "ny nx"]
+    mean_shown: bool
+    noise_share: float
     lights: int
     scaled: float | None
     draws: tuple[int, int] | None
@@ -168,6 +173,16 @@ def warnings(found: Findings) -> tuple[str, ...]:
         said.append(
             "all pictures have the same light and there is no prior: of slopes across the light only silhouettes and shadows "
             "tell; give a prior, or pictures with other lights"
+        )
+    if found.strayed is None and not found.mean_shown and found.seen.any():
+        said.append(
+            "the pictures show the terrain's shape, not how high all of it stands: its mean height is that of the start; a "
+            "prior tells it, or a picture that is not from straight above"
+        )
+    if found.strayed is None and found.noise_share > _NOISY and found.unlike_noise is None and found.scaled is None:
+        said.append(
+            f"the noise is {found.noise_share:.0%} of the pictures' brightness, and no prior holds the heights: uncertainty=20 "
+            "says how far they may be off"
         )
     if found.scaled is not None and found.scaled > 1.05:
         said.append(

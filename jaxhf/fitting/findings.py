@@ -20,6 +20,7 @@ _LEAST_SIZE = 0.01  # of a picture's brightness: smaller residuals are rounding 
 _FAR = 4.5  # times the median: three standard deviations of normal errors
 _EXPLAINED = 0.5  # share of the squared residuals that a factor or an offset of the picture must explain
 _TRIFLE = 0.1  # a factor or, over the brightness, an offset that is too small to be a cause
+_RELATIVE = 1e-5  # above what single precision leaves of a sum that is 0; oblique pictures have 1e-3 to 0.2
 _WIDER = 1.2  # the spread of residuals over the noise, above which that may be larger
 
 
@@ -131,6 +132,8 @@ def what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"], pictures:
         return "what is left looks like noise that is larger than the given one: leave noise out, and the fit estimates it"
     if problem.loss == "squares":
         return "loss='geman' lets pixels go that the scene cannot explain"
+    if not problem.settings.shadows:
+        return "Settings(shadows=True), the default, renders shadows, too"
     if not problem.settings.edge_samples:
         return "Settings(edge_samples=None), the default, lets the fit move silhouettes, shadows and the terrain's border"
     share = 0.0 if options.settings.normals is None else share_of_normals(problem, heights)  # else the fit has tried them
@@ -140,7 +143,10 @@ def what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"], pictures:
             "default, and by angle, as by Mitsuba: for those, Settings(normals='six-angle')"
         )
     if (problem.settings.samples or 1) < 16:
-        return "Settings(samples=16) makes pictures of finer samples; if that changes nothing, mask those pixels by weights"
+        return (
+            "Settings(samples=16) makes pictures of finer samples; if that changes nothing, camera_std finds a camera that is "
+            "off, or mask those pixels by weights"
+        )
     return "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo)"
 
 
@@ -155,6 +161,15 @@ def strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: 
         return None
     ratio = (heights - np.asarray(problem.basis.crop(problem.prior.heights))) / np.asarray(prior_std, np.float64)
     return float(np.sqrt(np.mean(np.broadcast_to(ratio, seen.shape)[seen] ** 2)))
+
+
+def shows_mean(influence: Float[np.ndarray, "ny nx"]) -> bool:
+    """Whether pictures change as all heights move up together; orthophotos do not.
+
+    Args:
+      influence: Jᵀz for a normal z, J the pictures' derivative in the heights: its sum is normal, with the deviation |J 1|.
+    """
+    return abs(float(np.sum(influence, dtype=np.float64))) > _RELATIVE * float(np.linalg.norm(influence))
 
 
 def light_directions(problem: Problem) -> int:

@@ -22,7 +22,16 @@ from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
 from .basis import Unknowns
 from .diagnosis import FAR_FROM_ONE, Findings, Region, warnings, where_residuals_are, worst_regions
-from .findings import Left, boundary_places, informing_values, light_directions, strayed, unlike_noise, what_may_help
+from .findings import (
+    Left,
+    boundary_places,
+    informing_values,
+    light_directions,
+    shows_mean,
+    strayed,
+    unlike_noise,
+    what_may_help,
+)
 from .groups import masked_targets
 from .history import Draws, Step, Stop
 from .loop import FitLoop
@@ -296,6 +305,8 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         unlike_noise=unlike_noise(left, options),
         strayed=strayed(problem, np.asarray(heights), seen, options.prior_std),
         seen=seen,
+        mean_shown=shows_mean(influence),
+        noise_share=float(np.min(problem.noise / problem.brightness)),
         lights=light_directions(problem),
         normals=problem.settings.normals if options.settings.normals is None else None,
         scaled=scaled,

@@ -46,7 +46,7 @@ NONE = np.zeros(0)  # the noise of no pictures
 TRUTH = fractal([12, 12], seed=3, exponent=3.0, range=(0.0, 0.1))
 
 
-def scenes(heights=None, albedo: Any = 0.7, camera: jaxhf.Perspective = CAMERA) -> list[jaxhf.Scene]:
+def scenes(heights=None, albedo: Any = 0.7, camera: jaxhf.Perspective | jaxhf.Orthographic = CAMERA) -> list[jaxhf.Scene]:
     heights = np.full_like(TRUTH, 0.05) if heights is None else heights
     field = jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(albedo))
     return [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]

@@ -6,16 +6,16 @@ import inspect
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_fit import OPTIONS, SETTINGS, TRUTH, fit_options, pictures, rms, scenes
+from test_fit import CAMERA, OPTIONS, SETTINGS, TRUTH, fit_options, pictures, rms, scenes
 
 import jaxhf
 from jaxhf.fitting import defaults as _defaults, uncertainty as _uncertainty
 from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
-from jaxhf.fitting.findings import Left, neighbour_correlation, unlike_noise, what_may_help
+from jaxhf.fitting.findings import Left, neighbour_correlation, shows_mean, unlike_noise, what_may_help
 from jaxhf.fitting.history import Draws
-from jaxhf.fitting.jacobian import in_rows
-from jaxhf.fitting.known import spreads_of
+from jaxhf.fitting.jacobian import images_jacobian, in_rows
+from jaxhf.fitting.known import pictures_and_influence, spreads_of
 from jaxhf.fitting.normal_matrix import NormalMatrix
 from jaxhf.fitting.normals import evidence_for_angles, share_of_normals
 from jaxhf.fitting.problem import make_problem
@@ -216,7 +216,9 @@ def test_normals_that_the_fit_has_tried_are_not_advised():
     """Where they are left open it has asked its pictures, and found those by area to be better."""
     steps = jnp.asarray(np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0))
     for normals, advised in ((None, False), ("six", True)):
-        options = fit_options(settings=dataclasses.replace(SETTINGS, edge_samples=64, normals=normals), noise=0.02)
+        options = fit_options(
+            settings=dataclasses.replace(SETTINGS, shadows=True, edge_samples=64, normals=normals), noise=0.02
+        )
         problem, _ = make_problem(scenes(), pictures(), options)
         assert ("six-angle" in what_may_help(problem, steps, [left(np.zeros((24, 24, 1)))], options)) == advised
 
@@ -292,7 +294,8 @@ def test_one_thing_to_try_is_enough(cause):
 
 GOOD = Findings(
     result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, help="try this",
-    strayed=0.9, seen=np.ones((4, 5), bool), lights=3, scaled=1.0, draws=(20, 20), normals=None,
+    strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, lights=3, scaled=1.0, draws=(20, 20),
+    normals=None,
 )  # fmt: skip
 
 
@@ -309,6 +312,8 @@ GOOD = Findings(
         ({"seen": np.arange(20).reshape(4, 5) > 4}, "no picture shows 5 of 20 heights (25%): they are what the prior makes"),
         ({"seen": np.zeros((4, 5), bool), "strayed": None}, "they are the start"),
         ({"strayed": None, "lights": 1}, "same light and there is no prior"),
+        ({"strayed": None, "mean_shown": False}, "not how high all of it stands"),
+        ({"strayed": None, "noise_share": 0.3, "scaled": None}, "the noise is 30% of the pictures' brightness"),
         ({"scaled": 1.8}, "1.8 times the noise"),
         ({"draws": (20, 7)}, "interrupted after 7 of 20"),
         ({"normals": "six-angle"}, "weighted as Settings(normals='six-angle') says"),
@@ -317,6 +322,17 @@ GOOD = Findings(
 def test_warnings_say_what_speaks_against_the_heights(change, said):
     assert warnings(GOOD) == ()
     assert any(said in warning for warning in warnings(GOOD._replace(**change)))
+
+
+def test_an_orthophoto_does_not_show_the_mean_height():
+    """In either precision, at any noise; a picture by a camera at a finite distance does."""
+    above = jaxhf.Orthographic.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), up=(0, 1, 0), extent=0.9, width=24, height=24)
+    for camera, shown in ((above, False), (CAMERA, True)):
+        problem, unknowns = make_problem(scenes(TRUTH, camera=camera), pictures(), fit_options(**OPTIONS))
+        known = linearised(unknowns, problem)
+        _, influence = pictures_and_influence(unknowns, known, 0, lambda u=unknowns, p=known: images_jacobian(u, p))
+        assert shows_mean(influence) == shown
+        assert shows_mean(influence.astype(np.float32)) == shown
 
 
 def test_a_small_chi2_is_no_warning_where_the_noise_was_estimated():
