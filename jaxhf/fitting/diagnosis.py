@@ -167,7 +167,9 @@ def warnings(found: Findings) -> tuple[str, ...]:
         )
     hidden = int((~found.seen).sum())
     if hidden > _UNSEEN * found.seen.size:
-        kept = "the start" if found.strayed is None else "what the prior makes of their neighbours"
+        kept = "what the prior makes of their neighbours"
+        if found.strayed is None:
+            kept = "a smooth continuation of their neighbours" if found.seen.any() else "the start"
         said.append(f"no picture shows {hidden} of {found.seen.size} heights ({hidden / found.seen.size:.0%}): they are {kept}")
     if found.strayed is None and found.lights == 1:
         said.append(

@@ -310,6 +310,7 @@ GOOD = Findings(
         ({"result": jaxhf.Stop.MAX_STEPS}, "stopped by max_steps"),
         ({"strayed": 2.5}, "2.5 times prior_std"),
         ({"seen": np.arange(20).reshape(4, 5) > 4}, "no picture shows 5 of 20 heights (25%): they are what the prior makes"),
+        ({"seen": np.arange(20).reshape(4, 5) > 4, "strayed": None}, "they are a smooth continuation of their neighbours"),
         ({"seen": np.zeros((4, 5), bool), "strayed": None}, "they are the start"),
         ({"strayed": None, "lights": 1}, "same light and there is no prior"),
         ({"strayed": None, "mean_shown": False}, "not how high all of it stands"),
