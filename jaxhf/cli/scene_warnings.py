@@ -28,11 +28,16 @@ def scene_warnings(scene: "Scene") -> Iterator[str]:
     """A line for each thing that makes a picture black or odd without being an error."""
     from ..scene.camera import Perspective
     from ..scene.heightfield import Heightfield
+    from ..scene.light import Directional
     from ..scene.material import Matte
 
     if not scene.lights:
         yield "the scene has no lights: the picture is black"
     camera = scene.camera
+    looks_down = float(np.asarray(camera.world_from_camera)[2, 2]) < 0
+    for k, light in enumerate(scene.lights):
+        if isinstance(light, Directional) and (z := float(np.asarray(light.towards)[2])) < 0 and looks_down:
+            yield f"lights[{k}]: it shines from below the horizon, its z is {z:.3g}: ground that is seen from above stays dark"
     if isinstance(camera, Perspective) and float(camera.fov) < _NARROW:
         yield f"camera: fov is {float(camera.fov):.4g} degrees, less than {_NARROW:g}; it is not in radians"
     if isinstance(camera, Perspective) and float(camera.fov) > _WIDE:

@@ -11,6 +11,7 @@ from .history import Stop
 FAR_FROM_ONE = 1.5  # by which factor chi2 may differ from 1
 _STRAYED = 2.0  # standard deviations of the prior, root mean square
 _UNSEEN = 0.01  # share of the heights
+_NOISY = 0.1  # of the brightness
 _REGIONS = 3
 _BLOCKS = 16  # along a picture's longer side
 _LEAST_BLOCK = 4  # pixels
@@ -106,9 +107,12 @@ class Findings(NamedTuple):
       noise_given: whether the noise is the user's, not estimated.
       where: see `where_residuals_are`.
       regions: see `worst_regions`.
+      unlike_noise: what is left although it is no noise, in words; None: nothing.
       help: what to try where the pictures are not explained.
       strayed: root mean square of (heights - prior) / prior_std over the heights that are seen; None: no prior.
       seen: which heights the pictures show.
+      mean_shown: whether pictures change as all heights move up together.
+      noise_share: the least noise of a picture over its brightness.
       lights: how many directions light comes from, over all pictures.
       scaled: by what the noise was multiplied for the standard deviations; None: there are none.
       draws: asked for, made; None: none were asked for.
@@ -120,9 +124,12 @@ class Findings(NamedTuple):
     noise_given: bool
     where: str
     regions: Sequence[Region]
+    unlike_noise: str | None
     help: str
     strayed: float | None
     seen: Bool[np.ndarray, "ny nx"]
+    mean_shown: bool
+    noise_share: float
     lights: int
     scaled: float | None
     draws: tuple[int, int] | None
@@ -133,6 +140,7 @@ def warnings(found: Findings) -> tuple[str, ...]:
     """What a user should know before trusting the heights; empty where nothing speaks against it."""
     said = []
     unexplained = found.chi2 > FAR_FROM_ONE
+    strays = found.strayed is not None and found.strayed > _STRAYED
     if unexplained:
         worst = "; ".join(map(str, found.regions))
         said.append(
@@ -144,25 +152,39 @@ def warnings(found: Findings) -> tuple[str, ...]:
             f"chi2 is {found.chi2:.3g}, not about 1: the noise that was given is {found.chi2**-0.5:.2g} times what is left, so "
             "standard deviations are too large and the prior counts for too much; without a noise the fit estimates it"
         )
+    if found.unlike_noise is not None:
+        said.append(found.unlike_noise)
     if found.result is Stop.MAX_STEPS:
         said.append("the fit was stopped by max_steps before it had converged: allow it more")
     elif found.result is Stop.NON_FINITE:
         said.append("a loss was not finite; the heights are those before it")
-    elif unexplained:
+    elif unexplained and found.unlike_noise is None and not strays:  # which name a cause
         said.append(f"{'it stalled' if found.result is Stop.STALLED else 'it came no nearer'}: {found.help}")
-    if found.strayed is not None and found.strayed > _STRAYED:
+    if strays:
         said.append(
             f"the heights differ from the prior by {found.strayed:.2g} times prior_std, root mean square: either prior_std is "
             "too small or the heights are wrong"
         )
     hidden = int((~found.seen).sum())
     if hidden > _UNSEEN * found.seen.size:
-        kept = "the start" if found.strayed is None else "what the prior makes of their neighbours"
+        kept = "what the prior makes of their neighbours"
+        if found.strayed is None:
+            kept = "a smooth continuation of their neighbours" if found.seen.any() else "the start"
         said.append(f"no picture shows {hidden} of {found.seen.size} heights ({hidden / found.seen.size:.0%}): they are {kept}")
     if found.strayed is None and found.lights == 1:
         said.append(
             "all pictures have the same light and there is no prior: of slopes across the light only silhouettes and shadows "
             "tell; give a prior, or pictures with other lights"
+        )
+    if found.strayed is None and not found.mean_shown and found.seen.any():
+        said.append(
+            "the pictures show the terrain's shape, not how high all of it stands: its mean height is that of the start; a "
+            "prior tells it, or a picture that is not from straight above"
+        )
+    if found.strayed is None and found.noise_share > _NOISY and found.unlike_noise is None and found.scaled is None:
+        said.append(
+            f"the noise is {found.noise_share:.0%} of the pictures' brightness, and no prior holds the heights: uncertainty=20 "
+            "says how far they may be off"
         )
     if found.scaled is not None and found.scaled > 1.05:
         said.append(

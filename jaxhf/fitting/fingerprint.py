@@ -26,7 +26,9 @@ def fingerprint(problem: Problem, unknowns: Unknowns, options: FitOptions) -> st
             parts[field.metadata.get("static", False)].append(getattr(problem, field.name))
     leaves, structure = jax.tree.flatten((parts[False], unknowns))
     levels = None if options.levels is None else list(options.levels)
-    choices = (parts[True], structure, options.solver, levels, options.inner_steps, options.tolerance)
+    # What is left open is chosen anew on the way, also where it begins with what another fit is given.
+    left_open = (options.noise is None, options.settings.edge_samples is None)
+    choices = (parts[True], structure, options.solver, levels, options.inner_steps, options.tolerance, left_open)
     digest = hashlib.sha256(repr(choices).encode())
     for leaf in map(np.asarray, leaves):
         digest.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())

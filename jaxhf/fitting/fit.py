@@ -12,17 +12,29 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float
 
-from ..core.errors import ArgumentError, require_kind
+from ..core.errors import ArgumentError, kind_of
 from ..core.settings import Settings
 from ..core.types import AnyArray
+from ..io.checkpoint import load_facts
 from ..io.errors import FileError
 from ..io.files import require_folder
+from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
 from .basis import Unknowns
-from .diagnosis import FAR_FROM_ONE, Findings, Places, Region, warnings, where_residuals_are, worst_regions
+from .diagnosis import FAR_FROM_ONE, Findings, Region, warnings, where_residuals_are, worst_regions
+from .findings import (
+    Left,
+    boundary_places,
+    informing_values,
+    light_directions,
+    shows_mean,
+    strayed,
+    unlike_noise,
+    what_may_help,
+)
+from .groups import masked_targets
 from .history import Draws, Step, Stop
 from .loop import FitLoop
-from .normals import share_of_normals
 from .options import Albedo, FitOptions, Loss, Solver
 from .problem import Problem, make_problem
 from .residuals import found_scenes
@@ -185,15 +197,12 @@ def fit(
       KeyboardInterrupt: Ctrl-C, after the checkpoint was written, if there was anything to keep.
     """
     for name, values in (("scenes", scenes), ("targets", targets)):
-        if isinstance(values, Scene | str):
-            raise ArgumentError("fit", name, f"must be a list, one for each picture, it is a {type(values).__name__}")
+        if isinstance(values, Scene | str) or not hasattr(values, "__iter__"):
+            raise ArgumentError("fit", name, f"must be a list, one for each picture, it is {kind_of(values)}")
     scenes, targets = tuple(scenes), tuple(targets)
-    for k, target in enumerate(targets):
-        if isinstance(target, str | Path):
-            raise ArgumentError("fit", f"targets[{k}]", f"must be an image, it is a name: jaxhf.load_image({str(target)!r})")
-    require_kind("fit", "settings", settings or Settings(), Settings, "a jaxhf.Settings")
     options = FitOptions(
-        settings=settings or Settings(), weights=weights, noise=noise, start=start, prior=prior, prior_std=prior_std,
+        settings=Settings() if settings is None else settings, weights=weights, noise=noise, start=start, prior=prior,
+        prior_std=prior_std,
         prior_length=prior_length, prior_exponent=prior_exponent, smoothness=smoothness, albedo=albedo,
         albedo_smoothness=albedo_smoothness, exposures=exposures, offsets=offsets, light_std=light_std, camera_std=camera_std,
         loss=loss, loss_scale=loss_scale,
@@ -203,17 +212,20 @@ def fit(
     )  # fmt: skip
     if checkpoint is not None:
         _require_place(Path(checkpoint), resume)
+    targets = masked_targets(scenes, targets, options.weights)
     problem, unknowns = make_problem(scenes, targets, options)
-    _require_solvable(problem, unknowns, options)
     field = scenes[0].heightfields[0]
+    _require_solvable(problem, unknowns, field, options)
     loop = FitLoop(problem, unknowns, field, options)
     result = loop.run()
     loop.set_all_modes()
     return _report(loop, result, scenes, targets)
 
 
-def _require_solvable(problem: Problem, unknowns: Unknowns, options: FitOptions) -> None:
+def _require_solvable(problem: Problem, unknowns: Unknowns, field: Heightfield, options: FitOptions) -> None:
     """Refuses what the solver or the standard deviations cannot do with a problem of this size and precision."""
+    if options.camera_std is not None:
+        _require_near(options.camera_std[0], field)
     if options.solver == "bfgs" and count_unknowns(unknowns) > BFGS_UNKNOWNS:
         raise ArgumentError(
             "fit", "solver", f"bfgs takes at most {BFGS_UNKNOWNS} unknowns, there are {count_unknowns(unknowns)}; take lbfgs"
@@ -227,9 +239,24 @@ def _require_solvable(problem: Problem, unknowns: Unknowns, options: FitOptions)
         require_small(unknowns, problem)
 
 
+def _require_near(deviation: float | int, field: Heightfield) -> None:
+    """Refuses cameras that may be farther off than the terrain is long, such as by a deviation in another unit."""
+    side = max((n - 1) * d for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True))
+    if deviation > side:
+        cells = deviation / min(field.dx, field.dy)
+        raise ArgumentError(
+            "fit",
+            "camera_std",
+            f"must have a position that is off by at most the terrain's longer side, {side:.6g}; it is {deviation:.6g}, or "
+            f"{cells:.3g} cells. It is in the unit of dx and dy",
+        )
+
+
 def _require_place(checkpoint: Path, resume: bool) -> None:
     require_folder(checkpoint, "a checkpoint")
-    if checkpoint.exists() and not resume:
+    if checkpoint.exists() and resume:
+        load_facts(checkpoint)  # refuses what is damaged or no checkpoint
+    elif checkpoint.exists():
         raise FileError(f"{checkpoint}: this checkpoint is there already; resume=True goes on from it, to begin anew remove it")
 
 
@@ -242,20 +269,22 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
     problem, unknowns, options = loop.problem, loop.unknowns, loop.options
     images: list[np.ndarray] = [np.zeros(())] * problem.count
     differences: list[np.ndarray] = [np.zeros(())] * problem.count
-    in_noise: list[np.ndarray] = [np.zeros(())] * problem.count
+    left: list[Any] = [None] * problem.count
+    informing = informing_values(problem)
     pictures, influence = loop.pictures_and_influence(unknowns)
     for group, simulated in zip(problem.groups, pictures, strict=True):
-        simulated, weights = np.asarray(simulated), np.asarray(group.weights)
-        difference = np.where(weights > 0, simulated - np.asarray(group.targets), 0)
-        for k, image, values, weight in zip(group.indices, simulated, difference, weights, strict=True):
+        simulated, weights, measured = np.asarray(simulated), np.asarray(group.weights), np.asarray(group.targets)
+        difference = np.where(weights > 0, simulated - measured, 0)
+        for k, image, target, values, weight in zip(group.indices, simulated, measured, difference, weights, strict=True):
             shape = np.shape(targets[k])
             images[k], differences[k] = _in_shape(image, shape), _in_shape(values, shape)
-            in_noise[k] = values * weight
+            left[k] = Left(image, target, values * weight, informing[k], float(problem.noise[k]), float(problem.brightness[k]))
+    in_noise = [picture.residual for picture in left]
     counted = np.concatenate(
-        [values[informs | (np.abs(values) > _OFF)] for values, informs in zip(in_noise, _informing(problem), strict=True)]
+        [picture.residual[picture.informing | (np.abs(picture.residual) > _OFF)] for picture in left]
     ).astype(np.float64)
     with np.errstate(over="ignore"):
-        regions, where = worst_regions(in_noise), where_residuals_are(in_noise, _places(problem))
+        regions, where = worst_regions(in_noise), where_residuals_are(in_noise, boundary_places(problem))
         chi2 = float(np.mean(np.square(counted))) if len(counted) else 0.0
     seen = influence != 0
     std, scaled, draws = None, None, None
@@ -272,10 +301,13 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         noise_given=options.noise is not None,
         where=where,
         regions=regions,
-        help=_what_may_help(problem, heights) if chi2 > FAR_FROM_ONE else "",
-        strayed=_strayed(problem, np.asarray(heights), seen, options.prior_std),
+        help=what_may_help(problem, heights, left, options) if chi2 > FAR_FROM_ONE else "",
+        unlike_noise=unlike_noise(left, options),
+        strayed=strayed(problem, np.asarray(heights), seen, options.prior_std),
         seen=seen,
-        lights=_light_directions(problem),
+        mean_shown=shows_mean(influence),
+        noise_share=float(np.min(problem.noise / problem.brightness)),
+        lights=light_directions(problem),
         normals=problem.found_settings.normals if options.settings.normals is None else None,
         scaled=scaled,
         draws=draws,
@@ -305,66 +337,3 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         stats=stats,
         history=tuple(loop.history),
     )
-
-
-def _informing(problem: Problem) -> list[Bool[np.ndarray, "h w c"]]:
-    """Which values of each picture depend on the heights; all of those with a weight where that is not known."""
-    found = [np.zeros((1, 1, 1), bool)] * problem.count
-    for number, group in enumerate(problem.groups):
-        informing = np.asarray(group.weights) > 0
-        if problem.linearised is not None:
-            informing &= np.asarray(problem.linearised[number].depends)[..., None]
-        for k, values in zip(group.indices, informing, strict=True):
-            found[k] = values
-    return found
-
-
-def _places(problem: Problem) -> list[Places]:
-    """Where boundaries are in each picture."""
-    found = [Places(np.zeros((1, 1), bool), None)] * problem.count
-    for number, group in enumerate(problem.groups):
-        h, w = group.targets.shape[1:3]
-        known = None if problem.linearised is None else problem.linearised[number]
-        for position, k in enumerate(group.indices):
-            if known is None:
-                found[k] = Places(np.zeros((h, w), bool), None)
-            elif known.edges is None:
-                found[k] = Places(~np.asarray(known.depends)[position], None)
-            else:
-                pixel, kind = np.asarray(known.edges.pixel)[position], np.asarray(known.edges.kind)[position]
-                silhouettes, shadows = (np.bincount(pixel[kind == which], minlength=h * w) > 0 for which in (1, 2))
-                found[k] = Places(silhouettes.reshape(h, w), shadows.reshape(h, w))
-    return found
-
-
-def _what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> str:
-    """The one option to try where pictures are left unexplained."""
-    if problem.loss == "squares":
-        return "loss='geman' lets pixels go that the scene cannot explain"
-    if not problem.settings.edge_samples:
-        return "Settings(edge_samples=None), the default, lets the fit move silhouettes, shadows and the terrain's border"
-    share = share_of_normals(problem, heights)
-    if share > 1:
-        return (
-            f"pictures of terrain as rough as this differ by {share:.2g} times the noise between normals weighted by area, the "
-            "default, and by angle, as by Mitsuba: for those, Settings(normals='six-angle')"
-        )
-    if (problem.settings.samples or 1) < 16:
-        return "Settings(samples=16) makes pictures of finer samples; if that changes nothing, mask those pixels by weights"
-    return "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo)"
-
-
-def _strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: Any) -> float | None:
-    if problem.prior is None or not seen.any():
-        return None
-    ratio = (heights - np.asarray(problem.basis.crop(problem.prior.heights))) / np.asarray(prior_std, np.float64)
-    return float(np.sqrt(np.mean(ratio[seen] ** 2)))
-
-
-def _light_directions(problem: Problem) -> int:
-    """How many different sets of lights the pictures have."""
-    found = set()
-    for group in problem.groups:
-        for k in range(len(group.indices)):
-            found.add(b"".join(np.asarray(leaf)[k].tobytes() for leaf in jax.tree.leaves(group.scenes.lights)))
-    return len(found)

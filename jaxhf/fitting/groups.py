@@ -1,5 +1,6 @@
 """The pictures of a fit, checked and gathered into those that one program renders."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -41,7 +42,7 @@ class Group(eqx.Module):
         return _with_heights(eqx.combine(scene, self.shared), heights)
 
 
-def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any]) -> None:
+def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None = None) -> None:
     """Checks that there is a scene for each picture, and that all have the same first heightfield but for its heights."""
     if len(scenes) == 0:
         raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
@@ -49,8 +50,20 @@ def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any]) -> None:
         raise ArgumentError(
             "fit", "targets", f"must hold a picture for each of the {len(scenes)} scenes, they are {len(targets)}"
         )
+    if weights is not None and len(weights) != len(scenes):
+        raise ArgumentError("fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(weights)}")
     for k, scene in enumerate(scenes):
         _require_alike(k, scene, scenes[0])
+
+
+def masked_targets(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> tuple[np.ndarray, ...]:
+    """Checks scenes, targets and weights; returns the targets with nan where they have no weight: no statistic counts these."""
+    require_scenes(scenes, targets, weights)
+    found = []
+    for k, (scene, target) in enumerate(zip(scenes, targets, strict=True)):
+        values, weight = _checked_picture(k, scene, target, weights)
+        found.append(np.where(weight > 0, values, np.nan).reshape(np.shape(target)))
+    return tuple(found)
 
 
 def make_groups(
@@ -61,12 +74,9 @@ def make_groups(
     settings: Settings,
 ) -> tuple[Group, ...]:
     """Checks pictures, and gathers those that one program can render with these settings."""
-    weights = options.weights
-    if weights is not None and len(weights) != len(scenes):
-        raise ArgumentError("fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(weights)}")
     found: dict[Any, list[tuple[int, Scene, Any, Any]]] = {}
     for k, scene in enumerate(scenes):
-        target, weight = _picture(k, scene, targets[k], None if weights is None else weights[k])
+        target, weight = _picture(*_checked_picture(k, scene, targets[k], options.weights))
         local = _with_heights(localise(scene), None)
         leaves, structure = jax.tree.flatten(local)
         kind = (
@@ -136,9 +146,13 @@ def _require_alike(k: int, scene: Scene, first: Scene) -> None:
             )
 
 
-def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Target and weight of one picture, shape (h, w, c); what has no weight is zero."""
+def _checked_picture(
+    k: int, scene: Scene, target: Any, weights: Sequence[Any] | None
+) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w c"]]:
+    """Target and weight of one picture."""
     size = (scene.camera.height, scene.camera.width)
+    if isinstance(target, str | os.PathLike):
+        raise ArgumentError("fit", f"targets[{k}]", f"must be an image, it is a name: jaxhf.load_image({os.fspath(target)!r})")
     target = np.asarray(target)
     if target.dtype.kind not in "fV":  # the latter are bfloat16 and its like
         rule = f"must hold linear radiance in floats, 1 being white; it holds {target.dtype} (load_image decodes a picture)"
@@ -149,7 +163,10 @@ def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray
             "fit", f"targets[{k}]", f"must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}"
         )
     target = target.reshape(*size, -1)
-    weight = np.ones(size) if weight is None else np.asarray(weight, np.float64)
+    weight = np.ones(size) if weights is None or weights[k] is None else np.asarray(weights[k])
+    if weight.dtype.kind not in "biufV":
+        raise ArgumentError("fit", f"weights[{k}]", f"must hold numbers, it holds {weight.dtype}")
+    weight = weight.astype(np.float64)
     if weight.shape not in (size, target.shape):
         raise ArgumentError("fit", f"weights[{k}]", f"must have shape {size}, its shape is {weight.shape}")
     if not np.isfinite(weight).all() or weight.min() < 0 or weight.max() == 0:
@@ -157,14 +174,22 @@ def _picture(k: int, scene: Scene, target: Any, weight: Any) -> tuple[np.ndarray
             "fit", f"weights[{k}]", f"must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}"
         )
     weight = np.broadcast_to(weight.reshape(*size, -1), target.shape)
-    if target.shape[-1] == 3 and _is_grey(target, weight):
-        target, weight = target[..., :1], weight[..., :1]
     bad = ~np.isfinite(target) & (weight > 0)
     if bad.any():
         y, x, c = np.argwhere(bad)[0]
-        raise ArgumentError(
-            "fit", f"targets[{k}]", f"must be finite where it has a weight; row {y} column {x} channel {c} is {target[y, x, c]}"
+        rule = (
+            f"must be finite where it has a weight; row {y} column {x} channel {c} is {target[y, x, c]}; a weight of 0 masks it"
         )
+        raise ArgumentError("fit", f"targets[{k}]", rule)
+    return target, weight
+
+
+def _picture(
+    target: Float[np.ndarray, "h w c"], weight: Float[np.ndarray, "h w c"]
+) -> tuple[Float[np.ndarray, "h w k"], Float[np.ndarray, "h w k"]]:
+    """What is measured, and its weight; 0 where it has none. Equal channels are one."""
+    if target.shape[-1] == 3 and _is_grey(target, weight):
+        target, weight = target[..., :1], weight[..., :1]
     return np.where(weight > 0, target, 0), weight
 
 

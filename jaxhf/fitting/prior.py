@@ -39,10 +39,12 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | int | N
     if std is None:
         raise ArgumentError("fit", "prior", "must stand with prior_std, how far it may be off")
     std = np.asarray(std, np.float64)
-    if std.shape not in ((), shape) or not (std > 0).all():
+    if std.shape not in ((), shape):
         raise ArgumentError(
-            "fit", "prior_std", f"must be positive, a number or of shape {shape}; it is {std.min()} to {std.max()}"
+            "fit", "prior_std", f"must be a number or of shape {shape}, as the heights; its shape is {std.shape}"
         )
+    if not (std > 0).all():
+        raise ArgumentError("fit", "prior_std", f"must be positive, it is {std.min()} to {std.max()}")
     padding = prior_padding(field, length)
     if length is not None:
         _require_plausible(field, length)

@@ -29,6 +29,10 @@ def scene(eye=(1.0, -4.0, 3.0), target=(1.0, 1.0, 0.0), heights=HILLS, lights=(S
     [
         ({}, None),
         ({"lights": ()}, "no lights"),
+        (
+            {"lights": (SUN, jaxhf.Directional.from_angles(90, -30))},
+            r"lights\[1\]: it shines from below the horizon, .* is -0.5:",
+        ),
         ({"fov": 0.7}, "camera: fov is 0.7 degrees"),
         ({"fov": 1.0}, None),
         ({"fov": 175.0}, "camera: fov is 175 degrees, more than 170; what it looks at is a dot"),

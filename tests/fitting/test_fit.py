@@ -19,7 +19,7 @@ import scipy.special
 import jaxhf
 from jaxhf.core.affine import rotate
 from jaxhf.core.devices import local_mesh
-from jaxhf.fitting import loop as _loop, normal_equations as _normal_equations
+from jaxhf.fitting import fit as _fit, loop as _loop, normal_equations as _normal_equations
 from jaxhf.fitting.basis import Unknowns, balanced_units, make_basis, resample
 from jaxhf.fitting.loop import FitLoop
 from jaxhf.fitting.options import FitOptions, make_stages
@@ -46,7 +46,7 @@ NONE = np.zeros(0)  # the noise of no pictures
 TRUTH = fractal([12, 12], seed=3, exponent=3.0, range=(0.0, 0.1))
 
 
-def scenes(heights=None, albedo: Any = 0.7, camera: jaxhf.Perspective = CAMERA) -> list[jaxhf.Scene]:
+def scenes(heights=None, albedo: Any = 0.7, camera: jaxhf.Perspective | jaxhf.Orthographic = CAMERA) -> list[jaxhf.Scene]:
     heights = np.full_like(TRUTH, 0.05) if heights is None else heights
     field = jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(albedo))
     return [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]
@@ -402,17 +402,43 @@ BAD = {
         {"camera_std": 3},
     ),
     r"camera_std must be two positive numbers.*it is \(1, 0\)": ({}, {"camera_std": (1, 0)}),
+    r"camera_std must have a position that is off by at most the terrain's longer side, 1; it is 3, or 33 cells": (
+        {},
+        {"camera_std": (3, 1)},
+    ),
+    r"light_std must be an angle of at most 45 degrees, it is 60": ({}, {"light_std": 60}),
+    r"prior must be heights, it is a name: jaxhf.load_heights\('map\.tif'\)\.heights": ({}, {"prior": "map.tif"}),
+    r"prior must be a number or an array of heights, it is a Terrain; its heights are meant": (
+        {},
+        {"prior": jaxhf.jacksboro(), "prior_std": 1.0},
+    ),
+    r"prior_std must be a number or of shape \(12, 12\), as the heights; its shape is \(5, 5\)": (
+        {},
+        {"prior": 0.0, "prior_std": np.ones((5, 5))},
+    ),
+    r"prior_exponent must stand with a prior_length": ({}, {"prior": 0.0, "prior_std": 1.0, "prior_exponent": 3}),
+    r"prior_exponent must be at most 10, it is 99": ({}, {"prior_length": 0.3, "prior_exponent": 99}),
+    r"albedo_smoothness must stand with albedo='map'": ({}, {"albedo_smoothness": 1.0}),
+    r"loss_scale must stand with a robust loss": ({}, {"loss": "squares", "loss_scale": 5}),
+    r"noise must be positive, .* it is an array of shape \(24, 24\)": ({}, {"noise": np.ones((24, 24))}),
+    r"noise must be positive, .* it is 'low'": ({}, {"noise": "low"}),
+    r"weights\[0\] must hold numbers, it holds <U8": ({}, {"weights": ["mask.png"] * 3}),
+    r"targets\[0\] must be an image, it is a name: jaxhf.load_image\('a\.png'\)": ({"measured": ["a.png"] * 3}, {}),
+    r"targets\[0\] must hold linear radiance in floats, .* it holds object": ({"measured": [None] * 3}, {}),
 }
 
 
 @pytest.mark.parametrize("message", BAD)
 def test_bad_input_is_refused(message):
     changes, options = BAD[message]
-    given, measured = scenes(), [np.zeros((SIZE, SIZE)) for _ in LIGHTS]
+    given: Any = scenes()
+    measured: Any = [np.zeros((SIZE, SIZE)) for _ in LIGHTS]
     if "scenes" in changes:
         given = []
     if "targets" in changes:
         measured = measured[:1]
+    if "measured" in changes:
+        measured = changes["measured"]
     if "shape" in changes:
         measured[1] = np.zeros(changes["shape"])
     if "nan" in changes:
@@ -429,6 +455,44 @@ def test_bad_input_is_refused(message):
         given[1] = scenes(np.zeros((5, 5)))[1]
     with pytest.raises(ValueError, match=f"^fit: {message}"):
         jaxhf.fit(given, measured, **options)
+
+
+def test_arguments_of_another_kind_are_refused_where_nothing_checks_annotations():
+    """As in a user's process; here jaxtyping would come first."""
+    wrong = {
+        "settings={}": "settings must be a jaxhf.Settings, it is a dict",
+        "weights=1.0": "weights must be a list, a map or None for each picture, it is a float",
+        "prior_length='3'": "prior_length must be positive and finite, it is '3'",
+        "loss_scale=None": "loss_scale must be positive and finite, it is None",
+        "levels=3": "levels must be shares above 0, the last of them 1; they are 3",
+        "exposures='yes'": "exposures must be True or False, it is a str",
+        "progress='yes'": "progress must be a function, True or False, it is 'yes'",
+        "checkpoint=3": "checkpoint must be the name of a file, it is an int",
+        "mesh=2": "mesh must be a jax.sharding.Mesh, it is an int",
+        "targets=None": "targets must be a list, one for each picture, it is a NoneType",
+    }
+    script = (
+        "import sys, jaxhf\nfor wrong in sys.argv[1:]:\n"
+        "    try:\n        jaxhf.fit(**{'scenes': [], 'targets': []} | eval(f'dict({wrong})'))\n"
+        "    except jaxhf.ArgumentError as error:\n        print(error)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    found = subprocess.run([sys.executable, "-c", script, *wrong], capture_output=True, text=True, env=environment, check=True)
+    assert found.stdout.splitlines() == [f"fit: {message}" for message in wrong.values()]
+
+
+def test_masked_pixels_do_not_count_as_brightness(monkeypatch):
+    """Of which the least noise and the first guess are shares: a saturated corner made noise of 500 from values up to 1e6."""
+    given, weight = pictures(), np.ones((SIZE, SIZE))
+    weight[:9, :9] = 0
+    problems = []
+    monkeypatch.setattr(_fit, "FitLoop", lambda problem, *_: problems.append(problem))
+    for value in (np.nan, 1e6, np.inf):
+        measured = [np.where(weight > 0, picture, value) for picture in given]
+        with pytest.raises(AttributeError):  # there is no loop to run
+            jaxhf.fit(scenes(), measured, weights=[weight] * 3)
+    np.testing.assert_allclose([problem.noise for problem in problems[1:]], [problems[0].noise] * 2)
+    assert problems[0].noise.max() < 0.01
 
 
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "geman"])

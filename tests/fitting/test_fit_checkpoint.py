@@ -173,6 +173,8 @@ def test_a_checkpoint_that_cannot_be_kept_is_refused_first(tmp_path, monkeypatch
     path.write_bytes(b"hours of work")
     with pytest.raises(ValueError, match=r"fit\.checkpoint: this checkpoint is there already; resume=True goes on from it"):
         jaxhf.fit(*problem(), **OPTIONS, checkpoint=path)
+    with pytest.raises(ValueError, match=r"fit\.checkpoint: this is not a checkpoint of jaxhf's"):
+        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True)
     assert path.read_bytes() == b"hours of work"
 
 
@@ -248,6 +250,9 @@ def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():
         fingerprint(loss="huber"),
     ]
     assert len(set(found)) == len(found)
+    # What is chosen at first may be what another fit is given: 1 % of the brightness, 2048 points.
+    assert fingerprint(noise=0.01) != found[0]
+    assert fingerprint(settings=jaxhf.Settings(edge_samples=2048)) != found[0]
     assert fingerprint(max_steps=7, checkpoint_every=3, uncertainty=5) == found[0]  # what does not decide on the steps
 
 

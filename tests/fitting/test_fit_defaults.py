@@ -6,15 +6,16 @@ import inspect
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_fit import OPTIONS, SETTINGS, TRUTH, fit_options, pictures, rms, scenes
+from test_fit import CAMERA, OPTIONS, SETTINGS, TRUTH, fit_options, pictures, rms, scenes
 
 import jaxhf
 from jaxhf.fitting import defaults as _defaults, residuals as _residuals, uncertainty as _uncertainty
 from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
+from jaxhf.fitting.findings import Left, neighbour_correlation, shows_mean, unlike_noise, what_may_help
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.jacobian import in_rows
-from jaxhf.fitting.known import spreads_of
+from jaxhf.fitting.known import Known, pictures_and_influence, spreads_of
 from jaxhf.fitting.linearise import linearise_each
 from jaxhf.fitting.normal_matrix import NormalMatrix
 from jaxhf.fitting.normals import evidence_for_angles, share_of_normals
@@ -39,6 +40,7 @@ def test_noise_that_is_not_given_is_estimated():
     assert found.regions[0].picture == 0
     assert found.regions[0].row == 0
     assert any("chi2 is" in warning and "picture 0 rows 0-3" in warning for warning in found.warnings)
+    assert not any("is no noise" in warning for warning in found.warnings)
 
 
 def test_the_noise_of_rounded_pictures_is_their_root_mean_square():
@@ -207,6 +209,27 @@ def test_samples_can_be_stopped_with_what_is_there(monkeypatch):
         _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
 
 
+def test_a_noise_that_is_given_too_small_is_told_from_what_the_scene_lacks():
+    problem, _ = make_problem(scenes(), pictures(), fit_options(noise=0.01))
+    noise = np.random.default_rng(0).standard_normal((24, 24, 1))
+    given = fit_options(noise=0.01)
+    assert "leave noise out" in what_may_help(problem, jnp.asarray(TRUTH), [left(10 * noise)] * 3, given)
+    noise[:5] = 30.0
+    assert "leave noise out" not in what_may_help(problem, jnp.asarray(TRUTH), [left(noise)] * 3, given)
+    assert "leave noise out" not in what_may_help(problem, jnp.asarray(TRUTH), [left(10 * noise)] * 3, fit_options())
+
+
+def test_normals_that_the_fit_has_tried_are_not_advised():
+    """Where they are left open it has asked its pictures, and found those by area to be better."""
+    steps = jnp.asarray(np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0))
+    for normals, advised in ((None, False), ("six", True)):
+        options = fit_options(
+            settings=dataclasses.replace(SETTINGS, shadows=True, edge_samples=64, normals=normals), noise=0.02
+        )
+        problem, _ = make_problem(scenes(), pictures(), options)
+        assert ("six-angle" in what_may_help(problem, steps, [left(np.zeros((24, 24, 1)))], options)) == advised
+
+
 def test_the_worst_regions_are_named():
     residual = np.full((64, 32, 1), 0.1)
     residual[8:12, 4:8] = 5.0
@@ -228,9 +251,58 @@ def test_it_says_where_residuals_are():
     assert where_residuals_are([residual], [Places(silhouettes, None)]).startswith("18% of their squares lie beside")
 
 
+def left(residual: np.ndarray, **values) -> Left:
+    """What a fit leaves of a picture of 0.5, in units of a noise of 0.05."""
+    image = np.full((24, 24, 1), 0.5)
+    changes = {"image": image, "target": image - 0.05 * residual, "informing": np.ones(image.shape, bool), **values}
+    return Left(residual=residual, noise=0.05, brightness=0.5, **changes)
+
+
+def test_what_is_left_of_pictures_is_noise_or_is_not():
+    """Neighbours of noise have nothing in common, whatever its size and however far off some pixels are."""
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((24, 24, 1))
+    noise[5:9, 5:9] = 500.0
+    smooth = 3 * np.sin(np.linspace(0, 9, 24))[:, None, None] + noise
+    correlation, spread = neighbour_correlation(noise, np.ones(noise.shape, bool))
+    assert abs(correlation) < 0.1
+    np.testing.assert_allclose(spread, 1, rtol=0.1)
+    for multiple in (0.1, 1, 10):
+        assert unlike_noise([left(multiple * noise)], fit_options()) is None
+    said = unlike_noise([left(noise), left(smooth)], fit_options(prior=0.0, prior_std=1.0))
+    assert said is not None
+    assert said.startswith("what is left of picture 1 is no noise: neighbouring pixels are off alike (correlation 0.")
+    assert "prior_std may be too small" in said
+    assert unlike_noise([left(smooth)._replace(noise=1e-3)], fit_options()) is None  # as rounding is
+    assert unlike_noise([left(smooth, informing=np.zeros((24, 24, 1), bool))], fit_options()) is None
+
+
+def test_a_picture_of_another_brightness_is_said_to_be_one():
+    """Such as one of values up to 255, or of an albedo that is off: its noise is estimated to be as large, and chi2 is 1."""
+    image = np.linspace(0.2, 0.5, 576).reshape(24, 24, 1)
+
+    def said(target: np.ndarray, **options) -> str:
+        return str(unlike_noise([left((image - target) / 0.05, image=image, target=target)], fit_options(**options)))
+
+    assert "it is 1.5 times as bright as the scene: exposures=True" in said(1.5 * image)
+    assert "exposures=True" not in said(1.5 * image, exposures=True)
+    assert "it is brighter than the scene by 0.1: offsets=True" in said(image + 0.1)
+    assert "offsets=True" not in said(image + 0.1, offsets=True)
+    assert "light_std, camera_std" in said(1.05 * image)
+    assert "light_std, camera_std" in said(image[::-1])
+
+
+@pytest.mark.parametrize("cause", [{"unlike_noise": "it is 1.5 times as bright"}, {"strayed": 2.5}])
+def test_one_thing_to_try_is_enough(cause):
+    said = warnings(GOOD._replace(chi2=4.3, **cause))
+    assert len(said) == 2
+    assert not any("try this" in warning for warning in said)
+
+
 GOOD = Findings(
-    result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), help="try this", strayed=0.9,
-    seen=np.ones((4, 5), bool), lights=3, scaled=1.0, draws=(20, 20), normals=None,
+    result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, help="try this",
+    strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, lights=3, scaled=1.0, draws=(20, 20),
+    normals=None,
 )  # fmt: skip
 
 
@@ -240,12 +312,16 @@ GOOD = Findings(
         ({"chi2": 4.3}, "differ from the measured ones by 2.1 times the noise"),
         ({"chi2": 4.3}, "came no nearer: try this"),
         ({"chi2": 4.3, "result": jaxhf.Stop.STALLED}, "it stalled: try this"),
+        ({"unlike_noise": "what is left is no noise"}, "what is left is no noise"),
         ({"chi2": 0.25}, "the noise that was given is 2 times what is left"),
         ({"result": jaxhf.Stop.MAX_STEPS}, "stopped by max_steps"),
         ({"strayed": 2.5}, "2.5 times prior_std"),
         ({"seen": np.arange(20).reshape(4, 5) > 4}, "no picture shows 5 of 20 heights (25%): they are what the prior makes"),
+        ({"seen": np.arange(20).reshape(4, 5) > 4, "strayed": None}, "they are a smooth continuation of their neighbours"),
         ({"seen": np.zeros((4, 5), bool), "strayed": None}, "they are the start"),
         ({"strayed": None, "lights": 1}, "same light and there is no prior"),
+        ({"strayed": None, "mean_shown": False}, "not how high all of it stands"),
+        ({"strayed": None, "noise_share": 0.3, "scaled": None}, "the noise is 30% of the pictures' brightness"),
         ({"scaled": 1.8}, "1.8 times the noise"),
         ({"draws": (20, 7)}, "interrupted after 7 of 20"),
         ({"normals": "six-angle"}, "weighted as Settings(normals='six-angle') says"),
@@ -254,6 +330,17 @@ GOOD = Findings(
 def test_warnings_say_what_speaks_against_the_heights(change, said):
     assert warnings(GOOD) == ()
     assert any(said in warning for warning in warnings(GOOD._replace(**change)))
+
+
+def test_an_orthophoto_does_not_show_the_mean_height():
+    """In either precision, at any noise; a picture by a camera at a finite distance does."""
+    above = jaxhf.Orthographic.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), up=(0, 1, 0), extent=0.9, width=24, height=24)
+    for camera, shown in ((above, False), (CAMERA, True)):
+        problem, unknowns = make_problem(scenes(TRUTH, camera=camera), pictures(), fit_options(**OPTIONS))
+        known = linearised(unknowns, problem)
+        _, influence = pictures_and_influence(unknowns, known, 0, Known([], known.linearised))
+        assert shows_mean(influence) == shown
+        assert shows_mean(influence.astype(np.float32)) == shown
 
 
 def test_a_small_chi2_is_no_warning_where_the_noise_was_estimated():

@@ -356,8 +356,8 @@ LOCATED = {
     "max_steps": (WHOLE + "\n[fit]\nmax_steps = 0\n", r":18: fit\.max_steps must be a whole number from 1 on, it is 0"),
     "loss": (WHOLE + '\n[fit]\nloss = "l2"\n', r":18: fit\.loss must be one of squares, huber, cauchy, geman; it is 'l2'"),
     "prior_std": (WHOLE + "\n[fit]\nprior = 0\n", r":18: fit\.prior must stand with prior_std"),
-    "target": (WHOLE.replace("grey", "nan"), r":14: pictures\[0\] must be finite where it has a weight; row 0 column 1"),
-    "weights": (WHOLE + 'mask = "nothing.npy"\n', r":14: pictures\[0\] must be finite, from 0 on, not all 0"),
+    "target": (WHOLE.replace("grey", "nan"), r":15: pictures\[0\]\.image must be finite where .*; row 0 column 1"),
+    "weights": (WHOLE + 'mask = "nothing.npy"\n', r":16: pictures\[0\]\.mask must be finite, from 0 on, not all 0"),
 }
 
 

@@ -45,6 +45,7 @@ _PICTURE: Keys = {
     "camera": Key(table, None),
     "lights": Key(tables, None),
 }
+_ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argument of `fit` is in such a table
 # Those of `fit` and of `Settings`, whose defaults they have and who check their values.
 _FIT: Keys = {
     "noise": Key(number, None),
@@ -93,8 +94,12 @@ class Case:
     def located(self, error: ArgumentError) -> UserError:
         """An error of `fit`'s about its arguments, on the line where they stand; others as they are."""
         name, _, index = error.argument.removesuffix("]").partition("[")
-        if index:  # of a picture: its scene, its target or its weights
-            place = self.part.at("pictures", int(index))
+        if name == "scenes":  # those of a case differ in cameras and lights only
+            place = self.part.at("objects" if "objects" in self.part.table else "scene")
+            return place.error(f"{place.name}: {error.rule}")
+        if index:
+            given = self.part.table["pictures"][int(index)]
+            place = self.part.at("pictures", int(index), next(key for key in _ABOUT[name] if key in given))
         elif name in _FIT:
             place = self.part.at("fit", name)
         else:

@@ -1,0 +1,181 @@
+"""What the last pictures of a fit say about it: gathered here, put into words by `diagnosis`."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..core.types import AnyArray
+from .diagnosis import Places
+from .normals import share_of_normals
+from .options import FitOptions
+from .problem import Problem
+
+_ALIKE = 0.3  # correlation of neighbouring residuals above which they are no noise
+_LIKE_NOISE = 0.2  # below which they may be
+_LEAST_PAIRS = 100  # from which it is taken
+_LEAST_SIZE = 0.01  # of a picture's brightness: smaller residuals are rounding and other trifles
+_FAR = 4.5  # times the median: three standard deviations of normal errors
+_EXPLAINED = 0.5  # share of the squared residuals that a factor or an offset of the picture must explain
+_TRIFLE = 0.1  # a factor or, over the brightness, an offset that is too small to be a cause
+_RELATIVE = 1e-5  # above what single precision leaves of a sum that is 0; oblique pictures have 1e-3 to 0.2
+_WIDER = 1.2  # the spread of residuals over the noise, above which that may be larger
+
+
+class Left(NamedTuple):
+    """What a fit leaves of one picture.
+
+    Attributes:
+      image: as it would be measured, (h, w, c).
+      residual: in standard deviations of the noise; 0 where it does not count.
+      informing: which values depend on the heights.
+      noise, brightness: see `Problem`.
+    """
+
+    image: Float[np.ndarray, "h w c"]
+    target: Float[np.ndarray, "h w c"]
+    residual: Float[np.ndarray, "h w c"]
+    informing: Bool[np.ndarray, "h w c"]
+    noise: float
+    brightness: float
+
+
+def neighbour_correlation(residual: Float[np.ndarray, "h w c"], counts: Bool[np.ndarray, "h w c"]) -> tuple[float, float]:
+    """The correlation of the residuals of pixels side by side, about 0 where they are noise; and their root mean square.
+
+    What is far off is left out: chi2 tells of it, and a robust loss has let it go. (0, 0) where too few count.
+    """
+    spread = float(np.median(np.abs(residual[counts]))) if counts.any() else 0.0
+    counts = counts & (np.abs(residual) <= _FAR * spread)
+    products, squares, pairs = 0.0, 0.0, 0
+    for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        both = counts[a] & counts[b]
+        one, other = residual[a][both].astype(np.float64), residual[b][both].astype(np.float64)
+        products, squares, pairs = products + one @ other, squares + (one @ one + other @ other) / 2, pairs + len(one)
+    if pairs < _LEAST_PAIRS or squares == 0:
+        return 0.0, 0.0
+    return float(products / squares), float(np.sqrt(squares / pairs))
+
+
+def unlike_noise(pictures: Sequence[Left], options: FitOptions) -> str | None:
+    """What is left of pictures although it is no noise, in words; None: nothing.
+
+    An estimate of the noise takes it for noise, and chi2 is about 1.
+    """
+    found = []
+    for number, left in enumerate(pictures):
+        alike, spread = neighbour_correlation(left.residual, left.informing)
+        size = spread * left.noise / left.brightness
+        if alike > _ALIKE and size > _LEAST_SIZE:
+            found.append((size * alike, size, alike, number))
+    if not found:
+        return None
+    _, size, alike, worst = max(found)
+    several = "" if len(found) == 1 else f" and of {len(found) - 1} more"
+    return (
+        f"what is left of picture {worst}{several} is no noise: neighbouring pixels are off alike (correlation {alike:.2f}), "
+        f"by {size:.0%} of its brightness; {_cause(pictures[worst], options)}"
+    )
+
+
+def _cause(left: Left, options: FitOptions) -> str:
+    image, target = (values[left.informing].astype(np.float64) for values in (left.image, left.target))
+    factor, offset = float(image @ target / max(image @ image, 1e-30)), float(np.mean(target - image))
+    most = (1 - _EXPLAINED) * np.sum((target - image) ** 2)
+    scaled, moved = np.sum((target - factor * image) ** 2), np.sum((target - image - offset) ** 2)
+    if not options.offsets and moved < min(most, scaled) and abs(offset) > _TRIFLE * left.brightness:
+        return f"it is brighter than the scene by {offset:.3g}: offsets=True finds what haze or the sensor adds"
+    if not options.exposures and factor > 0 and scaled < most and abs(factor - 1) > _TRIFLE:
+        return (
+            f"it is {factor:.3g} times as bright as the scene: exposures=True finds such factors, if the exposure, the light "
+            "or the albedo is not known"
+        )
+    prior = "prior_std may be too small, or " if options.prior is not None else ""
+    return f"{prior}lights, cameras or the albedo may be off: light_std, camera_std and albedo let the fit find them"
+
+
+def informing_values(problem: Problem) -> list[Bool[np.ndarray, "h w c"]]:
+    """Which values of each picture depend on the heights; all of those with a weight where that is not known."""
+    found = [np.zeros((1, 1, 1), bool)] * problem.count
+    for number, group in enumerate(problem.groups):
+        informing = np.asarray(group.weights) > 0
+        if problem.linearised is not None:
+            informing &= np.asarray(problem.linearised[number].depends)[..., None]
+        for k, values in zip(group.indices, informing, strict=True):
+            found[k] = values
+    return found
+
+
+def boundary_places(problem: Problem) -> list[Places]:
+    """Where boundaries are in each picture."""
+    found = [Places(np.zeros((1, 1), bool), None)] * problem.count
+    for number, group in enumerate(problem.groups):
+        h, w = group.targets.shape[1:3]
+        known = None if problem.linearised is None else problem.linearised[number]
+        for position, k in enumerate(group.indices):
+            if known is None:
+                found[k] = Places(np.zeros((h, w), bool), None)
+            elif known.edges is None:
+                found[k] = Places(~np.asarray(known.depends)[position], None)
+            else:
+                pixel, kind = np.asarray(known.edges.pixel)[position], np.asarray(known.edges.kind)[position]
+                silhouettes, shadows = (np.bincount(pixel[kind == which], minlength=h * w) > 0 for which in (1, 2))
+                found[k] = Places(silhouettes.reshape(h, w), shadows.reshape(h, w))
+    return found
+
+
+def what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"], pictures: Sequence[Left], options: FitOptions) -> str:
+    """The one option to try where pictures are left unexplained."""
+    if options.noise is not None and all(map(_is_wider_noise, pictures)):
+        return "what is left looks like noise that is larger than the given one: leave noise out, and the fit estimates it"
+    if problem.loss == "squares":
+        return "loss='geman' lets pixels go that the scene cannot explain"
+    if not problem.settings.shadows:
+        return "Settings(shadows=True), the default, renders shadows, too"
+    if not problem.settings.edge_samples:
+        return "Settings(edge_samples=None), the default, lets the fit move silhouettes, shadows and the terrain's border"
+    share = share_of_normals(problem, heights) if problem.by_angle is None else 0.0  # else the fit has tried them
+    if share > 1:
+        return (
+            f"pictures of terrain as rough as this differ by {share:.2g} times the noise between normals weighted by area, the "
+            "default, and by angle, as by Mitsuba: for those, Settings(normals='six-angle')"
+        )
+    if (problem.settings.samples or 1) < 16:
+        return (
+            "Settings(samples=16) makes pictures of finer samples; if that changes nothing, camera_std finds a camera that is "
+            "off, or mask those pixels by weights"
+        )
+    return "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo)"
+
+
+def _is_wider_noise(left: Left) -> bool:
+    alike, spread = neighbour_correlation(left.residual, left.informing)
+    return spread > _WIDER and abs(alike) < _LIKE_NOISE
+
+
+def strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: Any) -> float | None:
+    """By how many of its deviations the heights that are seen differ from the prior, root mean square; None: there is none."""
+    if problem.prior is None or not seen.any():
+        return None
+    ratio = (heights - np.asarray(problem.basis.crop(problem.prior.heights))) / np.asarray(prior_std, np.float64)
+    return float(np.sqrt(np.mean(np.broadcast_to(ratio, seen.shape)[seen] ** 2)))
+
+
+def shows_mean(influence: Float[np.ndarray, "ny nx"]) -> bool:
+    """Whether pictures change as all heights move up together; orthophotos do not.
+
+    Args:
+      influence: Jᵀz for a normal z, J the pictures' derivative in the heights: its sum is normal, with the deviation |J 1|.
+    """
+    return abs(float(np.sum(influence, dtype=np.float64))) > _RELATIVE * float(np.linalg.norm(influence))
+
+
+def light_directions(problem: Problem) -> int:
+    """How many different sets of lights the pictures have."""
+    found = set()
+    for group in problem.groups:
+        for k in range(len(group.indices)):
+            found.add(b"".join(np.asarray(leaf)[k].tobytes() for leaf in jax.tree.leaves(group.scenes.lights)))
+    return len(found)
