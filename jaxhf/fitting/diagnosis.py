@@ -108,6 +108,7 @@ class Findings(NamedTuple):
       where: see `where_residuals_are`.
       regions: see `worst_regions`.
       unlike_noise: what is left although it is no noise, in words; None: nothing.
+      channels: which channels are hardly more than one measurement, in words; None: none.
       help: what to try where the pictures are not explained.
       strayed: root mean square of (heights - prior) / prior_std over the heights that are seen; None: no prior.
       seen: which heights the pictures show.
@@ -125,6 +126,7 @@ class Findings(NamedTuple):
     where: str
     regions: Sequence[Region]
     unlike_noise: str | None
+    channels: str | None
     help: str
     strayed: float | None
     seen: Bool[np.ndarray, "ny nx"]
@@ -154,6 +156,8 @@ def warnings(found: Findings) -> tuple[str, ...]:
         )
     if found.unlike_noise is not None:
         said.append(found.unlike_noise)
+    elif found.channels is not None:
+        said.append(found.channels)
     if found.result is Stop.MAX_STEPS:
         said.append("the fit was stopped by max_steps before it had converged: allow it more")
     elif found.result is Stop.NON_FINITE:

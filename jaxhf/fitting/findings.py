@@ -21,6 +21,9 @@ _FAR = 4.5  # times the median: three standard deviations of normal errors
 _EXPLAINED = 0.5  # share of the squared residuals that a factor or an offset of the picture must explain
 _TRIFLE = 0.1  # a factor or, over the brightness, an offset that is too small to be a cause
 _RELATIVE = 1e-5  # above what single precision leaves of a sum that is 0; oblique pictures have 1e-3 to 0.2
+_LIKE_ONE = 0.5  # correlation of the channels' residuals
+_OUTLIER = 4.0  # standard deviations
+_LEAST_CHI2 = 0.5  # below which what is left is mostly the error of few samples, which all channels have
 _WIDER = 1.2  # the spread of residuals over the noise, above which that may be larger
 
 
@@ -78,6 +81,24 @@ def unlike_noise(pictures: Sequence[Left], options: FitOptions) -> str | None:
         f"what is left of picture {worst}{several} is no noise: neighbouring pixels are off alike (correlation {alike:.2f}), "
         f"by {size:.0%} of its brightness; {_cause(pictures[worst], options)}"
     )
+
+
+def dependent_channels(pictures: Sequence[Left]) -> str | None:
+    """Which picture's channels are off alike, such as those of a grey photograph that was tinted; None: no picture's."""
+    for number, left in enumerate(pictures):
+        if left.residual.shape[-1] == 1:
+            continue
+        kept = left.informing.all(axis=-1) & (np.abs(left.residual) < _OUTLIER).all(axis=-1)
+        values = left.residual[kept].astype(np.float64)
+        if len(values) < _LEAST_PAIRS or np.mean(values**2) < _LEAST_CHI2:
+            continue
+        alike = (np.mean(values.sum(axis=-1) ** 2) / np.mean(np.sum(values**2, axis=-1)) - 1) / (values.shape[-1] - 1)
+        if alike > _LIKE_ONE:
+            return (
+                f"the channels of picture {number} are off alike (correlation {alike:.2f}), so they are hardly more than one "
+                "measurement, and standard deviations are too small, up to 1.7 times: give their mean, of shape (h, w)"
+            )
+    return None
 
 
 def _cause(left: Left, options: FitOptions) -> str:

@@ -25,6 +25,7 @@ from .diagnosis import FAR_FROM_ONE, Findings, Region, warnings, where_residuals
 from .findings import (
     Left,
     boundary_places,
+    dependent_channels,
     informing_values,
     light_directions,
     shows_mean,
@@ -303,6 +304,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         regions=regions,
         help=what_may_help(problem, heights, left, options) if chi2 > FAR_FROM_ONE else "",
         unlike_noise=unlike_noise(left, options),
+        channels=dependent_channels(left),
         strayed=strayed(problem, np.asarray(heights), seen, options.prior_std),
         seen=seen,
         mean_shown=shows_mean(influence),

@@ -12,7 +12,7 @@ import jaxhf
 from jaxhf.fitting import defaults as _defaults, residuals as _residuals, uncertainty as _uncertainty
 from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
-from jaxhf.fitting.findings import Left, neighbour_correlation, shows_mean, unlike_noise, what_may_help
+from jaxhf.fitting.findings import Left, dependent_channels, neighbour_correlation, shows_mean, unlike_noise, what_may_help
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.jacobian import in_rows
 from jaxhf.fitting.known import Known, pictures_and_influence, spreads_of
@@ -253,7 +253,7 @@ def test_it_says_where_residuals_are():
 
 def left(residual: np.ndarray, **values) -> Left:
     """What a fit leaves of a picture of 0.5, in units of a noise of 0.05."""
-    image = np.full((24, 24, 1), 0.5)
+    image = np.full(residual.shape, 0.5)
     changes = {"image": image, "target": image - 0.05 * residual, "informing": np.ones(image.shape, bool), **values}
     return Left(residual=residual, noise=0.05, brightness=0.5, **changes)
 
@@ -292,6 +292,15 @@ def test_a_picture_of_another_brightness_is_said_to_be_one():
     assert "light_std, camera_std" in said(image[::-1])
 
 
+def test_channels_that_are_off_alike_are_said_to_be_one_measurement():
+    """Of a grey picture that was tinted or compressed: with a thirtieth of the noise of its own each channel counted fully."""
+    rng = np.random.default_rng(0)
+    grey, own = rng.standard_normal((24, 24, 1)), rng.standard_normal((24, 24, 3))
+    assert "picture 1 are off alike (correlation 1.00)" in str(dependent_channels([left(grey), left(grey + own / 30)]))
+    assert dependent_channels([left(own)]) is None
+    assert dependent_channels([left(0.3 * grey + own / 30)]) is None  # as noise-free pictures are
+
+
 @pytest.mark.parametrize("cause", [{"unlike_noise": "it is 1.5 times as bright"}, {"strayed": 2.5}])
 def test_one_thing_to_try_is_enough(cause):
     said = warnings(GOOD._replace(chi2=4.3, **cause))
@@ -300,9 +309,9 @@ def test_one_thing_to_try_is_enough(cause):
 
 
 GOOD = Findings(
-    result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, help="try this",
-    strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, lights=3, scaled=1.0, draws=(20, 20),
-    normals=None,
+    result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, channels=None,
+    help="try this", strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, lights=3, scaled=1.0,
+    draws=(20, 20), normals=None,
 )  # fmt: skip
 
 
@@ -313,6 +322,7 @@ GOOD = Findings(
         ({"chi2": 4.3}, "came no nearer: try this"),
         ({"chi2": 4.3, "result": jaxhf.Stop.STALLED}, "it stalled: try this"),
         ({"unlike_noise": "what is left is no noise"}, "what is left is no noise"),
+        ({"channels": "they are off alike"}, "they are off alike"),
         ({"chi2": 0.25}, "the noise that was given is 2 times what is left"),
         ({"result": jaxhf.Stop.MAX_STEPS}, "stopped by max_steps"),
         ({"strayed": 2.5}, "2.5 times prior_std"),
