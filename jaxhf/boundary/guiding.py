@@ -131,7 +131,7 @@ class GuidingDistribution(eqx.Module):
     stratum: Index
 
 
-def make_distribution(weights: Float[jax.Array, " edges"], draws: Index) -> GuidingDistribution:
+def make_distribution(weights: Float[jax.Array, " edges"], draws: Index | int) -> GuidingDistribution:
     """The distribution in proportion to `weights`, in as many strata as there are draws; no positive weight becomes zero.
 
     Weights are rounded down to powers of two, so that single and double precision draw the same edges from the same key.

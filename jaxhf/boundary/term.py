@@ -17,9 +17,11 @@ from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from ..core.devices import map_over, on_every_device
+from ..core.kernel import one_kernel, traced_once
 from ..core.materialise import materialise
 from ..core.settings import Settings
 from ..scene.camera import Camera
+from ..trace.search import PART
 from ..trace.world import World
 from .guiding import GuidingDistribution, initial_weights, make_distribution, refined_weights
 from .jump import boundary_segment, pass_edge, radiance_jump
@@ -100,8 +102,8 @@ def draw_boundaries(world: World, camera: Camera, key: jax.Array, mesh: Mesh, re
     """
     settings, edge_samples = world.settings, world.settings.edge_samples or 0
     chunks = math.ceil(edge_samples / (_ROUNDS * settings.chunk))
-    size = math.ceil(edge_samples / (_ROUNDS * chunks))
-    contributions, seen = lax.stop_gradient(_draw_edges(world, camera, key, mesh, chunks, size))
+    draws = math.ceil(edge_samples / (_ROUNDS * chunks))
+    contributions, seen = lax.stop_gradient(_draw_edges(world, camera, key, mesh, chunks, draws))
     pixel, _, sizes, _ = (values.ravel() for values in seen.unpacked())
     all_pixels = camera.width * camera.height
 
@@ -132,22 +134,25 @@ def moved_light(world: World, camera: Camera, drawn: Boundaries, mesh: Mesh) -> 
     return map_over(mesh, chunk, (world, camera), drawn.contributions).reshape(-1, 3)
 
 
-def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks: int, size: int):
-    """In chunks the `contributions` of `Boundaries`, and of each its pixel, its edge, the size of its flow and its speed."""
+def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks: int, draws: int):
+    """In chunks the `contributions` of `Boundaries`, and of each its pixel, its edge, the size of its flow and its speed.
+
+    A chunk's draws are followed by some that are not valid, so that its walks end in parts of equal size.
+    """
     world, camera = lax.stop_gradient((world, camera))
+    size = math.ceil(draws / PART) * PART if draws > PART else draws
+    per_round = chunks * draws
 
     def one(world: World, camera: Camera, guiding: GuidingDistribution, k: jax.Array, u: jax.Array):
         sample = materialise(draw(world, camera, guiding, k, u))
         sample, passage = materialise(pass_edge(world, camera, sample))
         return materialise((sample, passage, boundary_segment(world, camera, sample, passage.fold)))
 
-    def chunk(known: tuple[World, Camera, GuidingDistribution], drawn: tuple[jax.Array, jax.Array]):
-        (world, camera, guiding), (key, first) = known, drawn
-        # In single precision always, so that both precisions take the same points.
-        u = jax.random.uniform(key, (size, 2), jnp.float32).astype(camera.world_from_camera.dtype)
-        samples, passages, segments = jax.vmap(functools.partial(one, world, camera, guiding))(
-            first + jnp.arange(size, dtype=jnp.int32), u
-        )
+    @traced_once  # it is also asked for its shapes
+    def chunk(world: World, camera: Camera, guiding: GuidingDistribution, first: jax.Array, u: jax.Array):
+        k = jnp.arange(size, dtype=jnp.int32)
+        k = jnp.where(k < draws, first + k, (_ROUNDS - 1) * per_round)  # beyond the last stratum nothing is valid
+        samples, passages, segments = jax.vmap(functools.partial(one, world, camera, guiding))(k, u)
 
         def one_side(side: jax.Array) -> jax.Array:
             return jax.vmap(functools.partial(radiance_jump, world, side=side))(samples, passages, segments.valid)
@@ -158,27 +163,38 @@ def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks
         flows = jump[:, :, None] * segments.across[:, None, :]
         samples = eqx.tree_at(lambda samples: samples.valid, samples, (flows != 0).any((1, 2)))
         column, row = (segments.x[:, axis].astype(jnp.int32) for axis in (0, 1))
-        sizes = jnp.sqrt(jnp.sum(flows * flows, axis=(1, 2)))
+        # Written out: XLA hands a sum over several axes to a library, which a kernel cannot call.
+        sizes = jnp.sqrt(sum(flows[:, i, j] ** 2 for i in range(3) for j in range(2)))
         seen = row * camera.width + column, samples.edge, sizes, segments.speed
         return Packed.of((samples, flows)), Packed.of(seen)
 
-    def in_round(weights: jax.Array, number: jax.Array):
-        per_round = chunks * size
-        guiding = make_distribution(weights, jnp.where(number == 0, per_round, (_ROUNDS - 1) * per_round))
-        firsts = jnp.maximum(number - 1, 0) * per_round + jnp.arange(chunks, dtype=jnp.int32) * size
-        keys = jax.random.split(jax.random.fold_in(key, number), chunks)
-        drawn = map_over(mesh, chunk, (world, camera, guiding), (keys, firsts))
+    weights = initial_weights(world, camera)
 
-        def refined(weights: jax.Array) -> jax.Array:
-            _, edge, sizes, speed = drawn[1].unpacked()
+    def in_round(carry: tuple[GuidingDistribution, Any], number: jax.Array):
+        guiding, kept = carry
+        before = jnp.maximum(number - 1, 0) * chunks
+        firsts = (before + jnp.arange(chunks, dtype=jnp.int32)) * draws
+        keys = jax.random.split(jax.random.fold_in(key, number), chunks)
+        # In single precision always, so that both precisions take the same points.
+        u = jax.vmap(lambda key: jax.random.uniform(key, (draws, 2), jnp.float32))(keys)
+        numbers = firsts, jnp.pad(u, ((0, 0), (0, size - draws), (0, 0))).astype(camera.world_from_camera.dtype)
+        drawn = map_over(mesh, lambda known, drawn: one_kernel(chunk, *known, *drawn), (world, camera, guiding), numbers)
+
+        def refined(_: GuidingDistribution) -> GuidingDistribution:
+            _, edge, sizes, speed = (values[:, :draws] for values in drawn[1].unpacked())
             # By how much the pixel changes as the edge is lifted; and, for what moves it otherwise, as if all had one speed.
             total = jnp.sum(sizes)
             mean_speed = jnp.sum(sizes * speed) / jnp.where(total > 0, total, 1)
             mean_speed = jnp.where(mean_speed > 0, mean_speed, 1)  # seen from straight above, lifting moves nothing
             sizes = sizes * (speed + mean_speed)
-            return refined_weights(world, weights, edge.ravel(), sizes.ravel())
+            found = refined_weights(world, weights, edge.ravel(), sizes.ravel())
+            return make_distribution(found, (_ROUNDS - 1) * per_round)
 
-        return lax.cond(number == 0, refined, lambda weights: weights, weights), drawn
+        # Later rounds overwrite the first one, in place: all of them one after the other took a third more memory, and copies.
+        kept = jax.tree.map(lambda all, part: lax.dynamic_update_slice_in_dim(all, part, before, 0), kept, drawn)
+        return (lax.cond(number == 0, refined, lambda guiding: guiding, guiding), kept), None
 
-    _, drawn = lax.scan(in_round, initial_weights(world, camera), jnp.arange(_ROUNDS, dtype=jnp.int32))
-    return jax.tree.map(lambda leaf: leaf[1:].reshape(-1, *leaf.shape[2:]), drawn)
+    guiding, u = make_distribution(weights, per_round), jnp.zeros((size, 2), camera.world_from_camera.dtype)
+    shapes = jax.eval_shape(chunk, world, camera, guiding, jnp.zeros((), jnp.int32), u)
+    kept = jax.tree.map(lambda leaf: jnp.zeros(((_ROUNDS - 1) * chunks, *leaf.shape), leaf.dtype), shapes)
+    return lax.scan(in_round, (guiding, kept), jnp.arange(_ROUNDS, dtype=jnp.int32))[0][1]
