@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from ..core.devices import map_over, on_every_device
-from ..core.kernel import one_kernel
+from ..core.kernel import one_kernel, traced_once
 from ..core.materialise import materialise
 from ..core.settings import Settings
 from ..scene.camera import Camera
@@ -148,7 +148,7 @@ def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks
         sample, passage = materialise(pass_edge(world, camera, sample))
         return materialise((sample, passage, boundary_segment(world, camera, sample, passage.fold)))
 
-    @jax.jit  # traced once, also to ask for the shapes
+    @traced_once  # it is also asked for its shapes
     def chunk(world: World, camera: Camera, guiding: GuidingDistribution, first: jax.Array, u: jax.Array):
         k = jnp.arange(size, dtype=jnp.int32)
         k = jnp.where(k < draws, first + k, (_ROUNDS - 1) * per_round)  # beyond the last stratum nothing is valid

@@ -32,3 +32,8 @@ def one_kernel(fun: Callable[..., Any], *args: Any) -> Any:
 
     called = jax.jit(with_uses)(*lax.optimization_barrier(args))
     return lax.optimization_barrier(set_xla_metadata(called, inlineable="false", xla_cpu_small_call="true"))[0]
+
+
+def traced_once(fun: Callable[..., Any]) -> Callable[..., Any]:
+    """`fun`, which JAX traces once for arguments of one form, however often it is called within a program."""
+    return jax.jit(fun)
