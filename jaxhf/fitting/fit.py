@@ -258,10 +258,11 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         regions, where = worst_regions(in_noise), where_residuals_are(in_noise, _places(problem))
         chi2 = float(np.mean(np.square(counted))) if len(counted) else 0.0
     seen = influence != 0
-    std, scaled, draws = None, None, None
+    std, scaled, draws, displaced = None, None, None, None
     if options.uncertainty is not None and result is not Stop.NON_FINITE:
         borne_out, scaled = with_unexplained(problem, counted)
-        std, drawn = standard_deviations(unknowns, borne_out, options.uncertainty, options.inner_steps, loop.progress)
+        found = standard_deviations(unknowns, borne_out, options.uncertainty, options.inner_steps, loop.progress)
+        std, drawn, displaced = found.std, found.drawn, (found.displacement, found.raised)
         draws = None if drawn is None else (int(options.uncertainty), drawn)
         if problem.prior is None:
             std = np.where(seen, std, np.inf)
@@ -278,6 +279,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         lights=_light_directions(problem),
         normals=problem.settings.normals if options.settings.normals is None else None,
         scaled=scaled,
+        displaced=displaced,
         draws=draws,
     )
     stats = {

@@ -186,11 +186,11 @@ def test_samples_can_be_stopped_with_what_is_there(monkeypatch):
     def draw(*_):
         if len(reports) == stop:
             raise KeyboardInterrupt
-        return np.full((12, 12), 2.0)
+        return np.full((12, 12), 2.0), np.zeros(0)
 
     monkeypatch.setattr(NormalMatrix, "draw", draw)
     stop = 3
-    std, drawn = _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
+    std, drawn, *_ = _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
     assert drawn == 3
     np.testing.assert_array_equal(std, 2.0)
     assert [(report.drawn, report.wanted) for report in reports] == [(1, 20), (2, 20), (3, 20)]
@@ -223,7 +223,7 @@ def test_it_says_where_residuals_are():
 
 GOOD = Findings(
     result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), help="try this", strayed=0.9,
-    seen=np.ones((4, 5), bool), lights=3, scaled=1.0, draws=(20, 20), normals=None,
+    seen=np.ones((4, 5), bool), lights=3, scaled=1.0, displaced=(0.5, 1.01), draws=(20, 20), normals=None,
 )  # fmt: skip
 
 
@@ -240,6 +240,7 @@ GOOD = Findings(
         ({"seen": np.zeros((4, 5), bool), "strayed": None}, "they are the start"),
         ({"strayed": None, "lights": 1}, "same light and there is no prior"),
         ({"scaled": 1.8}, "1.8 times the noise"),
+        ({"displaced": (0.5, 1.2)}, "were off by 0.5, and are 1.2 times as large for it"),
         ({"draws": (20, 7)}, "interrupted after 7 of 20"),
         ({"normals": "six-angle"}, "weighted as Settings(normals='six-angle') says"),
     ],
