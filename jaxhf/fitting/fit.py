@@ -167,7 +167,8 @@ def fit(
         the noise leaves them with; else 1e-4.
       uncertainty: None; the number of samples from which standard deviations are estimated, each to 1 / √(2 · samples); or
         "exact", where pictures times unknowns are few. Ctrl-C while samples are drawn ends with those that there are, from
-        two on. Where pictures are not explained to their noise, deviations are those of the noise that is borne out.
+        two on. Where pictures are not explained to their noise, or boundaries stand elsewhere in them, deviations are those
+        that residuals bear out.
       progress: called after each step with a `Step`, and after each sample of the deviations with a `Draws`, which says what
         is left to do; True prints lines to standard error.
       checkpoint: a file in which the state is kept every `checkpoint_every` steps, after the last one and on Ctrl-C;

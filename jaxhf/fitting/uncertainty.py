@@ -80,7 +80,7 @@ def standard_deviations(
       report: called after each sample.
 
     Raises:
-      KeyboardInterrupt: Ctrl-C before there were two samples.
+      KeyboardInterrupt: Ctrl-C before there were two samples, or one of displaced boundaries.
     """
     unknowns, problem = on_every_device((unknowns, linearised(unknowns, problem)), problem.mesh)
     matrix = NormalMatrix(unknowns, problem) if is_sparse(problem) else None
@@ -147,16 +147,20 @@ class _Boundaries:
         if self._size(residuals, 0.0) <= self._mean_size(self.left, 0.0):
             return 0.0, 0.0
         heights, moved = [], []
-        for seed in range(len(self.left)):
-            noise = np.zeros(self.matrix.roots.size)
-            noise[self.rows] = self.reach * np.random.default_rng((seed, 1)).standard_normal(self.rows.size)
-            change, left = self.matrix.response(noise)
-            heights.append(change)
-            moved.append(left[self.rows])
+        try:
+            for seed in range(len(self.left)):
+                noise = np.zeros(self.matrix.roots.size)
+                noise[self.rows] = self.reach * np.random.default_rng((seed, 1)).standard_normal(self.rows.size)
+                change, left = self.matrix.response(noise)
+                moved.append(left[self.rows])
+                heights.append(change)
+        except KeyboardInterrupt:
+            if not heights:
+                raise
 
         def excess(log: float) -> float:
             tau = math.exp(log)
-            both = [one + tau * other for one, other in zip(self.left, moved, strict=True)]
+            both = [one + tau * other for one, other in zip(self.left, moved, strict=False)]
             return float(np.log(self._size(residuals, tau) / self._mean_size(both, tau)))
 
         # From where it makes a hundredth of the noise of the pixel that changes most to where it is all noise in each.
