@@ -218,6 +218,12 @@ MUTATIONS = {
         "np.random.default_rng(0 * seed)",
         "fitting/test_normal_matrix.py::test_draws_have_its_inverse_as_their_covariance",
     ),
+    "boundaries that stand elsewhere": Mutation(
+        "fitting/uncertainty.py",
+        "[one + tau * other for",
+        "[one for",
+        "fitting/test_normal_matrix.py::test_boundaries_that_stand_elsewhere_widen_deviations[2.0-0.37]",
+    ),
     "priors of draws": Mutation(
         "fitting/normal_matrix.py",
         "right[: moved.size] += moved.ravel()",

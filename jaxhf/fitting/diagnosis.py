@@ -116,6 +116,7 @@ class Findings(NamedTuple):
       noise_share: the least noise of a picture over its brightness.
       lights: how many directions light comes from, over all pictures.
       scaled: by what the noise was multiplied for the standard deviations; None: there are none.
+      displaced: by how much boundaries may be, height units, and what that multiplies the deviations by; None: as `scaled`.
       draws: asked for, made; None: none were asked for.
       normals: the scheme that the fit chose in place of the default one; None: none.
     """
@@ -134,6 +135,7 @@ class Findings(NamedTuple):
     noise_share: float
     lights: int
     scaled: float | None
+    displaced: tuple[float, float] | None
     draws: tuple[int, int] | None
     normals: str | None
 
@@ -194,6 +196,12 @@ def warnings(found: Findings) -> tuple[str, ...]:
         said.append(
             f"the standard deviations allow for what is left unexplained: they are those of {found.scaled:.2g} times the noise "
             "(M-estimator's covariance, Huber, Robust statistics, 1981, section 7.6; see docs/concepts/recovery.md)"
+        )
+    if found.displaced is not None and found.displaced[1] > 1.05:
+        said.append(
+            f"the standard deviations allow for shadows and silhouettes that stand elsewhere in the measured pictures, as if "
+            f"heights that make them were off by {found.displaced[0]:.2g}, and are {found.displaced[1]:.2g} times as large for "
+            "it (variance component, Richardson and Welsh, Biometrics 51, 1429, 1995; see docs/concepts/recovery.md)"
         )
     if found.normals is not None:
         said.append(

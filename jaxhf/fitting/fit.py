@@ -180,7 +180,8 @@ def fit(
         the noise leaves them with; else 1e-4.
       uncertainty: None; the number of samples from which standard deviations are estimated, each to 1 / √(2 · samples); or
         "exact", where pictures times unknowns are few. Ctrl-C while samples are drawn ends with those that there are, from
-        two on. Where pictures are not explained to their noise, deviations are those of the noise that is borne out.
+        two on. Where pictures are not explained to their noise, or boundaries stand elsewhere in them, deviations are those
+        that residuals bear out.
       progress: called after each step with a `Step`, and after each sample of the deviations with a `Draws`, which says what
         is left to do; True prints lines to standard error.
       checkpoint: a file in which the state is kept every `checkpoint_every` steps, after the last one and on Ctrl-C;
@@ -288,10 +289,11 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         regions, where = worst_regions(in_noise), where_residuals_are(in_noise, boundary_places(problem))
         chi2 = float(np.mean(np.square(counted))) if len(counted) else 0.0
     seen = influence != 0
-    std, scaled, draws = None, None, None
+    std, scaled, draws, displaced = None, None, None, None
     if options.uncertainty is not None and result is not Stop.NON_FINITE:
         borne_out, scaled = with_unexplained(problem, counted)
-        std, drawn = standard_deviations(unknowns, borne_out, options.uncertainty, options.inner_steps, loop.progress)
+        found = standard_deviations(unknowns, borne_out, options.uncertainty, options.inner_steps, loop.progress)
+        std, drawn, displaced = found.std, found.drawn, (found.displacement, found.raised)
         draws = None if drawn is None else (int(options.uncertainty), drawn)
         if problem.prior is None:
             std = np.where(seen, std, np.inf)
@@ -312,6 +314,7 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         lights=light_directions(problem),
         normals=problem.found_settings.normals if options.settings.normals is None else None,
         scaled=scaled,
+        displaced=displaced,
         draws=draws,
     )
     stats = {

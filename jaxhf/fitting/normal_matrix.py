@@ -15,7 +15,7 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from .basis import Basis, Unknowns
-from .jacobian import Sparse, images_jacobian, other_unknowns, picture_values, sp
+from .jacobian import Sparse, images_jacobian, in_rows, other_unknowns, picture_values, sp
 from .problem import Problem
 from .quadratic import Quadratic, laplacian_matrix
 
@@ -37,6 +37,10 @@ class NormalMatrix:
     Args:
       unknowns: whose albedo is known.
       problem: `linearised` there.
+
+    Attributes:
+      residuals: of the pictures, in units of the noise, in the order of `in_rows`.
+      roots: of their robust weights.
     """
 
     def __init__(self, unknowns: Unknowns, problem: Problem):
@@ -44,6 +48,9 @@ class NormalMatrix:
         self.basis, self.shape = basis, basis.base.shape
         images, values = images_jacobian(unknowns, problem), picture_values(unknowns, problem)
         self.model = Quadratic(unknowns, problem, images, values, reweighted=True)
+        pairs = zip(problem.groups, values.images, strict=True)
+        self.residuals = in_rows([group.weights * (image - group.targets) for group, image in pairs])
+        self.roots = in_rows(values.roots)
         known = _other_precision(unknowns, problem)
         self.model.precision[basis.base.size :] = known
         self.model.priors.insert(0, (np.ones(self.shape), 1 / np.asarray(basis.scale * basis.prior_amplitude, np.float64)))
@@ -55,24 +62,43 @@ class NormalMatrix:
             near.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
 
-    def draw(self, seed: int) -> Float[np.ndarray, "ny nx"]:
-        """A draw from N(0, H⁻¹): x = H⁻¹ Jᵀz, z normal, whose heights come without their padding.
+    def draw(self, seed: int) -> tuple[Float[np.ndarray, "ny nx"], Float[np.ndarray, " rows"]]:
+        """A draw from N(0, H⁻¹): x = H⁻¹ Jᵀz, z normal (Papandreou and Yuille, Gaussian sampling by local perturbations, NIPS
+        2010, section 3).
 
-        (Papandreou and Yuille, Gaussian sampling by local perturbations, NIPS 2010, section 3.)
+        Returns:
+          Its heights without their padding, and the residuals that it leaves of noise z in the pictures, as a fit would.
         """
         rng = np.random.default_rng(seed)
-        right = self.model.jacobian.T @ rng.standard_normal(self.model.jacobian.shape[0])
+        noise = rng.standard_normal(self.model.jacobian.shape[0])
+        right = self.model.jacobian.T @ noise
         right += np.sqrt(self.model.precision) * rng.standard_normal(right.size)
         for weight, stiffness in self.model.priors:
             moved = weight * fft.idctn(stiffness * rng.standard_normal(self.shape), norm="ortho")
             right[: moved.size] += moved.ravel()
-        return self.basis.crop(self._solved(right)[: math.prod(self.shape)].reshape(self.shape))
+        x = self._solved(right)
+        return self._heights(x), (noise - self.model.jacobian @ x)[: self.roots.size]
+
+    def response(self, noise: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, "ny nx"], Float[np.ndarray, " rows"]]:
+        """What this error of the pictures, in units of their noise, makes of the heights, and of the residuals."""
+        images = self.model.jacobian[: self.roots.size]
+        x = self._solved(images.T @ (self.roots * noise))
+        return self._heights(x), noise - (images @ x) / self.roots
+
+    def reach(self) -> Float[np.ndarray, " rows"]:
+        """By how much each value of the pictures changes, in units of its noise, as the heights that it depends on move by
+        independent errors of deviation 1."""
+        images = self.model.jacobian[: self.roots.size, : math.prod(self.shape)]
+        return np.sqrt(images.power(2).sum(axis=1)) / self.roots
 
     def variance(self) -> Float[np.ndarray, "ny nx"]:
         """The diagonal of H⁻¹ by a dense inverse: the variances of the heights without their padding."""
         dense = np.stack([self.model.product(row) for row in np.eye(self.model.precision.size)])
         inverse = scipy.linalg.cho_solve(scipy.linalg.cho_factor(dense), np.eye(len(dense)))
         return self.basis.crop(np.diag(inverse)[: math.prod(self.shape)].reshape(self.shape))
+
+    def _heights(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, "ny nx"]:
+        return self.basis.crop(x[: math.prod(self.shape)].reshape(self.shape))
 
     def _solved(self, right: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         n = right.size

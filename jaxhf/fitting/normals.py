@@ -15,6 +15,8 @@ from ..trace.normals import vertex_normals
 from .jacobian import group_by_vertices, in_rows
 from .problem import Problem
 
+_BLOCK = 8  # pixels
+
 
 def share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> float:
     """By about how much pictures change, in units of the noise, as normals are weighted by angle, not by area: the horizontal
@@ -27,10 +29,10 @@ def share_of_normals(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> flo
 
 
 def evidence_for_angles(problem: Problem, heights: Float[AnyArray, "ny nx"], left: Float[np.ndarray, " rows"]) -> float:
-    """What the pictures say for normals weighted by angle in place of area: about N(0, 1) where these change nothing.
+    """What the pictures say for normals weighted by angle in place of area: about N(0, 1) where these explain nothing.
 
-    It is the product of what is left of the pictures with their change by such normals, to first order, over the norm of that
-    change, all in units of the noise. Heights that were fitted make up for a part of it, never for more than all.
+    It is the product of what is left of the pictures with their change by such normals, to first order, over its standard
+    deviation. Heights that were fitted make up for a part of it, never for more than all.
 
     Args:
       problem: `linearised`, with smooth shading.
@@ -50,8 +52,25 @@ def evidence_for_angles(problem: Problem, heights: Float[AnyArray, "ny nx"], lef
         change = np.concatenate(parts)
         changes += [rows @ change for rows in group_by_vertices(problem, number, heights, change.size)]
     change = in_rows([group.weights for group in problem.groups]) * np.concatenate(changes)
-    square = change @ change
-    return float(-(change @ left) / math.sqrt(square)) if square else 0.0
+    return deviations_above_zero(-change * left, problem)
+
+
+def deviations_above_zero(values: Float[np.ndarray, " rows"], problem: Problem) -> float:
+    """The sum of values, one for each of the pictures', over its standard deviation by the sums over blocks of 8 x 8 pixels.
+
+    So values may hang together nearby, as what is left does where light, prior or scale are off (clustered standard errors:
+    Liang and Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 1986).
+    """
+    sums, first = [], 0
+    for group in problem.groups:
+        n, h, w, c = group.targets.shape
+        here = values[first : first + n * h * w * c].reshape(n * c, h, w)
+        first += here.size
+        rows = np.add.reduceat(here, np.arange(0, h, _BLOCK), axis=1)
+        sums.append(np.add.reduceat(rows, np.arange(0, w, _BLOCK), axis=2).ravel())
+    blocks = np.concatenate(sums)
+    size = math.sqrt(blocks @ blocks)
+    return float(np.sum(blocks) / size) if size else 0.0
 
 
 def _turned(problem: Problem, heights: Float[AnyArray, "ny nx"]) -> tuple[np.ndarray, np.ndarray]:

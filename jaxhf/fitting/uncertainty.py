@@ -1,9 +1,10 @@
 """How sure a fit is of its heights: standard deviations from the normal matrix, by samples or by a dense inverse."""
 
 import dataclasses
+import math
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,13 +12,15 @@ import jax.flatten_util
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+import scipy.optimize
 from jax import lax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ..core.devices import on_every_device
 from ..core.errors import ArgumentError
 from .basis import Unknowns
 from .history import Draws
+from .jacobian import in_rows
 from .linearise import can_be_linearised
 from .normal_matrix import NormalMatrix
 from .problem import Problem
@@ -28,10 +31,27 @@ from .solvers import count_unknowns
 from .view import KNOWN
 
 _INNER_TOLERANCE = 1e-6
+_SIMULATED = 20  # draws by which a displacement of boundaries is estimated, at most
 EXACT_UNKNOWNS = 4096
 """Up to so many unknowns the normal matrix is inverted where "exact" is asked for: 128 MiB, some 10 s."""
 EXACT_ENTRIES = 2**24
 """The same of residuals times unknowns, where J is not sparse and is formed first."""
+
+
+class Deviations(NamedTuple):
+    """See `standard_deviations`.
+
+    Attributes:
+      std: shape (ny, nx), height units.
+      drawn: how many samples were drawn: fewer than asked for after Ctrl-C, None for "exact".
+      displacement: τ of `_Boundaries`, height units; 0 where residuals are as small as the noise says.
+      raised: by which factor, root mean square, that made the deviations larger.
+    """
+
+    std: Float[np.ndarray, "ny nx"]
+    drawn: int | None
+    displacement: float = 0.0
+    raised: float = 1.0
 
 
 def standard_deviations(
@@ -40,14 +60,14 @@ def standard_deviations(
     samples: int | str,
     inner_steps: int,
     report: Callable[[Draws], None] | None = None,
-) -> tuple[Float[np.ndarray, "ny nx"], int | None]:
-    """The standard deviation of each height, given what the pictures and the prior say; shape (ny, nx), height units.
+) -> Deviations:
+    """The standard deviation of each height, given what the pictures and the prior say.
 
     The normal matrix is H = JᵀJ, J all residuals' derivative in the unknowns, weighted as the robust loss weighs
     them; its inverse is the covariance (Laplace's approximation). Albedo, exposures, offsets, lights and cameras vary
     along, so their doubt counts too. Besides, each DCT coefficient has the prior N(0, `Basis.prior_amplitude`²), and the
     albedo, each exposure and each offset N(0, 1): a direction on which no picture depends, such as the mean of all heights,
-    then gets a large deviation, not an infinite one.
+    then gets a large deviation, not an infinite one. Where pictures bear it out, boundaries are displaced, see `_Boundaries`.
 
     Args:
       unknowns: at which the fit ended; all modes are varied.
@@ -59,22 +79,26 @@ def standard_deviations(
         `NormalMatrix`.
       report: called after each sample.
 
-    Returns:
-      The deviations; and how many samples were drawn: fewer than asked for after Ctrl-C, None for "exact".
-
     Raises:
-      KeyboardInterrupt: Ctrl-C before there were two samples.
+      KeyboardInterrupt: Ctrl-C before there were two samples, or one of displaced boundaries.
     """
     unknowns, problem = on_every_device((unknowns, linearised(unknowns, problem)), problem.mesh)
     matrix = NormalMatrix(unknowns, problem) if is_sparse(problem) else None
+    scale = np.inf if problem.loss_scale is None else float(problem.loss_scale)
+    boundaries = None if matrix is None else _Boundaries(matrix, _on_boundaries(problem), scale)
+    total, drawn, count = np.zeros(problem.basis.crop(np.asarray(problem.basis.base)).shape), 0, 0
     if samples == "exact":
-        variance = _exact_variance(unknowns, problem) if matrix is None else matrix.variance()
-        return np.sqrt(np.asarray(variance)), None
-    total, drawn, count = np.zeros(problem.basis.crop(np.asarray(problem.basis.base)).shape), 0, int(samples)
+        total = np.asarray(_exact_variance(unknowns, problem) if matrix is None else matrix.variance())
+    else:
+        count = int(samples)
     begin = time.perf_counter()
     try:
         while drawn < count:
-            draw = _draw_by_lsmr(unknowns, problem, drawn, 5 * inner_steps) if matrix is None else matrix.draw(drawn)
+            if matrix is None or boundaries is None:
+                draw = _draw_by_lsmr(unknowns, problem, drawn, 5 * inner_steps)
+            else:
+                draw, left = matrix.draw(drawn)
+                boundaries.keep(left)
             total, drawn = total + draw * draw, drawn + 1
             if report is not None:
                 seconds = time.perf_counter() - begin
@@ -82,7 +106,87 @@ def standard_deviations(
     except KeyboardInterrupt:
         if drawn < 2:
             raise
-    return np.sqrt(total / drawn), drawn
+    variance, displacement, more = total / max(drawn, 1), 0.0, 0.0
+    if boundaries is not None:
+        displacement, more = boundaries.variance()
+    raised = float(np.sqrt(np.mean(variance + more) / np.mean(variance)))
+    return Deviations(np.sqrt(variance + more), None if samples == "exact" else drawn, displacement, raised)
+
+
+class _Boundaries:
+    """How far boundaries are off in the pictures: shadows and silhouettes, as if the heights that make them were displaced.
+
+    Pixels that a boundary crosses tell heights to a hundredth of a pixel, if both pictures have it in the same place. Other
+    renderers begin shadow rays beside the surface, the sun is a disk, ground is no triangles; and heights that a few such
+    pixels decide on explain them, right or wrong. So the noise of such a pixel has the variance 1 + τ² D, with D its squared
+    derivative in heights, in units of the noise, and τ a deviation in height units that all pictures share. τ is that for
+    which Σ D / s² min(r / s, k)², s² = 1 + τ² D, is for the residuals r what it is on average for those that a fit would leave
+    of such noise (simulated, so that those are small which heights explain); k is the scale of the robust loss. That is the
+    equation of restricted maximum likelihood for a variance component, made robust by Huber's proposal 2 (Richardson and
+    Welsh, Biometrics 51, 1429, 1995). Heights were fitted without τ, so their covariance is H⁻¹ Jᵀ diag(s²) J H⁻¹.
+    """
+
+    def __init__(self, matrix: NormalMatrix, rows: Bool[np.ndarray, " rows"], loss_scale: float):
+        self.matrix, reach = matrix, matrix.reach()
+        self.rows = np.flatnonzero(rows & (reach > 0))
+        self.reach = reach[self.rows]
+        self.most = loss_scale**2
+        self.left: list[np.ndarray] = []  # of simulated noise, on these rows
+
+    def keep(self, left: Float[np.ndarray, " rows"]) -> None:
+        if len(self.left) < _SIMULATED:
+            self.left.append(left[self.rows])
+
+    def variance(self) -> tuple[float, Float[np.ndarray, "ny nx"] | float]:
+        """τ, and what it adds to the variance of each height."""
+        if self.rows.size == 0:
+            return 0.0, 0.0
+        for seed in range(0 if self.left else _SIMULATED):  # for "exact"
+            self.keep(self.matrix.draw(seed)[1])
+        residuals = self.matrix.residuals[self.rows]
+        if self._size(residuals, 0.0) <= self._mean_size(self.left, 0.0):
+            return 0.0, 0.0
+        heights, moved = [], []
+        try:
+            for seed in range(len(self.left)):
+                noise = np.zeros(self.matrix.roots.size)
+                noise[self.rows] = self.reach * np.random.default_rng((seed, 1)).standard_normal(self.rows.size)
+                change, left = self.matrix.response(noise)
+                moved.append(left[self.rows])
+                heights.append(change)
+        except KeyboardInterrupt:
+            if not heights:
+                raise
+
+        def excess(log: float) -> float:
+            tau = math.exp(log)
+            both = [one + tau * other for one, other in zip(self.left, moved, strict=False)]
+            return float(np.log(self._size(residuals, tau) / self._mean_size(both, tau)))
+
+        # From where it makes a hundredth of the noise of the pixel that changes most to where it is all noise in each.
+        low, high = np.log(0.01 / self.reach.max()), np.log(100 / self.reach.min())
+        found: Any = scipy.optimize.brentq(excess, low, high, xtol=0.01) if excess(low) > 0 > excess(high) else low
+        tau = math.exp(found)
+        return tau, tau**2 * np.mean(np.square(heights), axis=0)
+
+    def _size(self, residuals: Float[np.ndarray, " n"], tau: float) -> float:
+        variance = 1 + (tau * self.reach) ** 2
+        return float(np.sum(self.reach**2 / variance * np.minimum(residuals**2 / variance, self.most)))
+
+    def _mean_size(self, drawn: Sequence[Float[np.ndarray, " n"]], tau: float) -> float:
+        return float(np.mean([self._size(residuals, tau) for residuals in drawn]))
+
+
+def _on_boundaries(problem: Problem) -> Bool[np.ndarray, " rows"]:
+    """Which values of the pictures, in the order of `in_rows`, are of pixels that a boundary crosses."""
+    masks = []
+    for group, known in zip(problem.groups, problem.linearised or (), strict=True):
+        mask = np.zeros(group.targets.shape, bool)
+        if known.edges is not None:
+            for picture, pixels in zip(mask, np.asarray(known.edges.resampled), strict=True):
+                picture.reshape(-1, picture.shape[-1])[pixels] = True
+        masks.append(mask)
+    return in_rows(masks) > 0
 
 
 def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tuple[Problem, float]:

@@ -18,7 +18,7 @@ from jaxhf.fitting.jacobian import in_rows
 from jaxhf.fitting.known import Known, pictures_and_influence, spreads_of
 from jaxhf.fitting.linearise import linearise_each
 from jaxhf.fitting.normal_matrix import NormalMatrix
-from jaxhf.fitting.normals import evidence_for_angles, share_of_normals
+from jaxhf.fitting.normals import deviations_above_zero, evidence_for_angles, share_of_normals
 from jaxhf.fitting.problem import make_problem
 from jaxhf.fitting.residuals import linearised, picture_residuals
 from jaxhf.fitting.robust import influence_function, soften
@@ -103,8 +103,18 @@ def test_evidence_for_other_normals_is_in_the_pictures():
         known = linearised(unknowns, problem)
         left = in_rows(picture_residuals(unknowns, known))
         found[scheme] = evidence_for_angles(known, jnp.asarray(rough), left)
-    assert found["six"] < 3
-    assert found["six-angle"] > 20
+    assert found["six"] < 3 < found["six-angle"]
+
+
+def test_what_is_alike_nearby_is_one_piece_of_evidence():
+    """Where the noise is one number a block, deviations are those of as few numbers."""
+    problem, _ = make_problem(scenes(), pictures(), fit_options())
+    rng, found = np.random.default_rng(5), []
+    for _ in range(200):
+        shapes = [group.targets.shape for group in problem.groups]
+        alike = [np.repeat(np.repeat(rng.standard_normal((n, h // 8, w // 8, c)), 8, 1), 8, 2) for n, h, w, c in shapes]
+        found.append(deviations_above_zero(in_rows(alike), problem))
+    np.testing.assert_allclose(np.std(found), 1, rtol=0.15)
 
 
 def test_a_grey_picture_with_three_channels_is_one_measurement():
@@ -195,11 +205,11 @@ def test_samples_can_be_stopped_with_what_is_there(monkeypatch):
     def draw(*_):
         if len(reports) == stop:
             raise KeyboardInterrupt
-        return np.full((12, 12), 2.0)
+        return np.full((12, 12), 2.0), np.zeros(0)
 
     monkeypatch.setattr(NormalMatrix, "draw", draw)
     stop = 3
-    std, drawn = _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
+    std, drawn, *_ = _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
     assert drawn == 3
     np.testing.assert_array_equal(std, 2.0)
     assert [(report.drawn, report.wanted) for report in reports] == [(1, 20), (2, 20), (3, 20)]
@@ -311,7 +321,7 @@ def test_one_thing_to_try_is_enough(cause):
 GOOD = Findings(
     result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, channels=None,
     help="try this", strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, lights=3, scaled=1.0,
-    draws=(20, 20), normals=None,
+    displaced=(0.5, 1.01), draws=(20, 20), normals=None,
 )  # fmt: skip
 
 
@@ -333,6 +343,7 @@ GOOD = Findings(
         ({"strayed": None, "mean_shown": False}, "not how high all of it stands"),
         ({"strayed": None, "noise_share": 0.3, "scaled": None}, "the noise is 30% of the pictures' brightness"),
         ({"scaled": 1.8}, "1.8 times the noise"),
+        ({"displaced": (0.5, 1.2)}, "were off by 0.5, and are 1.2 times as large for it"),
         ({"draws": (20, 7)}, "interrupted after 7 of 20"),
         ({"normals": "six-angle"}, "weighted as Settings(normals='six-angle') says"),
     ],
