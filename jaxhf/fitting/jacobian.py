@@ -6,7 +6,10 @@ heights and normals at vertices, times that of these in the heights.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -37,6 +40,7 @@ sp: Any = scipy.sparse  # whose stubs miss much
 Sparse = Any
 """A `scipy.sparse.csr_array`."""
 
+_THREADS = min(4, os.cpu_count() or 1)  # each holds the rows of a picture's samples, of 100 bytes and more
 _REACH = 3  # A vertex's normal depends on heights one row and one column off: of each 3 x 3 heights on one.
 
 
@@ -57,21 +61,26 @@ def images_jacobian(unknowns: Unknowns, problem: Problem) -> Sparse:
     slopes, blocks = _slopes(*on_every_device((heights, unknowns, decided), problem.mesh)), []
     for number, (group, here) in enumerate(zip(problem.groups, slopes, strict=True)):
         of_heights = vertices_by_heights(np.asarray(here, np.float64), group.complete(group.scenes, heights))
-        blocks += [rows @ of_heights for rows in group_by_vertices(problem, number, heights, of_heights.shape[0])]
+        blocks += group_by_vertices(problem, number, heights, of_heights)
     return sp.vstack(blocks, format="csr")
 
 
-def group_by_vertices(problem: Problem, number: int, heights: Float[Array, "ny nx"], columns: int) -> Iterator[Sparse]:
+def group_by_vertices(problem: Problem, number: int, heights: Float[Array, "ny nx"], right: Sparse) -> list[Any]:
     """The derivatives of the pictures of one group, which are `linearised` at these heights, in what stands at the vertices:
-    `picture_by_vertices` in the order of `in_rows`."""
+    `picture_by_vertices` times a matrix or vector, in the order of `in_rows`."""
     assert problem.linearised is not None
     group, known = problem.groups[number], problem.linearised[number]
     camera = group.complete(group.scenes, heights).camera
-    for k in range(len(group.indices)):
-        one = jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], known)
+
+    def product(which: tuple[int, int]) -> Any:
+        k, channel = which
+        one = jax.tree.map(lambda leaf: np.asarray(leaf)[k], known)
         samples = PictureSamples(camera, problem.settings, None if one.edges is None else one.edges.resampled)
-        for channel in range(group.targets.shape[-1]):
-            yield picture_by_vertices(one, samples, channel, columns)
+        return picture_by_vertices(one, samples, channel, right.shape[0]) @ right
+
+    # NumPy and SciPy let other threads run as they look up and multiply.
+    with ThreadPoolExecutor(_THREADS) as threads:
+        return list(threads.map(product, itertools.product(range(len(group.indices)), range(group.targets.shape[-1]))))
 
 
 def in_rows(pictures: Sequence[Any]) -> Float[np.ndarray, " rows"]:

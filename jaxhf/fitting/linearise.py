@@ -23,6 +23,7 @@ from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
 from ..boundary.term import Packed, default_key, draw_boundaries
 from ..core.autodiff import with_tangent
 from ..core.devices import map_over, on_every_device
+from ..core.kernel import one_kernel
 from ..core.materialise import materialise
 from ..core.settings import Settings
 from ..core.types import Flag
@@ -159,12 +160,13 @@ def _linearise(world: World, camera: Camera, mesh: Mesh, channels: int, still: V
         drawn = draw_boundaries(world, camera, key, mesh, math.ceil((world.settings.edge_samples or 0) / _POINTS_PER_PIXEL))
     samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
     sampled = functools.partial(_samples, channels)
-    light, slopes, vertices, view = map_over(mesh, sampled, (world, camera, still), samples.positions())
+    seen = world, camera, still
+    light, slopes, vertices, view = map_over(mesh, lambda *args: one_kernel(sampled, *args), seen, samples.positions())
     image, edges = samples.in_pixels(light), None
     sampling = _sampling_error(samples.in_rows(light), math.isqrt(world.settings.samples or 1))
     if drawn is not None:
         followed = functools.partial(_boundary_samples, channels)
-        edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, (world, camera, still), drawn.contributions)
+        edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, seen, drawn.contributions)
         points, _ = drawn.contributions.unpacked()
         kind = jnp.where(points.valid, jnp.where(points.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
         edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled, edge_view)

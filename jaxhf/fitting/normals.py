@@ -50,7 +50,7 @@ def evidence_for_angles(problem: Problem, heights: Float[AnyArray, "ny nx"], lef
         ]
         parts = [turned.ravel() if shape == turned.shape[:2] else np.zeros(4 * math.prod(shape)) for shape in shapes]
         change = np.concatenate(parts)
-        changes += [rows @ change for rows in group_by_vertices(problem, number, heights, change.size)]
+        changes += group_by_vertices(problem, number, heights, change)
     change = in_rows([group.weights for group in problem.groups]) * np.concatenate(changes)
     return deviations_above_zero(-change * left, problem)
 
