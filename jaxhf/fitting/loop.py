@@ -71,11 +71,12 @@ class FitLoop:
     def run(self) -> Stop:
         self.started = time.perf_counter()
         self.fingerprint = fingerprint(self.problem, self.unknowns, self.options) if self.path else ""
+        facts = self._facts() if self.path and self.options.resume and self.path.exists() else None
         self.state = self.initial_state = self._initial_state(self.unknowns)
-        if self.path and self.options.resume and self.path.exists():
-            self._load()
-        else:
+        if facts is None:
             self._next_stage()
+        else:
+            self._load(facts)
         try:
             while True:
                 stop = self._stage_ended()
@@ -357,11 +358,16 @@ class FitLoop:
         if self.path and self.snapshot:
             save_checkpoint(self.path, *self.snapshot)
 
-    def _load(self) -> None:
+    def _facts(self) -> dict[str, Any]:
+        """Those of the checkpoint to go on from; FileError where it is another fit's."""
         assert self.path is not None
         facts = load_facts(self.path)
         if facts["fingerprint"] != self.fingerprint:
             raise FileError(f"{self.path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
+        return facts
+
+    def _load(self, facts: dict[str, Any]) -> None:
+        assert self.path is not None
         settings = dataclasses.replace(self.problem.settings, edge_samples=facts["edge_samples"])
         by_angle = None if facts["by_angle"] is None else jnp.asarray(facts["by_angle"])
         if settings != self.problem.settings or by_angle:

@@ -267,10 +267,12 @@ def test_another_process_finds_the_same_fingerprint():
     assert found.stdout.strip() == fingerprint(albedo="map", loss="geman", levels=[0.5, 1.0])
 
 
-def test_a_damaged_checkpoint_and_that_of_another_fit_are_refused(tmp_path):
+def test_a_damaged_checkpoint_and_that_of_another_fit_are_refused(tmp_path, monkeypatch):
+    """Before anything is rendered."""
     path = tmp_path / "fit.checkpoint"
     scenes, targets = problem()
     jaxhf.fit(scenes, targets, **{**OPTIONS, "max_steps": 2}, checkpoint=path)
+    monkeypatch.setattr(_loop.FitLoop, "_initial_state", None)
     with pytest.raises(ValueError, match=r"fit\.checkpoint: this is the checkpoint of another fit"):
         jaxhf.fit(scenes, [targets[0] + 1], **OPTIONS, checkpoint=path, resume=True)
     content = bytearray(path.read_bytes())

@@ -128,6 +128,7 @@ BAD = [
     (perspective(np.eye(3)), "Perspective: world_from_camera must be a 4x4 matrix, its shape is (3, 3)"),
     (perspective(matrix(m00=NAN)), "Perspective: world_from_camera must be finite, it is "),
     (perspective(matrix(m11=0)), "Perspective: world_from_camera must be invertible, it flattens space: "),
+    (intrinsics(width="a"), "from_intrinsics: width must be a whole number of pixels from 1 on, it is 'a'"),
     (intrinsics(fx=0), "from_intrinsics: fx must be positive, it is 0.0"),
     (intrinsics(cy=NAN), "from_intrinsics: cy must be finite, it is nan"),
     (intrinsics(cx=[1, 2]), "from_intrinsics: cx must be one number, its shape is (2,)"),
