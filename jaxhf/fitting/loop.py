@@ -180,21 +180,22 @@ class FitLoop:
         heights, before = jnp.asarray(self.problem.basis.crop(surface), self.field.heights.dtype), self.problem
         finer = before.with_edge_samples(heights, self.options)
         left_open = before.by_angle is not None and not bool(before.by_angle)
-        if left_open and self._evidence_for_angles(heights) > _EVIDENCE:
+        if left_open:
             left = self._left(self.best[1])
-            self._set_problem(dataclasses.replace(finer, by_angle=jnp.asarray(True)))
-            left_by_angle = self._left(self._tried(_TRIAL_STEPS))
-            if left_by_angle @ left_by_angle < left @ left:
-                return True
-            self._set_problem(before)
+            if self._evidence_for_angles(heights, left) > _EVIDENCE:
+                self._set_problem(dataclasses.replace(finer, by_angle=jnp.asarray(True)))
+                left_by_angle = self._left(self._tried(_TRIAL_STEPS))
+                if left_by_angle @ left_by_angle < left @ left:
+                    return True
+                self._set_problem(before)
         if finer.settings != before.settings:
             self._set_problem(finer)
         return finer.settings != before.settings
 
-    def _evidence_for_angles(self, heights: jax.Array) -> float:
+    def _evidence_for_angles(self, heights: jax.Array, left: Float[np.ndarray, " rows"]) -> float:
         """See there; 0 where the pictures' derivatives are not known."""
         known = self.known(self.best[1])
-        return evidence_for_angles(known, heights, self._left(self.best[1])) if is_sparse(known) else 0.0
+        return evidence_for_angles(known, heights, left) if is_sparse(known) else 0.0
 
     def _left(self, unknowns: Unknowns) -> Float[np.ndarray, " rows"]:
         """What these unknowns leave of the pictures, in units of the noise; far off at most `_FAR`."""

@@ -80,6 +80,11 @@ class Problem(eqx.Module):
         return dataclasses.replace(self.settings, normals="six-angle")
 
     @property
+    def can_be_linearised(self) -> bool:
+        """Whether the derivatives of all pictures in the heights can be kept, where the albedo is known."""
+        return all(can_be_linearised(group.scenes, self.settings) for group in self.groups)
+
+    @property
     def least_noise(self) -> Float[np.ndarray, " pictures"]:
         """Below which no estimate of the noise may fall."""
         return _LEAST_NOISE * self.brightness
@@ -156,16 +161,16 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
         local_mesh() if options.mesh is None else options.mesh,
         None,
         *_view_priors(scenes, options),
-        jnp.asarray(False) if _open_normals(groups, settings, options) else None,
     )
+    if _open_normals(problem, options):
+        problem = dataclasses.replace(problem, by_angle=jnp.asarray(False))
     return problem.with_edge_samples(jnp.asarray(heights, dtype), options), unknowns
 
 
-def _open_normals(groups: Sequence[Group], settings: Settings, options: FitOptions) -> bool:
+def _open_normals(problem: Problem, options: FitOptions) -> bool:
     """Whether pictures are to tell how normals are weighted, as far as steps know their derivatives."""
-    known = options.solver == "lm" and options.albedo == "known"
-    known = known and all(can_be_linearised(group.scenes, settings) for group in groups)
-    return known and settings.normals is None and settings.shading == "smooth"
+    known = options.solver == "lm" and options.albedo == "known" and problem.can_be_linearised
+    return known and problem.settings.normals is None and problem.settings.shading == "smooth"
 
 
 def _view_priors(scenes: Sequence[Scene], options: FitOptions) -> tuple[View, View]:

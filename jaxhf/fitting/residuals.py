@@ -20,7 +20,7 @@ from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
 from .basis import Basis, Unknowns
 from .groups import Group
-from .linearise import Linearised, can_be_linearised, linearise_each, picture_each
+from .linearise import Linearised, linearise_each, picture_each
 from .problem import Problem
 from .robust import soften
 from .view import moved
@@ -70,7 +70,7 @@ def linearised(unknowns: Unknowns, problem: Problem) -> Problem:
     """
     if problem.linearised is not None or unknowns.albedo is not None:
         return problem
-    if not all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
+    if not problem.can_be_linearised:
         return problem
     heights = heights_of(unknowns, problem.basis)
     found = _linearised(*on_every_device((heights, unknowns, problem), problem.mesh))

@@ -21,7 +21,6 @@ from ..core.errors import ArgumentError
 from .basis import Unknowns
 from .history import Draws
 from .jacobian import in_rows
-from .linearise import can_be_linearised
 from .normal_matrix import NormalMatrix
 from .problem import Problem
 from .quadratic import is_sparse
@@ -216,7 +215,7 @@ def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tu
 def require_small(unknowns: Unknowns, problem: Problem) -> None:
     """Raises ValueError where "exact" would make a matrix above `EXACT_UNKNOWNS` or `EXACT_ENTRIES`."""
     count = count_unknowns(unknowns)
-    if unknowns.albedo is None and all(can_be_linearised(group.scenes, problem.settings) for group in problem.groups):
+    if unknowns.albedo is None and problem.can_be_linearised:
         if count > EXACT_UNKNOWNS:
             rule = f"'exact' takes at most {EXACT_UNKNOWNS} unknowns, there are {count}; give a number of samples"
             raise ArgumentError("fit", "uncertainty", rule)
