@@ -60,7 +60,7 @@ def test_no_circle():
 
 
 def test_rays_are_batched_and_compiled_in_few_places():
-    """Rays are batched where pictures, boundaries and a fit's matrix are made; two modules say what `vmap` makes of one ray."""
+    """Rays are batched where pictures, boundaries and a fit's matrix are made; three say what `vmap` makes of calls."""
     batching = {
         "rendering/tiles",
         "rendering/samples",
@@ -73,6 +73,7 @@ def test_rays_are_batched_and_compiled_in_few_places():
         "mujoco/sensors",
     }
     rules = {"core/masked", "trace/search"}
+    batching |= {"core/kernel"}
     for path in MODULES:
         text, name = path.read_text(), "/".join(_parts(path))
         assert ("custom_vmap" in text) == (name in rules), name

@@ -16,7 +16,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
-from ..core.devices import map_over, on_every_device
+from ..core.devices import map_over
 from ..core.kernel import one_kernel, traced_once
 from ..core.materialise import materialise
 from ..core.settings import Settings
@@ -33,13 +33,6 @@ Tree = TypeVar("Tree")
 _ROUNDS = 4
 # Samples along a pixel's side where its interior derivative is resampled; twice the picture's, where that is more.
 _RESAMPLED_SIDE = 8
-
-
-def default_key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
-    """The key of the random numbers, a fixed one where the caller gives none; None where the settings draw none."""
-    if not settings.edge_samples:
-        return None
-    return on_every_device(jax.random.key(0) if key is None else key, mesh)
 
 
 class Boundaries(eqx.Module):
@@ -90,17 +83,20 @@ class Packed(eqx.Module, Generic[Tree]):
         return jax.tree.unflatten(structure, leaves)
 
 
-def draw_boundaries(world: World, camera: Camera, key: jax.Array, mesh: Mesh, resampled: int | None = None) -> Boundaries:
+def draw_boundaries(
+    world: World, camera: Camera, key: jax.Array | None, mesh: Mesh, resampled: int | None = None
+) -> Boundaries:
     """Draws `edge_samples` samples of boundaries.
 
     Args:
       world: what is seen.
       camera: what sees it.
-      key: of the random numbers.
+      key: of the random numbers; None: a fixed one.
       mesh: the devices that share the work.
       resampled: how many pixels are resampled; None: as many as take `edge_samples` samples.
     """
     settings, edge_samples = world.settings, world.settings.edge_samples or 0
+    key = jax.random.key(0) if key is None else key
     chunks = math.ceil(edge_samples / (_ROUNDS * settings.chunk))
     draws = math.ceil(edge_samples / (_ROUNDS * chunks))
     contributions, seen = lax.stop_gradient(_draw_edges(world, camera, key, mesh, chunks, draws))

@@ -78,8 +78,7 @@ class Settings:
         metadata={
             "help": "points on terrain edges, in all, at which the derivative of moving silhouettes and shadow boundaries is "
             "taken, and about as many samples more in the pixels that see them, see docs/concepts/boundary.md; 0: the "
-            "derivative that each sample has by itself, no more; the picture is the same, but takes longer where render is "
-            "traced",
+            "derivative that each sample has by itself, no more; a picture that is not differentiated takes none",
             "none": "0, but in a fit, which chooses by what its scenes show",
             "metavar": "N",
         },

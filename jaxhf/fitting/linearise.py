@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..boundary.guiding import edge_sets
 from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
-from ..boundary.term import Packed, default_key, draw_boundaries
+from ..boundary.term import Packed, draw_boundaries
 from ..core.autodiff import with_tangent
 from ..core.devices import map_over, on_every_device
 from ..core.kernel import one_kernel
@@ -154,10 +154,9 @@ def picture_each(
 
 
 def _linearise(world: World, camera: Camera, mesh: Mesh, channels: int, still: View) -> Linearised:
-    key = default_key(None, world.settings, mesh)
-    drawn = None
-    if key is not None and edge_sets(world):
-        drawn = draw_boundaries(world, camera, key, mesh, math.ceil((world.settings.edge_samples or 0) / _POINTS_PER_PIXEL))
+    drawn, edge_samples = None, world.settings.edge_samples or 0
+    if edge_samples and edge_sets(world):
+        drawn = draw_boundaries(world, camera, None, mesh, math.ceil(edge_samples / _POINTS_PER_PIXEL))
     samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
     sampled = functools.partial(_samples, channels)
     seen = world, camera, still

@@ -16,11 +16,12 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..boundary.guiding import edge_sets
-from ..boundary.term import Boundaries, default_key, draw_boundaries, moved_light
+from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
-from ..core.compilation import compiled, is_traced
+from ..core.compilation import compiled
 from ..core.devices import chosen_mesh, map_over, on_every_device
 from ..core.errors import UserError, require_kind, require_progress
+from ..core.kernel import in_turn, one_kernel
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
@@ -150,13 +151,13 @@ def render(
         world, mesh = scene._world, scene.mesh
         camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
         if progress is None:
-            outputs = _trace_prepared(world, camera, aovs, mesh, _key(key, world.settings, mesh), not is_traced())
+            outputs = _trace_prepared(world, camera, aovs, mesh, _key(key, world.settings, mesh))
         else:
             outputs = _trace_in_parts(world, camera, aovs, mesh, progress)
     else:
         settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("render", mesh)
         local = on_every_device(localise(scene), mesh)
-        outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh), not is_traced())
+        outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -177,8 +178,8 @@ def _require_scene(owner: str, scene: Any, kind: type | tuple[type, ...]) -> Non
 
 
 def _key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
-    """See `default_key`; None also where nothing can be differentiated, as nothing is traced."""
-    return default_key(key, settings, mesh) if is_traced() else None
+    """None also where the settings draw nothing."""
+    return on_every_device(key, mesh) if settings.edge_samples else None
 
 
 def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh) -> Float[jax.Array, "n h w 3"]:
@@ -194,31 +195,36 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         resolved = resolve_settings(settings, scene)
-        return _trace_all(on_every_device(scene, mesh), resolved, (), mesh, default_key(None, resolved, mesh), False)["image"]
+        return _trace_all(on_every_device(scene, mesh), resolved, (), mesh, None)["image"]
 
     return lax.map(one, scenes)
 
 
-@functools.partial(compiled, static_argnames=("settings", "aovs", "mesh", "alone"))
+@functools.partial(compiled, static_argnames=("settings", "aovs", "mesh"))
 def _trace_all(
-    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None, alone: bool = False
+    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
 ) -> dict[str, jax.Array]:
-    return _trace_world(make_world(scene, settings), scene.camera, aovs, mesh, key, alone)
+    return _trace_world(make_world(scene, settings), scene.camera, aovs, mesh, key)
 
 
 def _trace_world(
-    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None, alone: bool = False
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
 ) -> dict[str, jax.Array]:
-    if key is not None and edge_sets(world):
-        others = _trace_picture(world, camera, aovs, mesh, alone) if aovs else {}
+    def picture(world: World, camera: Camera, _: jax.Array | None = None) -> dict[str, jax.Array]:
+        return _trace_picture(world, camera, aovs, mesh)
+
+    def across_boundaries(world: World, camera: Camera, key: jax.Array | None) -> dict[str, jax.Array]:
+        others = picture(world, camera) if aovs else {}
         drawn = draw_boundaries(world, camera, key, mesh)
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
-    return _trace_picture(world, camera, aovs, mesh, alone)
+
+    has_points = world.settings.edge_samples and edge_sets(world)
+    return in_turn(picture, world, camera, key, derivative_of=across_boundaries if has_points else None)
 
 
-def _trace_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, alone: bool) -> dict[str, jax.Array]:
+def _trace_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh) -> dict[str, jax.Array]:
     tiling = Tiling(camera, world.settings)
-    tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32), alone)
+    tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
     return jax.tree.map(tiling.assemble, tiles)
 
 
@@ -226,10 +232,14 @@ def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, 
     """The picture, with the derivative in which boundaries have a part.
 
     One loop traces all samples, also those of pixels in which boundaries were seen: with a loop of their own for these the
-    program compiled for 7 s longer. So they are traced also where nothing is differentiated.
+    program compiled for 7 s longer.
     """
     samples = PictureSamples(camera, world.settings, drawn.resampled)
-    light = map_over(mesh, lambda seen, points: light_along(*seen, *points)[0], (world, camera), samples.positions())
+
+    def radiance(seen: tuple[World, Camera], points: tuple[jax.Array, ...]) -> jax.Array:
+        return one_kernel(lambda *args: light_along(*args)[0], *seen, *points)
+
+    light = map_over(mesh, radiance, (world, camera), samples.positions())
     image = samples.in_pixels(light)
     finer = samples.of_resampled(light).mean(1)
     light = moved_light(world, camera, drawn, mesh)
@@ -250,8 +260,8 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
     return lax.map(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights)
 
 
-_trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh", "alone"))
-_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs", "alone"))
+_trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh"))
+_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
 _make_world = compiled(make_world, static_argnames=("settings",))
 _make_ceilings = compiled(make_ceilings, static_argnames=("settings",))
 _make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
@@ -267,6 +277,6 @@ def _trace_in_parts(
     parts = []
     for first in range(0, tiling.count, size):
         tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
-        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, aovs, np.asarray(tiles, np.int32), True)))
+        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, aovs, np.asarray(tiles, np.int32))))
         progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
     return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)

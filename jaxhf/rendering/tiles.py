@@ -47,18 +47,15 @@ class Tiling:
 
 
 def trace_tiles(
-    mesh: Mesh, world: World, camera: Camera, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"], alone: bool
+    mesh: Mesh, world: World, camera: Camera, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]
 ) -> dict[str, jax.Array]:
-    """The picture ("image") and AOVs of tiles, traced one after the other; (n, side * side, ...) each.
-
-    `alone` says that nothing is differentiated or transformed: each tile then is one kernel.
-    """
+    """The picture ("image") and AOVs of tiles, traced one after the other; (n, side * side, ...) each."""
 
     def of_tile(world: World, camera: Camera, tile: jax.Array) -> dict[str, jax.Array]:
         return _trace_tile(world, camera, aovs, tile)
 
     def one(seen: tuple[World, Camera], tile: jax.Array) -> dict[str, jax.Array]:
-        return one_kernel(of_tile, *seen, tile) if alone else of_tile(*seen, tile)
+        return one_kernel(of_tile, *seen, tile)
 
     return map_over(mesh, one, (world, camera), tiles)
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ..core.affine import Affine
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
-from ..core.vector import largest_component, unit
+from ..core.vector import dot, largest_component, unit
 from ..scene.skirt import Skirt
 from .hit import Hit, orthogonal_tangents
 from .status import Status
@@ -23,11 +23,13 @@ class Walls(eqx.Module):
     Attributes:
       tops: heights of the border: south, north, west, east, one after the other.
       base: z of the floor.
+      tallest: the height of the tallest wall, above zero.
       size: of the footprint, x and y.
     """
 
     tops: Float[jax.Array, " vertices"]
     base: Scalar
+    tallest: Scalar
     size: tuple[float, float] = eqx.field(static=True)
     cells: tuple[int, int] = eqx.field(static=True)
     world_from_object: Affine
@@ -40,7 +42,9 @@ def make_walls(skirt: Skirt, world_from_object: Affine | None) -> Walls:
     world = Affine(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)) if world_from_object is None else world_from_object
     cells = len(skirt.south) - 1, len(skirt.west) - 1
     size = cells[0] * skirt.dx, cells[1] * skirt.dy
-    return Walls(tops, jnp.asarray(skirt.base, dtype), size, cells, world, world.inverse())
+    base = jnp.asarray(skirt.base, dtype)
+    tallest = jnp.maximum(jnp.nanmax(tops) - base, jnp.finfo(dtype).tiny)
+    return Walls(tops, base, tallest, size, cells, world, world.inverse())
 
 
 def wall_distance(walls: Walls, ray: Ray, left: Flag | None, left_side: Index | None) -> tuple[Scalar, Flag, Index]:
@@ -102,16 +106,15 @@ def wall_hit(walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: F
     (size_x, size_y), dtype = walls.size, t.dtype
     outwards = jnp.array([[0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, -1]], dtype)[side]
     along_x, floor = (side < 2) | (side == _FLOOR), side == _FLOOR
-    tallest = jnp.maximum(jnp.nanmax(walls.tops) - walls.base, jnp.finfo(dtype).tiny)
     u = jnp.where(along_x, local[0] / size_x, local[1] / size_y)
-    v = jnp.where(floor, local[1] / size_y, (local[2] - walls.base) / tallest)
+    v = jnp.where(floor, local[1] / size_y, (local[2] - walls.base) / walls.tallest)
     n = unit(walls.object_from_world.covector(outwards))
     zero = jnp.zeros((), dtype)
     per_u = jnp.where(along_x, jnp.stack([zero + size_x, zero, zero]), jnp.stack([zero, zero + size_y, zero]))
-    per_v = jnp.where(floor, jnp.stack([zero, zero + size_y, zero]), jnp.stack([zero, zero, tallest]))
+    per_v = jnp.where(floor, jnp.stack([zero, zero + size_y, zero]), jnp.stack([zero, zero, walls.tallest]))
     dp_du, dp_dv = orthogonal_tangents(walls.world_from_object.vector(per_u), walls.world_from_object.vector(per_v), n)
     none = jnp.zeros((), jnp.int32)
-    faces = (n * ray.d).sum() < 0
+    faces = dot(n, ray.d) < 0
     # At the rim a wall comes before the terrain, whose lower side would be seen there.
     nearer = jnp.where(faces, 1 - _WIDE * jnp.finfo(dtype).eps, 1)
     status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID))

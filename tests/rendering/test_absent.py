@@ -37,9 +37,16 @@ class Case(NamedTuple):
     scene: jaxhf.Scene
     settings: jaxhf.Settings = BARE
     aovs: tuple[str, ...] = ()
+    differentiated: bool = False
 
     def program(self) -> str:
         jax.clear_caches()  # or a trace from before the change would be taken
+
+        def brightness(heights):
+            return jaxhf.render(self.scene.with_heights(heights), self.settings).sum()
+
+        if self.differentiated:
+            return jax.jit(jax.grad(brightness)).lower(self.scene.heights).as_text()
         return jax.jit(lambda scene: jaxhf.render(scene, self.settings, aovs=self.aovs)).lower(self.scene).as_text()
 
 
@@ -119,6 +126,7 @@ TEXTURE = jaxhf.Matte(jaxhf.ImageTexture(np.ones((2, 2, 3))))
 TILTED = np.array([[1, 0, 0, 0.1], [0, 1, 0.2, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 SMOOTH = jaxhf.Settings(shading="smooth", shadows=False)
 DEPTH = Case(scene(), aovs=("depth",))
+POINTS = jaxhf.Settings(shading="flat", shadows=False, edge_samples=64)
 
 # feature: the baseline without it, the same with it, and the changes that make its code fail
 FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
@@ -175,8 +183,8 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
         [fails_in(trace_world, "affine"), fails_in(affine.Affine, "inverse")],
     ),
     "edge samples": (
-        "plain",
-        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, edge_samples=64)),
+        "differentiated",
+        Case(scene(), POINTS, differentiated=True),
         [fails_everywhere(sample.draw), fails_everywhere(guiding.initial_weights), fails_everywhere(autodiff.with_tangent)],
     ),
     "AOVs": ("plain", DEPTH, [fails_everywhere(rendering_aovs.observe)]),
@@ -199,7 +207,12 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
 }
 
 
-BASELINES = {"plain": PLAIN, "smooth": Case(scene(), SMOOTH), "depth": DEPTH}
+BASELINES = {
+    "plain": PLAIN,
+    "smooth": Case(scene(), SMOOTH),
+    "depth": DEPTH,
+    "differentiated": Case(scene(), differentiated=True),
+}
 
 
 @functools.cache
@@ -229,6 +242,10 @@ def test_what_is_absent_leaves_no_trace(name, monkeypatch):
             for change in changes if without_it == name else ():
                 change(patch)
         assert BASELINES[name].program() == program
+
+
+def test_points_on_edges_are_drawn_only_where_a_derivative_is_taken():
+    assert Case(scene(), POINTS).program() == baseline("plain")
 
 
 def test_max_depth_means_nothing_without_mirrors():
