@@ -94,7 +94,8 @@ def visible_sky(grid: Grid, azimuths: int) -> Float[jax.Array, "vertices 3"]:
     """`sky_vector` at the vertices of a grid, world frame; its z axis must be upright there. Differentiable in the heights."""
     z, linear = grid.z, grid.world_from_grid.linear
     level = jnp.asarray(cell_directions(even_azimuths(azimuths), 1.0, 1.0, z.dtype))
-    directions = lax.stop_gradient(level @ grid.grid_from_world.linear[:2, :2].T)
+    to_grid = grid.grid_from_world.linear[None, :2]  # term by term, as `Affine` has it
+    directions = lax.stop_gradient(level[:, :1] * to_grid[..., 0] + level[:, 1:] * to_grid[..., 1])
     flat = jnp.zeros((), z.dtype)
     seen = over_horizon(sky_vector, local_mesh(1), z * linear[2, 2], directions, flat)
     return jnp.moveaxis(seen, 0, -1).reshape(-1, 3)
