@@ -17,6 +17,7 @@ else:
     AnyArray = jax.Array | np.ndarray
 
 MOST = 1e30  # of a number in a scene: beyond, products overflow in single precision
+MOST_PLACES = 2**31 - 1  # of numbers in an array that several heightfields share: places in it are 32-bit integers
 
 Scalar = Float[jax.Array, ""]
 Flag = Bool[jax.Array, ""]
