@@ -8,7 +8,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from ..core.errors import ArgumentError
-from ..io.terrain import Terrain, fitted
+from ..core.precision import fitted
+from ..io.terrain import Terrain
 
 Heights = ArrayLike | Terrain
 
