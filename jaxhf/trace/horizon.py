@@ -29,6 +29,7 @@ _STRETCH = 24  # cells, along the axis on which a direction moves faster; up to 
 _TOGETHER = 8  # crossings in one pass over a tile
 _GRAIN = 8  # cells from one of the windows whose highest points are kept to the next
 _MARGIN = _TILE + 1
+_STEEPEST = 1e18  # of slopes: a right angle, whose square is a number in single precision
 
 # The kinds of edges, by where they lead from their first vertex, in x and y; the last is that of crossings at a vertex.
 _ALONG_X, _ALONG_Y, _DIAGONAL, _VERTEX = range(4)
@@ -326,7 +327,8 @@ def _from_tile(
         return (carry[0] < stretches) & carry[1]
 
     seen = jnp.full_like(z, lowest), jnp.full(z.shape, -1, jnp.int32) if numbered else None
-    return lax.while_loop(going, walk, (jnp.zeros((), jnp.int32), jnp.ones((), bool), seen))[2]
+    slopes, found = lax.while_loop(going, walk, (jnp.zeros((), jnp.int32), jnp.ones((), bool), seen))[2]
+    return jnp.minimum(slopes, _STEEPEST), found
 
 
 def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
