@@ -14,7 +14,7 @@ from jaxtyping import Float
 from .errors import ArgumentError, UserError
 from .powers import floor_to_power_of_two
 from .ray import Ray
-from .types import MOST, AnyArray, Vector
+from .types import MOST, AnyArray, Vector, VectorLeaf
 
 
 class Affine(eqx.Module):
@@ -23,10 +23,10 @@ class Affine(eqx.Module):
     linear: Float[AnyArray, "3 3"]
     offset: Float[AnyArray, "3"]
 
-    def point(self, p: Vector) -> Vector:
+    def point(self, p: VectorLeaf) -> VectorLeaf:
         return self.vector(p) + self.offset
 
-    def vector(self, v: Vector) -> Vector:
+    def vector(self, v: VectorLeaf) -> VectorLeaf:
         return self.linear[:, 0] * v[0] + self.linear[:, 1] * v[1] + self.linear[:, 2] * v[2]
 
     def covector(self, n: Vector) -> Vector:

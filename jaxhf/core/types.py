@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .errors import ArgumentError, UserError
+from .precision import fitted
 
 # What a leaf of a scene may be: float64 NumPy until the scene is rendered, or whatever JAX array or tracer the caller put
 # there. A type checker takes it for the latter, which it is wherever rays are traced.
@@ -17,6 +18,7 @@ else:
     AnyArray = jax.Array | np.ndarray
 
 MOST = 1e30  # of a number in a scene: beyond, products overflow in single precision
+MOST_PLACES = 2**31 - 1  # of numbers in an array that several heightfields share: places in it are 32-bit integers
 
 Scalar = Float[jax.Array, ""]
 Flag = Bool[jax.Array, ""]
@@ -43,6 +45,18 @@ def float_leaf(value: Any) -> Any:
     except (TypeError, ValueError) as error:
         shown = repr(value)
         raise UserError(f"{shown if len(shown) <= 60 else type(value).__name__} stands where numbers must") from error
+
+
+def height_leaf(owner: str, value: Any, dtype: Any = None) -> jax.Array:
+    """Heights as an array of JAX, in `dtype` or as they are given, where whole numbers become float32; see `fitted`."""
+    if isinstance(value, jax.Array):
+        whole = jnp.issubdtype(value.dtype, jnp.integer)
+        return value.astype(dtype or (jnp.float32 if whole else value.dtype))
+    given = np.asarray(value)
+    if given.dtype.kind in "fiu":
+        dtype = dtype or (np.float32 if given.dtype.kind in "iu" else jax.dtypes.canonicalize_dtype(given.dtype))
+        given = given if given.dtype == dtype else fitted(given, dtype, owner)
+    return jnp.asarray(given, dtype)
 
 
 def rgb_leaf(value: Any) -> Any:

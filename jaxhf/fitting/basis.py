@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..core.errors import ArgumentError
+from ..core.precision import fitted
 from ..scene.heightfield import Heightfield
 from .view import KNOWN, View
 
@@ -168,8 +169,9 @@ def dct_matrix(n: int) -> Float[np.ndarray, "n n"]:
     return matrix
 
 
-def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:
-    """Heights from a number (flat), from a coarser or finer grid over the same footprint, or as they are."""
+def make_heights(name: str, value: Any, field: Heightfield) -> Float[np.ndarray, "ny nx"]:
+    """Heights at the vertices of `field` from a number (flat), or from a grid of any size over the same footprint."""
+    shape = field.heights.shape
     heights = np.asarray(value, np.float64)
     if heights.shape == ():
         heights = np.full(shape, heights)
@@ -178,6 +180,7 @@ def make_heights(name: str, value: Any, shape: tuple[int, ...]) -> Float[np.ndar
     if not np.isfinite(heights).all():
         iy, ix = np.argwhere(~np.isfinite(heights))[0]
         raise ArgumentError("fit", name, f"must be finite, row {iy} column {ix} is {heights[iy, ix]}")
+    fitted(heights, field.heights.dtype, f"fit, {name}")  # for its warning
     return heights if heights.shape == shape else resample(heights, shape)
 
 

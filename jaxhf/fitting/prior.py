@@ -48,7 +48,7 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | int | N
     padding = prior_padding(field, length)
     if length is not None:
         _require_plausible(field, length)
-    heights = pad(make_heights("prior", prior, shape), padding)
+    heights = pad(make_heights("prior", prior, field), padding)
     weight, stiffness = pad(np.broadcast_to(1 / std, shape), padding), None
     if length is not None:
         stiffness = _stiffness(field, heights.shape, length, exponent)

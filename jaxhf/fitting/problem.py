@@ -138,9 +138,9 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
     """
     require_scenes(scenes, targets)
     first = scenes[0]
-    field, shape, dtype = first.heightfields[0], first.heights.shape, first.heights.dtype
+    field, dtype = first.heightfields[0], first.heights.dtype
     start = _without_holes(np.asarray(first.heights)) if options.start is None else options.start
-    heights = make_heights("start", start, shape)
+    heights = make_heights("start", start, field)
     settings = choose_samples(scenes, options.settings)
     noise = _noise(options.noise, targets)
     groups = make_groups(scenes, targets, noise, options, settings)

@@ -105,9 +105,10 @@ class BFGS(optx.AbstractBFGS):
             jax.flatten_util.ravel_pytree(after)[0] - jax.flatten_util.ravel_pytree(before)[0]
             for after, before in ((y_eval, y), (f_eval_info.grad, f_info.grad))
         )
-        curved = step @ change > jnp.finfo(step.dtype).eps
+        along = (step * change).sum()
+        curved = along > jnp.finfo(step.dtype).eps
         first = hessian_update_state & curved
-        factor = jnp.where(first, step @ change / jnp.where(first, change @ change, 1), 1)
+        factor = jnp.where(first, along / jnp.where(first, (change * change).sum(), 1), 1)
         scaled = eqx.tree_at(
             lambda info: info.hessian_inv, f_info, jax.tree.map(lambda leaf: factor * leaf, f_info.hessian_inv)
         )

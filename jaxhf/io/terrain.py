@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import DTypeLike
 
 from ..core.errors import ArgumentError
+from ..core.precision import WORTH_A_WARNING, fitted, rounding
 from .errors import FileError
 from .georeference import (
     WGS84,
@@ -171,16 +172,17 @@ def _even(owner: str, array: Any, name: str) -> tuple[float, float]:
     stored = np.asarray(array.coords[name].values)
     values = stored.astype(np.float64)
     step = (values[-1] - values[0]) / (len(values) - 1)
-    rounding = 4 * np.finfo(stored.dtype if stored.dtype.kind == "f" else np.float64).eps * np.abs(values).max()
+    noise = 4 * np.finfo(stored.dtype if stored.dtype.kind == "f" else np.float64).eps * np.abs(values).max()
     steps = np.diff(values)
-    if not np.abs(steps - step).max() <= max(1e-3 * abs(step), rounding):
+    if not np.abs(steps - step).max() <= max(1e-3 * abs(step), noise):
         rule = f"must have evenly spaced coordinates along {name}, their steps go from {steps.min()} to {steps.max()}"
         raise ArgumentError(owner, "array", rule)
     return float(values[0]), float(step)
 
 
 def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, offset: float = 0.0) -> Float[np.ndarray, "ny nx"]:
-    """Stored values as heights: value * scale + offset, float32 where it holds the values exactly, else float64.
+    """Stored values as heights: value * scale + offset, in float32 where that holds the values exactly and moves no height by
+    more than a thousandth of the relief, else in float64.
 
     What is not finite, and what equals `nodata`, becomes nan.
     """
@@ -197,15 +199,6 @@ def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, off
             holes |= values == (values.dtype.type(nodata) if values.dtype.kind == "f" else nodata)
     heights[holes] = np.nan
     if (scale, offset) != (1, 0):
-        with np.errstate(over="ignore"):
-            heights = (heights.astype(np.float64) * scale + offset).astype(heights.dtype)
+        scaled = heights.astype(np.float64) * scale + offset
+        heights = scaled if rounding(scaled, heights.dtype) > WORTH_A_WARNING else scaled.astype(heights.dtype)
     return heights
-
-
-def fitted(heights: np.ndarray, dtype: DTypeLike) -> np.ndarray:
-    """The heights in another precision; ValueError where they do not fit, as infinite ones would count as holes."""
-    with np.errstate(over="ignore"):
-        found = heights.astype(dtype)
-    if np.isinf(found).any():
-        raise ArgumentError("", "heights", f"must fit into {found.dtype}, the largest is {np.nanmax(np.abs(heights)):.3g}")
-    return found

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
@@ -113,6 +114,7 @@ def sky_view(
     if weighting != "slope":
         return found
     normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
+    normals = normals / lax.stop_gradient(jnp.max(jnp.abs(normals), -1, keepdims=True))  # areas may have no square
     received = jnp.sum(jnp.moveaxis(found, 0, -1) * normals, -1) / jnp.linalg.norm(normals, axis=-1)
     return jnp.maximum(received, 0)
 
@@ -130,6 +132,7 @@ def _horizontal(slopes: jax.Array) -> jax.Array:
 
 
 _PARTS = 64  # of a map that reports its progress
+_ROOM = 4  # heights and horizontal distances are divided by it, so that differences of heights stay numbers
 _WEIGHTINGS = ("solid-angle", "horizontal", "slope")
 _SUMMARIES: dict[str, Summary] = dict(
     zip(("degrees", *_WEIGHTINGS), (_degrees, _solid_angle, _horizontal, sky_vector), strict=True)
@@ -147,7 +150,8 @@ def _mapped(
 ) -> jax.Array:
     require_progress(owner, progress)
     dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh)
-    heights, directions = on_every_device((field.heights, cell_directions(azimuths, field.dx, field.dy, dtype)), mesh)
+    directions = _ROOM * cell_directions(azimuths, field.dx, field.dy, dtype)
+    heights, directions = on_every_device((field.heights, directions), mesh)
     if progress is None:
         return _over(summary, mesh, heights, directions, np.asarray(lowest, dtype))
     count, parts = tile_count(heights.shape), []
@@ -177,7 +181,7 @@ def _over_tiles(summary: str, mesh: Mesh, view: HorizonView, lowest: jax.Array, 
 
 
 def _holed(heights: jax.Array) -> jax.Array:
-    return jnp.where(jnp.isfinite(heights), heights, jnp.nan)
+    return jnp.where(jnp.isfinite(heights), heights / _ROOM, jnp.nan)
 
 
 def _field(owner: str, terrain: Any, dx: float | None, dy: float | None) -> Heightfield:

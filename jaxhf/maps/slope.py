@@ -37,7 +37,7 @@ def slope(
         west, south = differences(window, algorithm)
         x, y = west / np.float64(ground.dx), south / np.float64(ground.dy)
         rise = np.sqrt(x * x + y * y) / run
-        return 100 * rise if percent else np.arctan(rise) * (180 / np.pi)
+        return np.minimum(100 * rise, np.finfo(np.float32).max) if percent else np.arctan(rise) * (180 / np.pi)
 
     return over_windows(ground.north_first(), formula, compute_edges, NODATA, np.float32)[::-1].copy()
 

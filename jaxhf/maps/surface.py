@@ -8,9 +8,12 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from ..core.errors import ArgumentError
-from ..io.terrain import Terrain, fitted
+from ..core.precision import fitted
+from ..io.terrain import Terrain
 
 Heights = ArrayLike | Terrain
+
+_MOST = 1e30  # of a number: beyond, sums of heights overflow in single precision
 
 
 class Surface(NamedTuple):
@@ -90,14 +93,18 @@ def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:
     finite = np.isfinite(values)
     if not finite.any():
         raise ArgumentError(owner, "heights", "must hold a finite one, all of them are nan or infinite")
-    return values if finite.all() else np.where(finite, values, np.nan)
+    values = values if finite.all() else np.where(finite, values, np.nan)
+    largest = max(-np.fmin.reduce(values, axis=None), np.fmax.reduce(values, axis=None))
+    if largest > _MOST:
+        raise ArgumentError(owner, "heights", f"must be within -{_MOST:g} and {_MOST:g}, one is {largest:.3g} from 0")
+    return values
 
 
 def require_positive(owner: str, name: str, value: float) -> None:
     if not (math.isfinite(value) and value > 0):
         raise ArgumentError(owner, name, f"must be positive and finite, it is {value}")
-    if not 1e-30 <= value <= 1e30:
-        raise ArgumentError(owner, name, f"must be from 1e-30 to 1e30, it is {value}")
+    if not 1e-30 <= value <= _MOST:
+        raise ArgumentError(owner, name, f"must be from 1e-30 to {_MOST:g}, it is {value}")
 
 
 def require_one_of(owner: str, name: str, value: str, known: tuple[str, ...]) -> None:

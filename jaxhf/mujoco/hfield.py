@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
-from ..core.types import AnyArray, float_leaf, require_finite
+from ..core.types import AnyArray, float_leaf, height_leaf, require_finite
 from ..rendering.render import heightfield_grids
 from ..scene.heightfield import Heightfield
 from ..trace.grid import Grid, make_grid
@@ -49,7 +49,7 @@ class HField(eqx.Module):
     _grid: Grid | None = eqx.field(init=False)
 
     def __init__(self, data: Any, size: Any, pos: Any = (0, 0, 0), quat: Any = (1, 0, 0, 0)):
-        data = jnp.asarray(data)
+        data = height_leaf("HField", data)
         self.data = data if data.dtype in (jnp.float32, jnp.float64) else data.astype(jnp.float32)
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
             rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"

@@ -31,6 +31,11 @@ def trace_chunks(one: Callable[[Any], Any], rays: Any, chunk: int) -> Any:
     return jax.tree.map(lambda leaf: leaf.reshape(count * chunk, *leaf.shape[2:])[:n], results)
 
 
+# Heights, or numbers of what was made of them, in shapes that share a chunk. Bounds of heights are up to 16 times as many, and
+# `_together` may take half as many shapes again: all places stay below 2^31.
+_MOST_TOGETHER = 2**26
+
+
 def trace_batch(
     make: Callable[[Any], Any],
     join: Callable[[Any], tuple[Any, Any]],
@@ -54,7 +59,8 @@ def trace_batch(
       chunk: about how many rays are traced together.
     """
     shape_count, n = jax.tree.leaves(rays)[0].shape[:2]
-    together = _together(shape_count, max(1, chunk // max(n, 1)))
+    largest = max(leaf.size for leaf in jax.tree.leaves(shapes)) // shape_count
+    together = _together(shape_count, max(1, min(chunk // max(n, 1), _MOST_TOGETHER // largest)))
 
     def of_one(given: Any) -> Any:
         ready, rays = make(given[0]), given[1]

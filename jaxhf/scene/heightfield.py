@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_kind
 from ..core.powers import next_power_of_two
-from ..core.types import AnyArray
+from ..core.types import AnyArray, height_leaf
 from .show import known, number, numbers
 
 # So that a walk's state fits into 32 bits; each side of the grid counts as the next power of two.
@@ -21,14 +21,12 @@ _FARTHEST = 1e18  # whose square and inverse square are numbers in single precis
 
 def _heights(value: Any) -> jax.Array:
     try:
-        heights = jnp.asarray(value)
+        heights = height_leaf("Heightfield", value)
     except TypeError as error:
         whole = ": take its .heightfield()" if hasattr(value, "heightfield") else ""
         raise ArgumentError(
             "Heightfield", "heights", f"must be an array of numbers, they are a {type(value).__name__}{whole}"
         ) from error
-    if jnp.issubdtype(heights.dtype, jnp.integer):
-        return heights.astype(jnp.float32)
     if heights.dtype not in (jnp.float32, jnp.float64):
         raise ArgumentError("Heightfield", "heights", f"must be float32, float64 or whole numbers, they are {heights.dtype}")
     return heights
@@ -40,8 +38,9 @@ class Heightfield(eqx.Module):
     Attributes:
       heights: shape (ny, nx), at least 2x2, object units; vertex (ix, iy) stands at x = x0 + ix dx, y = y0 + iy dy. A
         vertex that is nan or infinite is a hole: the cells around it are not there. Their dtype, float32 or float64, is
-        the precision of everything that is rendered from them; whole numbers become float32. There are at most 2^28
-        cells, where the cells along each side count as the next power of two.
+        the precision of everything that is rendered from them; whole numbers become float32, as does float64 without
+        JAX's x64 mode, with a warning where that moves a height by more than a thousandth of the relief. There are at
+        most 2^28 cells, where the cells along each side count as the next power of two.
       dx, dy: cell size, object units; one alone counts for both. With neither given the grid spans pbrt's unit square.
       x0, y0: where vertex (0, 0) stands. They are metadata in double precision and never enter single-precision
         arithmetic: an offset of 5e6 costs no accuracy.

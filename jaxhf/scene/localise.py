@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..core.affine import translate
+from ..core.affine import affine, translate
 from .camera import Camera
 from .heightfield import Heightfield
 from .light import Light, Point
@@ -31,7 +31,7 @@ def localise(scene: Scene) -> Scene:
         elif isinstance(shape, Skirt):
             shape = dataclasses.replace(shape, x0=0.0, y0=0.0)
         world: Any = np.eye(4) if obj.world_from_object is None else obj.world_from_object
-        shift = world[:3, :3] @ _like(world, corner) - _like(world, origin)
+        shift = affine(world).vector(_like(world, corner)) - _like(world, origin)
         if obj.world_from_object is None and not np.any(shift):
             return Object(shape, obj.material)
         return Object(shape, obj.material, _shifted(world, shift))
@@ -74,8 +74,8 @@ def anchor(scene: Scene) -> np.ndarray:
     world: Any = None if obj is None else obj.world_from_object
     if obj is None or isinstance(world, jax.Array):
         return np.zeros(3)
-    corner = _grid_corner(obj.shape)
-    return corner if world is None else world[:3, :3] @ corner + world[:3, 3]
+    corner: Any = _grid_corner(obj.shape)
+    return corner if world is None else np.asarray(affine(world).point(corner))
 
 
 def _like(leaf: Any, value: np.ndarray) -> Any:

@@ -5,14 +5,13 @@ from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ..core.affine import require_invertible
 from ..core.errors import ArgumentError, UserError, kind_of, whole_number
 from ..core.settings import MOST_SAMPLES
-from ..core.types import AnyArray, MatrixLeaf, float_leaf
+from ..core.types import AnyArray, MatrixLeaf, float_leaf, height_leaf
 from .camera import Camera
 from .cylinder import Cylinder
 from .heightfield import Heightfield
@@ -130,7 +129,7 @@ class Scene(eqx.Module):
     def with_heights(self, heights: Any) -> "Scene":
         """The same scene over other heights of the same shape and precision; nothing is compiled again."""
         old = self.heights
-        new = jnp.asarray(heights, old.dtype)
+        new = height_leaf("with_heights", heights, old.dtype)
         if new.shape != old.shape:
             raise ArgumentError("with_heights", "heights", f"must keep their shape {old.shape}, theirs is {new.shape}")
         return eqx.tree_at(lambda scene: scene.heightfields[0].heights, self, new)

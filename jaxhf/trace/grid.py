@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..core.affine import Affine
 from ..core.powers import floor_to_power_of_two
 from ..core.settings import NormalScheme
-from ..core.types import Flag, Index, Scalar
+from ..core.types import MOST_PLACES, Flag, Index, Scalar
 from ..scene.heightfield import Heightfield
 from .normals import vertex_normals
 from .pyramid import Pyramid, make_pyramid
@@ -118,6 +118,7 @@ def joined(grids: Grid) -> tuple[Grid, Grid]:
       one of the second makes a grid, see `equinox.combine`.
     """
     count, vertices = grids.rows.shape
+    assert max(grids.rows.size, grids.pyramid.bounds.size) <= MOST_PLACES, "trace_batch takes few large grids together"
     number = jnp.arange(count, dtype=jnp.int32)
 
     def arrays(grid: Grid) -> tuple[Any, ...]:

@@ -29,6 +29,7 @@ _STRETCH = 24  # cells, along the axis on which a direction moves faster; up to 
 _TOGETHER = 8  # crossings in one pass over a tile
 _GRAIN = 8  # cells from one of the windows whose highest points are kept to the next
 _MARGIN = _TILE + 1
+_STEEPEST = 1e18  # of slopes: a right angle, whose square is a number in single precision
 
 # The kinds of edges, by where they lead from their first vertex, in x and y; the last is that of crossings at a vertex.
 _ALONG_X, _ALONG_Y, _DIAGONAL, _VERTEX = range(4)
@@ -94,7 +95,8 @@ def visible_sky(grid: Grid, azimuths: int) -> Float[jax.Array, "vertices 3"]:
     """`sky_vector` at the vertices of a grid, world frame; its z axis must be upright there. Differentiable in the heights."""
     z, linear = grid.z, grid.world_from_grid.linear
     level = jnp.asarray(cell_directions(even_azimuths(azimuths), 1.0, 1.0, z.dtype))
-    directions = lax.stop_gradient(level @ grid.grid_from_world.linear[:2, :2].T)
+    to_grid = grid.grid_from_world.linear[None, :2]  # term by term, as `Affine` has it
+    directions = lax.stop_gradient(level[:, :1] * to_grid[..., 0] + level[:, 1:] * to_grid[..., 1])
     flat = jnp.zeros((), z.dtype)
     seen = over_horizon(sky_vector, local_mesh(1), z * linear[2, 2], directions, flat)
     return jnp.moveaxis(seen, 0, -1).reshape(-1, 3)
@@ -325,7 +327,8 @@ def _from_tile(
         return (carry[0] < stretches) & carry[1]
 
     seen = jnp.full_like(z, lowest), jnp.full(z.shape, -1, jnp.int32) if numbered else None
-    return lax.while_loop(going, walk, (jnp.zeros((), jnp.int32), jnp.ones((), bool), seen))[2]
+    slopes, found = lax.while_loop(going, walk, (jnp.zeros((), jnp.int32), jnp.ones((), bool), seen))[2]
+    return jnp.minimum(slopes, _STEEPEST), found
 
 
 def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int, UInt32
 
+from ..core.errors import UserError
 from ..core.kernel import one_kernel
 from ..core.ray import Ray
-from ..core.types import Flag, Index, Scalar
+from ..core.types import MOST_PLACES, Flag, Index, Scalar
 from .grid import Grid
 from .hit import Hit
 from .walk import Walk, WalkResult, walking
@@ -166,6 +167,9 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
         """The values of all batches, whether they differ from walk to walk, and where those of a walk begin."""
         if per_ray or not per_batch:
             return flattened(values, per_ray, per_batch), per_ray, first
+        if values.size > MOST_PLACES:
+            share = f"{axis_size} heightfields under a vmap share an array of {values.size} numbers"
+            raise UserError(f"{share}, at most {MOST_PLACES} can be addressed; jax.lax.map with a batch_size takes fewer")
         begin = jnp.repeat(jnp.arange(axis_size, dtype=jnp.int32), rays) * values.shape[1]
         return values.reshape(-1), False, begin if first is None else begin + first
 

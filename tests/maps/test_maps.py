@@ -1,5 +1,6 @@
 """Hillshades, slopes and aspects: against gdaldem, and planes by hand."""
 
+import functools
 import itertools
 import re
 
@@ -151,12 +152,24 @@ def test_degrees_become_metres_unless_a_scale_is_given():
         (np.ones((3, 3), bool), {}, "heights must be an array of real numbers or a Terrain, they are of bool"),
         (np.ones((3, 3, 3)), {}, "heights must have shape (ny, nx) of at least 2x2, theirs is (3, 3, 3)"),
         (np.full((3, 3), np.nan), {}, "heights must hold a finite one, all of them are nan or infinite"),
-        (np.full((3, 3), 1e300), {}, "heights must fit into float32"),
+        (np.full((3, 3), 1e300), {}, "heights must be within -1e+30 and 1e+30, one is 1e+300 from 0"),
     ],
 )
 def test_refuses(heights, options, message):
     with pytest.raises(jaxhf.ArgumentError, match=re.escape(message)):
         jaxhf.hillshade(heights, **{"dx": 1.0, **options})
+
+
+def test_heights_and_cells_of_any_size():
+    """Only their ratio counts; where that is beyond any number surfaces are vertical, or flat."""
+    z = rough(9, 9)
+    for draw in (jaxhf.slope, jaxhf.hillshade, functools.partial(jaxhf.relief, shadows=True)):
+        for scale in (2.0**-96, 2.0**90):
+            np.testing.assert_allclose(draw(z * np.float32(scale), scale).astype(float), draw(z, 1.0).astype(float), rtol=1e-6)
+    steep = np.random.default_rng(3).normal(size=(9, 9)) * 1e28
+    np.testing.assert_allclose(jaxhf.slope(steep, 1e-29)[1:-1, 1:-1], 90)
+    assert (jaxhf.slope(steep, 1e-29, percent=True)[1:-1, 1:-1] == np.finfo(np.float32).max).all()
+    np.testing.assert_allclose(jaxhf.slope(steep / 1e58, 1e30)[1:-1, 1:-1], 0, atol=1e-30)
 
 
 @pytest.mark.parametrize("draw", [jaxhf.hillshade, jaxhf.slope, jaxhf.relief, jaxhf.horizon, jaxhf.sky_view])

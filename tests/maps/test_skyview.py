@@ -81,6 +81,19 @@ def test_sky_view_is_the_mean_over_horizons():
     np.testing.assert_array_equal(jaxhf.sky_view(jaxhf.Terrain(z, 2.0, 3.0), 6, weighting="horizontal"), found)
 
 
+@pytest.mark.parametrize("cell", [2.0**-59, 2.0**-30, 1.0, 2.0**30, 2.0**59])
+@pytest.mark.parametrize("scale", [2.0**-140, 2.0**-60, 1.0, 2.0**60, 2.0**106, 2.0**125])
+def test_single_precision_suffices_from_end_to_end(scale, cell):
+    """From the smallest heights and cells to the largest, slopes beyond 1e50 included, maps are those of double precision."""
+    z = np.random.default_rng(7).uniform(-7, 7, (9, 12)).astype(np.float32)
+
+    def maps(z):
+        views = [jaxhf.sky_view(z, 8, dx=cell, weighting=name) for name in ("solid-angle", "horizontal", "slope")]
+        return np.stack([*views, *(jaxhf.horizon(z, 3, dx=cell, lowest=-90.0) / 90)]).astype(float)
+
+    np.testing.assert_allclose(maps(z * np.float32(scale)), maps(z.astype(np.float64) * scale), atol=2e-6)
+
+
 def test_rays_just_above_the_horizon_meet_nothing_and_rays_just_below_do():
     rng = np.random.default_rng(7)
     z = np.cumsum(np.cumsum(rng.normal(size=SHAPE), 0), 1) / 8

@@ -68,3 +68,23 @@ def test_a_gradient_stores_little_of_each_sample():
     ]
     assert stored
     assert max(stored) < 12 * 4 * 1024  # numbers, of 4 samples of 1024 pixels
+
+
+def test_no_matrix_product_has_the_accelerators_precision():
+    """By default TPUs multiply matrices in bfloat16 and GPUs in TF32: 8 and 11 bits of an offset or a direction."""
+    field = jaxhf.Heightfield(HEIGHTS, x0=5e5, y0=4e6)
+    lights = [jaxhf.Point((1, 2, 3)), jaxhf.Sun((1, 2, 3)), jaxhf.Sky(1, occlusion=4)]
+
+    def loss(heights: jax.Array, world: jax.Array, pose: jax.Array) -> jax.Array:
+        objects = [
+            jaxhf.Object(field, world_from_object=world),
+            jaxhf.Object(jaxhf.Skirt.of(field, -1.0), world_from_object=world),
+        ]
+        scene = jaxhf.Scene(objects, jaxhf.Perspective(pose, width=32, height=32), lights).with_heights(heights)
+        image = jaxhf.render(scene, jaxhf.Settings(edge_samples=64))
+        return jnp.sum(image) + jnp.sum(jaxhf.sky_view(heights, dx=1.0))
+
+    arguments = HEIGHTS, np.eye(4, dtype=np.float32), np.asarray(SCENE.camera.world_from_camera, np.float32)
+    program = jax.make_jaxpr(jax.value_and_grad(loss, argnums=(0, 1, 2)))(*arguments).jaxpr
+    products = [str(equation) for equation in equations(program) if equation.primitive.name == "dot_general"]
+    assert not [product for product in products if "HIGHEST" not in product]

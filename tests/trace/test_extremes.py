@@ -1,12 +1,17 @@
 """`cast` at the extremes: a right answer or a clear status, never a nan."""
 
+import re
+
 import aimed
+import jax
+import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
 from compare import COUNT, DOWN, DTYPES, ROUGH, compare_with_oracle, every_family, heightfield, numpied
 
 import jaxhf
+import jaxhf.mujoco
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -163,6 +168,37 @@ def test_from_a_million_widths_away(dtype):
     )
     np.testing.assert_array_equal(hit["status"], jaxhf.Status.HIT)
     np.testing.assert_allclose(hit["uv"], uv.T, atol=0.15 if dtype is np.float32 else 1e-9)  # 0.5 of 8, and 4 / 10 by z
+
+
+MANY = jax.ShapeDtypeStruct((600, 1025, 1025), jnp.float32)  # whose bounds are 600 * 4192256 > 2^31 numbers
+STARTS = jnp.ones((600, 1, 3), jnp.float32)
+
+
+def of_batch(heights):
+    return jaxhf.cast(jax.vmap(lambda z: jaxhf.Heightfield(z, 1.0))(heights), STARTS, DOWN).t
+
+
+def of_prepared(heights):
+    return jaxhf.cast(jaxhf.prepare(jax.vmap(lambda z: jaxhf.Heightfield(z, 1.0))(heights)), STARTS, DOWN).t
+
+
+def of_hfields(heights):
+    return jaxhf.mujoco.ray(jaxhf.mujoco.HField(heights, np.ones(4)), STARTS, DOWN)[0]
+
+
+@pytest.mark.parametrize("traced", [of_batch, of_prepared, of_hfields])
+def test_places_in_what_heightfields_share_are_32_bit_integers(traced):
+    """Shapes alone: so few share their arrays that no place overflows."""
+    arrays = [int(size) for size in re.findall(r"f32\[(\d+)\]", str(jax.make_jaxpr(traced)(MANY)))]
+    assert 2**25 < max(arrays) < 2**31
+
+
+def test_more_heightfields_than_32_bits_address_are_refused():
+    cast = jax.vmap(lambda z, o: jaxhf.cast(jaxhf.Heightfield(z, 1.0), o, DOWN).t)
+    message = "^600 heightfields under a vmap share an array of 2515353600 numbers, at most 2147483647 can be addressed"
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(cast, MANY, STARTS)
+    assert jax.eval_shape(cast, jax.ShapeDtypeStruct((512, 1025, 1025), jnp.float32), STARTS[:512]).shape == (512, 1)
 
 
 def random_bits(seed: int) -> np.ndarray:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from ...core.affine import rotate, scale, translate
 from ...core.errors import UserError
+from ...core.precision import fitted
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
 from ...scene.light import Directional, Light, Point
@@ -124,7 +125,7 @@ def _heightfield(args: Arguments, dtype: np.dtype) -> Heightfield:
         k = int(bad[0])
         message = f"Pz[{k}] (column {k % nu}, row {k // nu}) must be finite in {dtype}, it is {z[k]}"
         raise args.error("float Pz", message, k)
-    return Heightfield(heights.reshape(nv, nu))
+    return Heightfield(fitted(z, dtype).reshape(nv, nu))
 
 
 def _cylinder(args: Arguments, dtype: np.dtype) -> Cylinder:

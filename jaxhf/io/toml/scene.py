@@ -15,6 +15,7 @@ from numpy.typing import DTypeLike
 
 from ...core.affine import require_invertible
 from ...core.errors import ArgumentError
+from ...core.precision import fitted
 from ...scene.camera import Camera
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
@@ -25,7 +26,7 @@ from .. import procedural
 from ..errors import SceneError, nearest, resolve_inside
 from ..images import load_image
 from ..load_terrain import jacksboro_file, read_terrain
-from ..terrain import Terrain, fitted
+from ..terrain import Terrain
 from .checks import Part
 from .lines import line_numbers
 from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, OBJECT, ORIGINS, SCENE, TEXTURES, Key, Keys

@@ -1,0 +1,57 @@
+"""Heights of a caller's or of a file in the precision of what is made of them."""
+
+import math
+import warnings
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from .errors import ArgumentError
+
+WORTH_A_WARNING = 1e-3  # of the relief
+
+
+def fitted(heights: np.ndarray, dtype: DTypeLike, owner: str = "") -> np.ndarray:
+    """The heights in another precision, with a warning where one moves by more than a thousandth of their relief.
+
+    Args:
+      heights: of any shape; what is not finite is a hole.
+      dtype: float32 or float64.
+      owner: see `ArgumentError`, which is raised where a height does not fit, as an infinite one would count as a hole.
+    """
+    moved = rounding(heights, dtype)
+    if moved == math.inf:
+        largest = np.abs(heights[np.isfinite(heights)]).max()
+        raise ArgumentError(owner, "heights", f"must fit into {np.dtype(dtype)}, the largest is {largest:.3g}")
+    if moved > WORTH_A_WARNING:
+        place = f"{owner}: heights" if owner else "heights"
+        warnings.warn(
+            f"{place} are rounded to {np.dtype(dtype)}, which moves one by {100 * moved:.3g} % of the relief: subtract a "
+            "constant from them, such as the lowest",
+            stacklevel=2,
+        )
+    return heights.astype(dtype)
+
+
+def rounding(heights: np.ndarray, dtype: DTypeLike) -> float:
+    """By how much of their relief heights move at most in another precision.
+
+    0 where that is certainly not `WORTH_A_WARNING`, which takes no more than their range; inf where one does not fit.
+    """
+    kind = np.finfo(dtype)
+    if np.can_cast(heights.dtype, kind.dtype):
+        return 0.0
+    low, high = (float(of.reduce(heights, axis=None)) for of in (np.fmin, np.fmax))
+    if not math.isfinite(high - low):
+        heights = heights[np.isfinite(heights)]
+        if not heights.size:
+            return 0.0
+        low, high = float(heights.min()), float(heights.max())
+    largest, relief = max(abs(low), abs(high)), high - low
+    with np.errstate(over="ignore", under="ignore"):
+        if np.isinf(kind.dtype.type(largest)):
+            return math.inf
+        if max(largest * kind.eps, kind.tiny) <= WORTH_A_WARNING * relief or relief == 0:
+            return 0.0
+        moved = heights.astype(dtype).astype(np.float64) - heights
+    return float(np.fmax.reduce(np.abs(moved[np.isfinite(moved)]), axis=None)) / relief
