@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
@@ -113,6 +114,7 @@ def sky_view(
     if weighting != "slope":
         return found
     normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
+    normals = normals / lax.stop_gradient(jnp.max(jnp.abs(normals), -1, keepdims=True))  # whose squares are numbers
     received = jnp.sum(jnp.moveaxis(found, 0, -1) * normals, -1) / jnp.linalg.norm(normals, axis=-1)
     return jnp.maximum(received, 0)
 
