@@ -24,7 +24,7 @@ from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
-from ..core.vector import largest_component, unit
+from ..core.vector import largest_component, quotient, unit
 from ..scene.camera import Camera
 from ..scene.light import Point, casts_sharp_shadows
 from ..trace.cylinder import Tube, tube_distance
@@ -194,7 +194,7 @@ def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Float[
             d = local.d / size
             slope = d[2] - a * d[0] - b * d[1]
             grazing = (slope == 0) | ~point.valid
-            step = jnp.where(grazing, 0, (c + a * u + b * v - local.o[2]) / jnp.where(grazing, 1, slope)) / size
+            step = jnp.where(grazing, 0, quotient(c + a * u + b * v - local.o[2], jnp.where(grazing, 1, slope))) / size
             landed = jnp.where(point.receiver == k, near + step * away, landed)
         else:
             ray = Ray(p, away)
@@ -224,6 +224,6 @@ def picture_point(
     ahead = affine(jnp.asarray(camera.world_from_camera)).point(jnp.array([0, 0, 1], p.dtype))
     at = materialise(camera.film_from_world()(materialise(jnp.where(point.valid, p, lax.stop_gradient(ahead)))))
     before = (at[2] > 0) & (at[3] > 0)
-    x = at[:2] / jnp.where(before, at[2], 1)
+    x = quotient(at[:2], jnp.where(before, at[2], 1))
     size = jnp.array([camera.width, camera.height], x.dtype)
     return x, point.valid & before & (x >= 0).all() & (x < size).all()

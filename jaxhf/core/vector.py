@@ -1,13 +1,55 @@
-"""Vectors of three numbers: lengths and directions that neither over- nor underflow."""
+"""Vectors, and quotients: lengths, directions, angles and distances that, and whose derivatives, neither over- nor underflow.
 
+A guard `b != 0` does not make a / b safe: where b is tiny, JAX's derivative -a / b² is infinite, and where a `where` passes
+over the quotient, that infinity times zero is nan. So whatever may be tiny divides by `quotient` or `time_to`.
+"""
+
+import functools
+import operator
+
+import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Float
 
+from .powers import floor_to_power_of_two
 from .types import Flag, Scalar, Vector
 
+# Along an axis in which it moves less than 1 / FAR, a ray counts as standing still; its distance to the next plane there is
+# then large, but finite in single precision whatever it is multiplied with later.
+FAR = 1e30
 
-def dot(a: Vector, b: Vector) -> Scalar:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+@jax.custom_jvp
+def quotient(a: Float[jax.Array, "*shape"], b: Float[jax.Array, "*of"]) -> Float[jax.Array, "*shape"]:
+    """a / b for a b that is not zero; the derivative (da - a / b db) / b has no square of b in it."""
+    return a / b
+
+
+@quotient.defjvp
+def _quotient_jvp(primals, tangents):
+    (a, b), (da, db) = primals, tangents
+    whole = a / b
+    return whole, (da - whole * db) / b
+
+
+def time_to(distance: Scalar, rate: Scalar) -> tuple[Scalar, Flag]:
+    """distance / rate, and whether that is below `FAR`; else it is 0 with derivative 0, as where the rate is 0."""
+    ever = jnp.abs(distance) < FAR * jnp.abs(rate)
+    return quotient(jnp.where(ever, distance, 0), jnp.where(ever, rate, 1)), ever
+
+
+def angle(y: Scalar, x: Scalar) -> Scalar:
+    """atan2(y, x); 0 with derivative 0 where both are 0, and finite where their squares underflow."""
+    size = lax.stop_gradient(greater(jnp.abs(y), jnp.abs(x)))
+    zero = size == 0
+    size = floor_to_power_of_two(jnp.where(zero, 1, size))
+    return jnp.arctan2(jnp.where(zero, 0, y) / size, jnp.where(zero, 1, x) / size)
+
+
+def dot(a: Float[jax.Array, " n"], b: Float[jax.Array, " n"]) -> Scalar:
+    """Written out, as XLA on the CPU calls a library for a reduction, however short."""
+    return functools.reduce(operator.add, (a[k] * b[k] for k in range(a.shape[0])))
 
 
 def lesser(a: Scalar, b: Scalar) -> Scalar:
@@ -28,16 +70,16 @@ def within(x: Scalar, least: Scalar | float, most: Scalar | float) -> Scalar:
     return lesser(greater(x, jnp.asarray(least, x.dtype)), jnp.asarray(most, x.dtype))
 
 
-def largest_component(v: Vector) -> Scalar:
-    """max |v_i|. Written out, as XLA on the CPU calls a library for a reduction, however short; nan is passed over."""
-    return greater(greater(jnp.abs(v[0]), jnp.abs(v[1])), jnp.abs(v[2]))
+def largest_component(v: Float[jax.Array, " n"]) -> Scalar:
+    """max |v_i|, written out as `dot` is; nan is passed over."""
+    return functools.reduce(greater, (jnp.abs(v[k]) for k in range(v.shape[0])))
 
 
 def finite(v: Vector) -> Flag:
     return jnp.isfinite(v[0]) & jnp.isfinite(v[1]) & jnp.isfinite(v[2])
 
 
-def unit(v: Vector) -> Vector:
+def unit(v: Float[jax.Array, " n"]) -> Float[jax.Array, " n"]:
     """`v` at length 1; a zero vector stays zero, with zero derivative. Neither over- nor underflows on the way."""
     largest = lax.stop_gradient(largest_component(v))  # any factor does; its own derivative has its square in it
     zero = largest == 0

@@ -114,7 +114,7 @@ def sky_view(
     if weighting != "slope":
         return found
     normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
-    normals = normals / lax.stop_gradient(jnp.max(jnp.abs(normals), -1, keepdims=True))  # areas may have no square
+    normals = normals / lax.stop_gradient(jnp.max(jnp.abs(normals), -1, keepdims=True))  # whose squares are numbers
     received = jnp.sum(jnp.moveaxis(found, 0, -1) * normals, -1) / jnp.linalg.norm(normals, axis=-1)
     return jnp.maximum(received, 0)
 

@@ -6,6 +6,7 @@ from jaxtyping import Float
 
 from ..core.affine import Affine
 from ..core.types import Vector
+from ..core.vector import angle, largest_component, unit
 
 Quaternion = Float[jax.Array, "4"]
 
@@ -24,9 +25,8 @@ def rotation(quat: Quaternion) -> Float[jax.Array, "3 3"]:
 
 def _normalised(quat: Quaternion) -> Quaternion:
     """Of length 1; the identity for one shorter than 1e-15, as `mju_normalize4` has it."""
-    square = (quat * quat).sum()
-    short = square < 1e-30
-    return jnp.where(short, jnp.array([1, 0, 0, 0], quat.dtype), quat / jnp.sqrt(jnp.where(short, 1, square)))
+    short = largest_component(quat) < 1e-15
+    return unit(jnp.where(short, jnp.array([1, 0, 0, 0], quat.dtype), quat))
 
 
 def pose(pos: Vector, quat: Quaternion) -> Affine:
@@ -37,6 +37,6 @@ def pose(pos: Vector, quat: Quaternion) -> Affine:
 def yaw(quat: Quaternion) -> Quaternion:
     """The rotation about z alone that a rotation holds, of its angles yaw, pitch, roll (z-y'-x'')."""
     w, x, y, z = _normalised(quat)
-    half = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
+    half = angle(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / 2
     zero = jnp.zeros_like(half)
     return jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])

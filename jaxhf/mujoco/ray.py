@@ -17,7 +17,7 @@ from ..core.errors import ArgumentError, require_kind
 from ..core.materialise import apart, materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import finite, unit
+from ..core.vector import finite, quotient, unit
 from ..rendering.chunks import trace_batch
 from ..trace.grid import Grid, joined
 from ..trace.intersect import plane_distance, ray_in_grid
@@ -134,7 +134,7 @@ def _one(ready: tuple[Ground, Grid], ray: Ray) -> Met:
     found = first_triangle(grid, scaled, max_steps=None, t_max=limit * scale)
     found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
     found = stored(materialise(found))
-    return nearest(hfield, local, frame, found, [*faces, *walls(hfield, local, within, faces[1], found.side < 0)])
+    return nearest(hfield, local, frame, found, [*faces, *walls(hfield, local, within, found.side < 0)])
 
 
 def in_hfield(frame: Affine, ray: Ray) -> Ray:
@@ -150,7 +150,7 @@ def in_cells(hfield: Ground, local: Ray) -> Ray:
     half = jnp.array([(ncol - 1) / 2, (nrow - 1) / 2, 1], local.o.dtype)
     centre = jnp.array([1, 1, 0], local.o.dtype)
     size = hfield.size[:3]
-    return Ray((local.o / size + centre) * half, local.d / size * half)
+    return Ray((quotient(local.o, size) + centre) * half, quotient(local.d, size) * half)
 
 
 def triangle_heights(hfield: Ground, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
@@ -182,7 +182,7 @@ def nearest(hfield: Ground, local: Ray, frame: Affine, found: WalkResult, solid:
     t = plane_distance(plane, cells, found)
     at, size = cells(t), hfield.size
     u, v = at[0] - found.ix.astype(t.dtype), at[1] - found.iy.astype(t.dtype)
-    per_x, per_y = a * size[2] * ((ncol - 1) / 2) / size[0], b * size[2] * ((nrow - 1) / 2) / size[1]
+    per_x, per_y = quotient(a * size[2] * ((ncol - 1) / 2), size[0]), quotient(b * size[2] * ((nrow - 1) / 2), size[1])
     surface = Side(t, found.status == int(Status.HIT), unit(jnp.stack([-per_x, -per_y, jnp.ones_like(a)])))
     best = Side(jnp.full_like(t, jnp.inf), jnp.zeros((), bool), jnp.zeros_like(surface.n))
     for side in (*solid, surface):

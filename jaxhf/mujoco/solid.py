@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
+from ..core.vector import time_to
 from .hfield import HField
 
 _ROUNDING = 16  # units in the last place by which the height of a wall's rim may be off
@@ -61,12 +62,12 @@ def column(hfield: Ground, ray: Ray) -> Column:
     near, far = [], []
     for axis in (0, 1):
         d, half = ray.d[axis], hfield.size[axis]
-        still, inside = d == 0, jnp.abs(ray.o[axis]) <= half
-        ahead, rate = jnp.where(d > 0, 1, -1).astype(d.dtype), jnp.where(still, 1, d)
+        inside, ahead = jnp.abs(ray.o[axis]) <= half, jnp.where(d > 0, 1, -1).astype(d.dtype)
         always, never = jnp.where(inside, -jnp.inf, jnp.inf), jnp.where(inside, jnp.inf, -jnp.inf)
         n = jnp.zeros(3, d.dtype).at[axis].set(ahead)
-        near.append((jnp.where(still, always, (-ahead * half - ray.o[axis]) / rate), -n))
-        far.append((jnp.where(still, never, (ahead * half - ray.o[axis]) / rate), n))
+        for planes, place, instead, normal in ((near, -half, always, -n), (far, half, never, n)):
+            t, ever = time_to(ahead * place - ray.o[axis], d)
+            planes.append((jnp.where(ever, t, instead), normal))
     (near_x, in_x), (near_y, in_y), (far_x, out_x), (far_y, out_y) = *near, *far
     first, last = near_x < near_y, far_x > far_y
     t_in, t_out = jnp.where(first, near_y, near_x), jnp.where(last, far_y, far_x)
@@ -76,35 +77,33 @@ def column(hfield: Ground, ray: Ray) -> Column:
 
 def base_faces(hfield: Ground, ray: Ray, within: Column) -> list[Side]:
     """The upper face of the base, and the floor."""
-    still = ray.d[2] == 0
-    rate = jnp.where(still, 1, ray.d[2])
-    up = jnp.array([0, 0, 1], rate.dtype)
+    up = jnp.array([0, 0, 1], ray.d.dtype)
     faces = []
-    for level, n in ((jnp.zeros_like(rate), up), (-hfield.size[3], -up)):
-        t = (level - ray.o[2]) / rate
-        faces.append(Side(t, ~still & (t >= 0) & (within.enters.t <= t) & (t <= within.leaves.t), n))
+    for level, n in ((jnp.zeros_like(ray.d[2]), up), (-hfield.size[3], -up)):
+        t, ever = time_to(level - ray.o[2], ray.d[2])
+        faces.append(Side(t, ever & (t >= 0) & (within.enters.t <= t) & (t <= within.leaves.t), n))
     return faces
 
 
-def walls(hfield: Ground, ray: Ray, within: Column, floor: Side, below: Flag) -> list[Side]:
+def walls(hfield: Ground, ray: Ray, within: Column, below: Flag) -> list[Side]:
     """The walls where the ray enters the column and where it leaves it.
 
     Args:
       hfield: one.
       ray: in its frame.
       within: the ray's column.
-      floor: of `base_faces`.
       below: whether the ray is below the surface, for where rounding cannot tell at the rim: so nothing gets in between a
         wall and the surface.
     """
-    return [_wall(hfield, ray, side, floor.t, below) for side in (within.enters, within.leaves)]
+    return [_wall(hfield, ray, side, below) for side in (within.enters, within.leaves)]
 
 
-def _wall(hfield: Ground, ray: Ray, side: Side, t_floor: Scalar, below: Flag) -> Side:
+def _wall(hfield: Ground, ray: Ray, side: Side, below: Flag) -> Side:
     """The side where it lies over the floor and below the rim."""
     t = jnp.where(side.met & jnp.isfinite(side.t), side.t, 0)
     p, up = ray(t), ray.d[2]
-    over_floor = jnp.where(up > 0, t >= t_floor, jnp.where(up < 0, t <= t_floor, ray.o[2] >= -hfield.size[3]))
+    t_floor, ever = time_to(-hfield.size[3] - ray.o[2], up)
+    over_floor = jnp.where(ever, jnp.where(up > 0, t >= t_floor, t <= t_floor), ray.o[2] >= -hfield.size[3])
     nrow, ncol = hfield.shape
     along_x = side.n[1] != 0
     c, u = _cell(p[0] / hfield.size[0], ncol)

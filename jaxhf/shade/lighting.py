@@ -12,7 +12,7 @@ from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, greater, largest_component, unit, within
+from ..core.vector import dot, greater, largest_component, quotient, unit, within
 from ..scene.light import Directional, Point, Sky, Sun
 from ..trace.cylinder import Tube
 from ..trace.grid import Grid
@@ -29,6 +29,8 @@ GRAZING = 0.01
 _CHORDS = 8
 # Altitude up to which slopes are told apart, radians.
 _STEEPEST = np.deg2rad(89.9)
+# So near to the zenith, radians, the sun has no azimuth: chords across x then do as well as any.
+_NO_AZIMUTH = 1e-4
 
 
 def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vector, Index]:
@@ -45,7 +47,7 @@ def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vecto
     if isinstance(light, Sun):
         seen, exhausted = _disc(world, light, hit, active)
         share = jnp.where(seen.share > 0, seen.share, 1)
-        return light.irradiance * seen.share * _cosine(world, seen.mean / share, hit), exhausted
+        return light.irradiance * seen.share * _cosine(world, quotient(seen.mean, share), hit), exhausted
     wi, arriving, distance = materialise(_towards(light, hit.p))
     lit, exhausted = _visible(number, world, wi, distance, hit, active)
     return jnp.where(lit, arriving * _cosine(world, wi, hit), 0), exhausted
@@ -122,36 +124,34 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
 
     The disc is cut into vertical chords, at the nodes of Gauss's and Chebyshev's quadrature of the second kind, whose weight is
     the chords' length. In the plane of a chord all that is below the horizon is hidden: what is left of it, and its middle, are
-    known exactly.
+    known exactly. Angles there count from the chord's middle, and may go beyond the zenith.
     """
     dtype = hit.p.dtype
     wi, radius = unit(sun.towards), jnp.deg2rad(sun.angular_diameter) / 2
-    below = jnp.sqrt(wi[0] * wi[0] + wi[1] * wi[1])
-    upright = below < 1e-6  # then any direction is that of its azimuth
-    along = jnp.where(upright, jnp.array([1, 0], dtype), wi[:2] / jnp.where(upright, 1, below))
+    along = unit(jnp.where(largest_component(wi[:2]) < _NO_AZIMUTH, jnp.array([1, 0], dtype), wi[:2]))
     aside = jnp.stack([along[1], -along[0]])
     n = hit.n * hit.side.astype(dtype)
     lit = active & _is_outside(world, hit)
 
     def chord(total: tuple[_Seen, Index], node: tuple[Scalar, Scalar]) -> tuple[tuple[_Seen, Index], None]:
         seen, exhausted = total
-        off, half = radius * node[0], radius * node[1]
-        level = below * along + off * aside
-        size = jnp.sqrt(level[0] * level[0] + level[1] * level[1])
-        level = jnp.stack([*(level / size), jnp.zeros((), dtype)])
-        middle = jnp.arctan2(wi[2], size)
-        bottom, top = (within(middle + end, -_STEEPEST, _STEEPEST) for end in (-half, half))
-        lowest, highest = jnp.tan(bottom), jnp.tan(top)
-        slope = greater(_own_slope(n, level, jnp.tan(within(middle, -_STEEPEST, _STEEPEST))), lowest)
+        half, foot = radius * node[1], wi[:2] + radius * node[0] * aside
+        level = jnp.stack([*unit(foot), jnp.zeros((), dtype)])
+        centre = unit(jnp.stack([*foot, wi[2]]))
+        middle = jnp.arctan2(wi[2], dot(foot, level[:2]))
+        lowest, mean, highest = (jnp.tan(within(middle + end, -_STEEPEST, _STEEPEST)) for end in (-half, 0, half))
+        slope = greater(_own_slope(n, level, mean), lowest)
         for number, surface in enumerate(world.surfaces):
             if world.settings.shadows and isinstance(surface, Grid):
                 slope, more = skyline_slope(surface, number, hit.p, level, hit, lit, (slope, highest), world.settings.max_steps)
                 exhausted = exhausted + more.astype(jnp.int32)
-        horizon = within(jnp.arctan(slope), bottom, top)
-        weight = 2 * node[1] * node[1] / (_CHORDS + 1) * ((top - horizon) / (top - bottom))
+        horizon = jnp.where(slope < jnp.inf, within(jnp.arctan(slope) - middle, -half, half), half)
+        horizon = jnp.where(slope > lowest, horizon, -half)
+        weight = 2 * node[1] * node[1] / (_CHORDS + 1) * quotient(half - horizon, 2 * half)
         weight = jnp.where(lit, weight, 0)
-        height = (horizon + top) / 2
-        direction = jnp.cos(height) * level + jnp.stack([jnp.zeros((), dtype)] * 2 + [jnp.sin(height)])
+        higher = (horizon + half) / 2
+        upwards = jnp.stack([*(-centre[2] * level[:2]), dot(centre, level)])
+        direction = jnp.cos(higher) * centre + jnp.sin(higher) * upwards
         return (_Seen(seen.share + weight, seen.mean + weight * direction), exhausted), None
 
     turns = np.arange(1, _CHORDS + 1) * (np.pi / (_CHORDS + 1))

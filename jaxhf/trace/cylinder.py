@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from ..core.affine import Affine
 from ..core.ray import Ray
 from ..core.types import Flag, Scalar
-from ..core.vector import dot, largest_component, lesser, unit
+from ..core.vector import angle, dot, largest_component, lesser, quotient, unit
 from ..scene.cylinder import Cylinder
 from .hit import Hit, orthogonal_tangents
 from .status import Status
@@ -50,7 +50,7 @@ def tube_distance(tube: Tube, ray: Ray, left: Flag | None) -> tuple[Scalar, Flag
     real = (square > 0) & (a > 0)
     root = jnp.sqrt(jnp.where(real, square, 1))
     q = -(half + jnp.where(half < 0, -root, root))
-    one, two = q / jnp.where(real, a, 1), c / jnp.where(q == 0, 1, q)
+    one, two = quotient(q, jnp.where(real, a, 1)), quotient(c, jnp.where(q == 0, 1, q))
 
     def reached(t):
         z = o[2] + t * d[2]
@@ -72,7 +72,7 @@ def cylinder_hit(tube: Tube, ray: Ray, left: Flag | None, number: int, active: F
     local = tube.object_from_world.point(p)
     x, y = jnp.where(found, local[0], 1), jnp.where(found, local[1], 0)
     turn = 2 * jnp.pi
-    phi = jnp.atan2(y, x)
+    phi = angle(y, x)
     phi = jnp.where(phi < 0, phi + turn, phi)
     zero, height = jnp.zeros_like(x), tube.z_max - tube.z_min
     n = unit(tube.object_from_world.covector(jnp.stack([x, y, zero])))
@@ -90,10 +90,10 @@ def cylinder_hit(tube: Tube, ray: Ray, left: Flag | None, number: int, active: F
         p=p,
         n=n,
         ns=n,
-        uv=jnp.stack([phi / turn, (local[2] - tube.z_min) / height]),
+        uv=jnp.stack([phi / turn, quotient(local[2] - tube.z_min, height)]),
         dp_du=dp_du,
         dp_dv=dp_dv,
-        dn_du=(bend - n * dot(n, bend)) / scale,
+        dn_du=quotient(bend - n * dot(n, bend), scale),
         dn_dv=jnp.zeros_like(n),
         cell=jnp.zeros(2, jnp.int32),
         triangle=none,

@@ -16,7 +16,7 @@ from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Scalar, Vector
-from ..core.vector import dot, finite, largest_component, unit
+from ..core.vector import dot, finite, largest_component, quotient, unit
 from .cylinder import Tube, cylinder_hit, tube_distance
 from .grid import Grid, triangle_plane
 from .hit import Hit, orthogonal_tangents
@@ -179,7 +179,7 @@ def plane_distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: WalkRe
     u, v = o[0] - found.ix.astype(o.dtype), o[1] - found.iy.astype(o.dtype)
     slope = d[2] - a * d[0] - b * d[1]
     grazing = (slope == 0) | (found.status != int(Status.HIT))
-    step = jnp.where(grazing, 0, (c + a * u + b * v - o[2]) / jnp.where(grazing, 1, slope))
+    step = jnp.where(grazing, 0, quotient(c + a * u + b * v - o[2], jnp.where(grazing, 1, slope)))
     t = found.t_near + step
     return t + lax.stop_gradient(jnp.clip(t, found.t_near, found.t_far) - t)
 

@@ -12,6 +12,7 @@ from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.settings import NormalScheme
 from ..core.types import AnyArray, Flag
+from ..core.vector import quotient
 
 # The triangles round a vertex, counter-clockwise: each is spanned by two neighbouring offsets (ix, iy).
 _FANS = {
@@ -36,12 +37,13 @@ def vertex_normals(
     if not isinstance(scheme, str):
         branches = [functools.partial(vertex_normals, dx=dx, dy=dy, scheme=name) for name in ("six-angle", "six")]
         return lax.cond(scheme, *branches, heights)
-    # Products of two huge heights would be larger than any number in single precision. Any unit will do, and a power of two
-    # changes no bit.
-    largest = jnp.max(jnp.abs(jnp.where(jnp.isfinite(heights), heights, 0)))
-    unit = floor_to_power_of_two(jnp.maximum(largest * 2.0**-61, 1))
+    # Products of two huge heights, or of two tiny cells, are no numbers in single precision. Any unit will do, and a power of
+    # two changes no bit.
+    largest = jnp.max(jnp.abs(jnp.where(jnp.isfinite(heights), heights, 0))) * 2.0**-61
     if scheme == "central":
+        unit = floor_to_power_of_two(jnp.maximum(largest, 1))
         return _central(heights / unit, dx, dy, 1 / unit)
+    unit = floor_to_power_of_two(jnp.maximum(jnp.maximum(largest, dx), dy))
     weight = {"six": "area", "six-angle": "angle"}.get(scheme, "equal")
     return _fan_mean(heights / unit, dx / unit, dy / unit, _FANS[scheme.split("-")[0]], weight)
 
@@ -88,23 +90,23 @@ def _fan_mean(heights, dx, dy, fan, weight):
         z = jnp.where(present, (ax * by - ay * bx) * dx * dy, 0)  # x and y are zero where there is no triangle
         if weight != "area":
             length = _length(x, y, jnp.where(present & (z > 0), z, 1))
-            share = 1 / length
+            angle = jnp.ones_like(length)
             if weight == "angle":
-                share = share * jnp.atan2(length, ax * bx * dx * dx + ay * by * dy * dy + az * bz)
-            share = materialise(share)
+                angle = jnp.atan2(length, ax * bx * dx * dx + ay * by * dy * dy + az * bz)
+            share = materialise(quotient(angle, length))
             x, y, z = x * share, y * share, z * share
         total_x, total_y, total_z = total_x + x, total_y + y, total_z + z
     # Zero, where there is no triangle; or less than any number, beside slopes that are larger than any.
     nothing = (total_x == 0) & (total_y == 0) & (total_z == 0)
     total_z = jnp.where(nothing, 1, total_z)
     if weight == "angle":
-        unit = 1 / _length(total_x, total_y, total_z)
+        unit = quotient(jnp.ones_like(total_z), _length(total_x, total_y, total_z))
         total_x, total_y, total_z = total_x * unit, total_y * unit, total_z * unit
     return jnp.stack([total_x, total_y, total_z], axis=-1)
 
 
 def _length(x, y, z):
-    """The length of nonzero vectors, without overflow."""
-    largest = jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z))
+    """The length of nonzero vectors, without overflow; any factor does for that, and needs no derivative."""
+    largest = lax.stop_gradient(jnp.maximum(jnp.maximum(jnp.abs(x), jnp.abs(y)), jnp.abs(z)))
     x, y, z = x / largest, y / largest, z / largest
     return largest * jnp.sqrt(x * x + y * y + z * z)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from ..core.affine import Affine
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
-from ..core.vector import dot, largest_component, unit
+from ..core.vector import dot, largest_component, time_to, unit
 from ..scene.skirt import Skirt
 from .hit import Hit, orthogonal_tangents
 from .status import Status
@@ -23,7 +23,7 @@ class Walls(eqx.Module):
     Attributes:
       tops: heights of the border: south, north, west, east, one after the other.
       base: z of the floor.
-      tallest: the height of the tallest wall, above zero.
+      tallest: the height of the tallest wall.
       size: of the footprint, x and y.
     """
 
@@ -43,7 +43,7 @@ def make_walls(skirt: Skirt, world_from_object: Affine | None) -> Walls:
     cells = len(skirt.south) - 1, len(skirt.west) - 1
     size = cells[0] * skirt.dx, cells[1] * skirt.dy
     base = jnp.asarray(skirt.base, dtype)
-    tallest = jnp.maximum(jnp.nanmax(tops) - base, jnp.finfo(dtype).tiny)
+    tallest = jnp.max(jnp.where(jnp.isfinite(tops), tops, base)) - base
     return Walls(tops, base, tallest, size, cells, world, world.inverse())
 
 
@@ -68,10 +68,8 @@ def wall_distance(walls: Walls, ray: Ray, left: Flag | None, left_side: Index | 
     planes = [(1, 0.0, 0, size_x, cells_x), (1, size_y, 0, size_x, cells_x), (0, 0.0, 1, size_y, cells_y),
               (0, size_x, 1, size_y, cells_y), (2, walls.base, 0, size_x, 0)]  # fmt: skip
     for side, (axis, place, along, length, cells) in enumerate(planes):
-        still = d[axis] == 0
-        rate = jnp.where(still, 1, d[axis])
-        t = (place - o[axis]) / rate
-        at = o + t * d
+        t, ever = time_to(place - o[axis], d[axis])
+        at, rate = o + t * d, jnp.where(ever, d[axis], 1)
         off = jnp.abs(o) + jnp.abs(at) + (jnp.abs(o[axis]) + jnp.abs(place)) / jnp.abs(rate) * jnp.abs(d)
         outwards = -1 if side in (0, 2, _FLOOR) else 1
         wider = jnp.where(outwards * d[axis] < 0, wide, -wide) * off
@@ -86,7 +84,7 @@ def wall_distance(walls: Walls, ray: Ray, left: Flag | None, left_side: Index | 
             more = wider[2] + jnp.abs(high - low) * (cells / length) * wider[along]
             inside = inside & (at[2] >= walls.base - wider[2]) & (at[2] <= top + more)
             first += cells + 1
-        met = ~still & (t > 0) & (t < best) & inside
+        met = ever & (t > 0) & (t < best) & inside
         if left is not None:
             met = met & ~(left & (left_side == side))
         best, found, number = jnp.where(met, t, best), found | met, jnp.where(met, side, number)
@@ -107,7 +105,7 @@ def wall_hit(walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: F
     outwards = jnp.array([[0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, -1]], dtype)[side]
     along_x, floor = (side < 2) | (side == _FLOOR), side == _FLOOR
     u = jnp.where(along_x, local[0] / size_x, local[1] / size_y)
-    v = jnp.where(floor, local[1] / size_y, (local[2] - walls.base) / walls.tallest)
+    v = jnp.where(floor, local[1] / size_y, time_to(local[2] - walls.base, walls.tallest)[0])
     n = unit(walls.object_from_world.covector(outwards))
     zero = jnp.zeros((), dtype)
     per_u = jnp.where(along_x, jnp.stack([zero + size_x, zero, zero]), jnp.stack([zero, zero + size_y, zero]))

@@ -15,7 +15,7 @@ from ..core.autodiff import stored
 from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import greater, lesser
+from ..core.vector import greater, lesser, quotient
 from .grid import Grid, triangle_plane
 from .hit import Hit
 from .search import SKIPS, enough_steps
@@ -81,9 +81,9 @@ def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index) -> Scalar:
     e = grid.world_from_grid.vector(jnp.stack([*step.astype(o.dtype), z1 - z0]))
     across = level[0] * e[1] - level[1] * e[0]
     t, s = to[0] * e[1] - to[1] * e[0], to[0] * level[1] - to[1] * level[0]  # both times `across`
-    known = known & (t * across > 0)
+    known = known & (t != 0) & ((t > 0) == (across > 0))  # their product may underflow
     rise = to[2] * across + s * e[2]
-    return jnp.where(known, rise / jnp.where(known, t, 1), -jnp.inf)
+    return jnp.where(known, quotient(rise, jnp.where(known, t, 1)), -jnp.inf)
 
 
 def _highest_edge(

@@ -21,15 +21,10 @@ from jaxtyping import Bool, Float, UInt32
 
 from ..core.materialise import materialise
 from ..core.types import Flag, Index, Scalar
-from ..core.vector import greater, lesser
+from ..core.vector import FAR, greater, lesser
 from .pyramid import Pyramid
 from .status import Status
 from .triangle import corners
-
-# Along an axis in which it moves less than 1 / FAR, a ray counts as standing still; its distance to the next plane there is
-# then large, but finite in single precision whatever it is multiplied with later.
-FAR = 1e30
-
 
 # The state of a walk is one unsigned integer, as every further carried array would repeat the step's arithmetic in a
 # kernel of its own. From its lowest bit on: the status (2 bits); whether the ray is above the surface; x, with the size of

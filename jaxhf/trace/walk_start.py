@@ -8,10 +8,10 @@ from jax import lax
 from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
-from ..core.vector import finite, lesser
+from ..core.vector import FAR, finite, lesser
 from .grid import Grid, triangle_plane
 from .hit import Hit
-from .walk import FAR, LEAVING, MISS, WALKING, Walk, reciprocal
+from .walk import LEAVING, MISS, WALKING, Walk, reciprocal
 
 
 class _SurfaceStart(eqx.Module):
