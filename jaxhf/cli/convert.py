@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import UserError
-from . import arguments, interruption
+from . import arguments
 
 
 def add(commands: Any) -> None:
@@ -38,7 +38,6 @@ def run(options: argparse.Namespace) -> None:
     else:
         require_writable_mesh(options.output)
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
-    interruption.raise_from_now_on()
     if ending in MESHES:
         save_mesh(options.output, terrain, base=options.base)
     else:

@@ -79,7 +79,6 @@ def make(
     """
     from ..io.load_terrain import read_terrain
     from ..io.rasters import require_writable_raster, save_raster
-    from . import interruption
 
     if numbers:
         require_numbers(options.output, kind)
@@ -89,7 +88,6 @@ def make(
     values = draw(terrain)
     if scaled and options.scale is None:
         report_spacing(options, terrain)
-    interruption.raise_from_now_on()
     save_raster(path, values, terrain, nodata)
     ny, nx = terrain.heights.shape
     print(f"{path}: {kind}, {nx} x {ny} pixels, {time.perf_counter() - begin:.2f} s")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.errors import UserError
 from ..core.settings import Settings
-from . import arguments, interruption
+from . import arguments
 
 if TYPE_CHECKING:
     from ..scene.scene import Scene
@@ -49,7 +49,6 @@ def run(options: argparse.Namespace) -> None:
     scene = _load(options)
     warn([scene])
     image, found, report = _timed_render(scene, settings, options.devices, aovs)
-    interruption.raise_from_now_on()
     save_image(options.output, image, aovs=found)
     print(f"{options.output}: {report}")
 

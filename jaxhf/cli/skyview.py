@@ -4,7 +4,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
-from . import arguments, interruption, mapping
+from . import arguments, mapping
 
 if TYPE_CHECKING:
     from ..io.terrain import Terrain
@@ -61,6 +61,7 @@ def read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
 def run(options: argparse.Namespace) -> None:
     import numpy as np
 
+    from ..core.errors import counted
     from ..io.rasters import require_writable_raster, save_raster
 
     path = require_writable_raster(options.output)
@@ -74,6 +75,6 @@ def run(options: argparse.Namespace) -> None:
         seen = np.asarray(sky_view(terrain, options.azimuths, weighting=options.weighting, progress=advance))
     took = time.perf_counter() - begin
     values = np.rint(255 * np.nan_to_num(np.clip(seen, 0, 1))).astype(np.uint8) if path.suffix.lower() == ".png" else seen
-    interruption.raise_from_now_on()
     save_raster(path, values, stored, nodata=None if values.dtype == np.uint8 else np.nan)
-    print(f"{path}: sky-view factor {np.nanmin(seen):.3f} .. {np.nanmax(seen):.3f}, {options.azimuths} azimuths, {took:.1f} s")
+    about = f"{counted(options.azimuths, 'azimuth')}, {took:.1f} s"
+    print(f"{path}: sky-view factor {np.nanmin(seen):.3f} .. {np.nanmax(seen):.3f}, {about}")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import ArgumentError, UserError
-from . import arguments, interruption
+from . import arguments
 
 if TYPE_CHECKING:
     import numpy as np
@@ -241,7 +241,6 @@ class _Stage:
         camera = self._camera(field, self._azimuth)
         with bar(total=self.look.samples, unit=" samples", delay=0.5) as shown:
             image = photograph(self._scene(field, camera, self.look), camera, self.look, shown.update)
-        interruption.raise_from_now_on()
         save_image(output, image)
         return f"{self.size[0]} x {self.size[1]} pixels"
 
@@ -271,5 +270,4 @@ class _Stage:
                 image = photograph(ready, camera, look)
                 add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
                 shown.update()
-            interruption.raise_from_now_on()
         return f"{options.frames} frames of {self.size[0]} x {self.size[1]} pixels"

@@ -136,17 +136,12 @@ def replacing_all(paths: Iterable[Path]) -> Iterator[list[Path]]:
         named.errno = error.errno
         raise named from error
     finally:
-        remove_temporaries(temporaries)
+        for temporary in temporaries:
+            temporary.unlink(missing_ok=True)
+        TEMPORARIES.difference_update(temporaries)
 
 
-TEMPORARIES: set[Path] = set()  # that there may be now
-
-
-def remove_temporaries(paths: Iterable[Path] | None = None) -> None:
-    """Removes what a file was to be made of; None: all of this process, which is about to end."""
-    for path in list(TEMPORARIES if paths is None else paths):
-        path.unlink(missing_ok=True)
-        TEMPORARIES.discard(path)
+TEMPORARIES: set[Path] = set()  # that there may be now: for Ctrl-C, which ends a command wherever it is
 
 
 @contextlib.contextmanager

@@ -86,6 +86,13 @@ def test_an_ending_gets_what_fits_the_command(folder, capsys, line, answer):
     assert (code, text.count("\n"), text.endswith(answer)) == (2, 1, True), text
 
 
+@pytest.mark.parametrize("line", ["info {}", "slope {} -o b.tif", "view {} -o b.png", "fit {} -o b.npz", "slope a.npy -o {}"])
+def test_an_address_is_refused_as_it_was_written(capsys, line):
+    code, text = said(capsys, *line.format("http://a/b.tif").split())
+    assert (code, text.count("\n")) == (2, 1)
+    assert text.startswith("jaxhf: error: http://a/b.tif: this is an address, files are neither read from the network nor")
+
+
 SCENE = """samples = 1
 [camera]
 type = "perspective"
