@@ -144,7 +144,7 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence
     lines += _views(case, found)
     lines.append(
         f"{outputs.heights}: {ny} x {nx} heights from {counted(len(case.targets), 'picture')}, {found.result.value}; "
-        f"{counted(found.stats['steps'], 'step')}, {found.stats['seconds']:.3g} s, loss {found.stats['loss']:.6g}, "
+        f"{counted(int(found.stats['steps']), 'step')}, {found.stats['seconds']:.3g} s, loss {found.stats['loss']:.6g}, "
         f"chi2 {found.stats['chi2']:.4g}"
     )
     return "\n".join(lines), found.warnings
