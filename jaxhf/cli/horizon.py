@@ -29,6 +29,8 @@ def run(options: argparse.Namespace) -> None:
 
     mapping.require_numbers(options.output, "angles")
     path = require_writable_raster(options.output)
+    if options.azimuth is not None:
+        arguments.refuse(options, "azimuths", because="--azimuth asks for one")
     if options.azimuth is not None and not np.isfinite(options.azimuth):
         raise ArgumentError("", "--azimuth", f"must be finite, it is {options.azimuth}")
     stored, terrain = read(options)

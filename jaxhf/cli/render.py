@@ -40,6 +40,8 @@ def run(options: argparse.Namespace) -> None:
 
     if options.aovs and Path(options.output).suffix.lower() != ".exr":
         raise UserError(f"--aovs are layers of an .exr, {options.output} is none")
+    if getattr(options, "shading", None) == "flat" and hasattr(options, "normals"):
+        raise UserError("--normals would change nothing: --shading flat takes those of the triangles")
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)

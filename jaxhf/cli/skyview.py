@@ -29,7 +29,7 @@ def add_terrain(command: argparse.ArgumentParser, output: str) -> None:
     command.set_defaults(placed=True)
     command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("-o", "--output", required=True, metavar="OUT", help=output)
-    command.add_argument("--azimuths", type=int, default=32, metavar="K", help="directions, at even steps from north on [32]")
+    command.add_argument("--azimuths", type=int, metavar="K", help="directions, at even steps from north on [32]")
     mapping.add_spacing(command, scale=False)
     arguments.add_raster(command)
     arguments.add_machine(command)
@@ -45,6 +45,7 @@ def read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
     from ..maps.surface import spacing
 
     given = spacing("", options.dx, options.dy)
+    options.azimuths = 32 if options.azimuths is None else options.azimuths
     if options.azimuths < 1:
         raise ArgumentError("", "--azimuths", f"must be a whole number from 1 on, it is {options.azimuths}")
     stored = read_terrain(options.terrain, options.z_scale, options.nodata)
