@@ -3,7 +3,7 @@
 import argparse
 import dataclasses
 from collections.abc import Collection
-from typing import get_args
+from typing import Any, get_args
 
 from ..core.errors import UserError
 from ..core.settings import Settings
@@ -14,6 +14,17 @@ TERRAIN = ".tif and others that GDAL reads, .npz, .npy, .asc, .hgt, .png (grey),
 def examples(*commands: str) -> str:
     """The end of a command's --help."""
     return "\n  ".join(("examples:", *commands))
+
+
+def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of these options that were given; where one was not, what takes them has a default of its own."""
+    return {name: value for name in names if (value := getattr(options, name)) is not None}
+
+
+def refuse(options: argparse.Namespace, *names: str, because: str) -> None:
+    """UserError where one of these options was given that would change nothing."""
+    for name in given(options, *names):
+        raise UserError(f"--{name.replace('_', '-')} would change nothing: {because}")
 
 
 def add_settings(command: argparse.ArgumentParser, names: Collection[str]) -> None:

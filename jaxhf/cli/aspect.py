@@ -23,6 +23,6 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     from ..maps.slope import NODATA, aspect
 
-    wanted = mapping.given(options, "trigonometric", "zero_for_flat", "algorithm", "compute_edges")
+    wanted = arguments.given(options, "trigonometric", "zero_for_flat", "algorithm", "compute_edges")
     nodata = None if options.zero_for_flat else NODATA
     mapping.make(options, lambda terrain: aspect(terrain, **wanted), kind="aspect", nodata=nodata, scaled=False, numbers=True)

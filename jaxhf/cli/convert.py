@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import UserError
-from . import arguments, interruption
+from . import arguments
 
 
 def add(commands: Any) -> None:
@@ -18,7 +18,9 @@ def add(commands: Any) -> None:
     command = commands.add_parser("convert", help="write a terrain in another format", description=about, epilog=examples)
     command.set_defaults(placed=True)
     command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
-    command.add_argument("output", metavar="OUT", help=".tif, .npz, .npy, .asc, .png or .exr; a mesh: .glb, .obj or .ply")
+    command.add_argument(
+        "output", metavar="OUT", help=".tif, .npz, .npy, .asc, .png (rounded) or .exr; a mesh: .glb, .obj or .ply"
+    )
     command.add_argument("--base", type=float, metavar="Z", help="close a mesh by walls down to this height [open]")
     arguments.add_raster(command)
     command.set_defaults(run=run)
@@ -38,12 +40,13 @@ def run(options: argparse.Namespace) -> None:
     else:
         require_writable_mesh(options.output)
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
-    interruption.raise_from_now_on()
     if ending in MESHES:
         save_mesh(options.output, terrain, base=options.base)
     else:
         save_heights(options.output, terrain)
     alone = f" ({ending} holds the heights alone)" if ending in (".npy", ".exr") else ""
+    if ending == ".png" and (terrain.heights % 1 != 0).any():
+        alone = " (.png holds whole numbers: heights are rounded to steps of 1)"
     if ending not in MESHES:  # which are in metres; others are in the unit of the file
         dx, dy, x0, y0 = terrain.in_file
         terrain = dataclasses.replace(terrain, dx=dx, dy=dy, x0=x0, y0=y0, georeference=None)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..core.errors import counted
+
 if TYPE_CHECKING:
     from ..io.terrain import Terrain
     from ..scene.heightfield import Heightfield
@@ -48,7 +50,7 @@ def terrain_lines(path: str, terrain: "Terrain") -> Iterator[str]:
     code = f" (EPSG:{crs.code})" if crs is not None and crs.code else ""
     yield f"system: {place.name or 'not known'}{code}"
     holes = int(np.count_nonzero(np.isnan(terrain.heights)))
-    share = f", {holes} holes ({holes / terrain.heights.size:.3g} of all)" if holes else ", no holes"
+    share = f", {counted(holes, 'hole')} ({100 * holes / terrain.heights.size:.3g} %)" if holes else ", no holes"
     stored = f", stored as {place.nodata:.10g}" if holes and place.nodata is not None else ""
     lowest, highest = np.fmin.reduce(terrain.heights, axis=None), np.fmax.reduce(terrain.heights, axis=None)
     span = "none" if holes == terrain.heights.size else f"{lowest:.7g} to {highest:.7g}"
@@ -60,7 +62,7 @@ def heightfield_line(field: "Heightfield | Terrain") -> str:
     ny, nx = heights.shape
     finite = heights[np.isfinite(heights)]
     span = _numbers([finite.min(), finite.max()]) if finite.size else "none"
-    holes = f", {heights.size - finite.size} holes" if finite.size < heights.size else ""
+    holes = f", {counted(heights.size - finite.size, 'hole')}" if finite.size < heights.size else ""
     return (
         f"Heightfield, {ny} x {nx} heights, cells {field.dx:.6g} x {field.dy:.6g}, "
         f"origin {_numbers([field.x0, field.y0])}, range {span}{holes}"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, counted
 from . import arguments, interruption
 from .overwriting import require_no_input
 
@@ -133,7 +133,6 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence
     _write(path, case, found, outputs)
     outputs.checkpoint.unlink(missing_ok=True)
     ny, nx = found.heights.shape
-    count = len(case.targets)
     lines = []
     if case.noise is None:
         lines.append(f"noise, estimated: {', '.join(f'{value:.3g}' for value in found.noise)}")
@@ -144,8 +143,8 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence
     ]
     lines += _views(case, found)
     lines.append(
-        f"{outputs.heights}: {ny} x {nx} heights from {count} picture{'s' * (count > 1)}, {found.result.value}; "
-        f"{found.stats['steps']} steps, {found.stats['seconds']:.3g} s, loss {found.stats['loss']:.6g}, "
+        f"{outputs.heights}: {ny} x {nx} heights from {counted(len(case.targets), 'picture')}, {found.result.value}; "
+        f"{counted(int(found.stats['steps']), 'step')}, {found.stats['seconds']:.3g} s, loss {found.stats['loss']:.6g}, "
         f"chi2 {found.stats['chi2']:.4g}"
     )
     return "\n".join(lines), found.warnings

@@ -23,6 +23,5 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     from ..maps.hillshade import hillshade
 
-    names = ("azimuth", "altitude", "z_factor", "variant", "shadows", "algorithm", "compute_edges", "scale", "dx", "dy")
-    wanted = mapping.given(options, *names)
+    wanted = {**mapping.light(options), "compute_edges": options.compute_edges}
     mapping.make(options, lambda terrain: hillshade(terrain, **wanted), kind="hillshade", nodata=0.0)

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from . import arguments, interruption, mapping
+from . import arguments, mapping
 from .skyview import add_terrain, read
 
 
@@ -23,13 +23,14 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     import numpy as np
 
-    from ..core.errors import ArgumentError
-    from ..io.files import replacing, write_npy
-    from ..io.rasters import require_writable_raster, save_raster
+    from ..core.errors import ArgumentError, counted
+    from ..io.files import replacing_all, write_npy
+    from ..io.rasters import geotiff, require_writable_raster
 
-    path = Path(options.output)
     mapping.require_numbers(options.output, "angles")
-    require_writable_raster(path)
+    path = require_writable_raster(options.output)
+    if options.azimuth is not None:
+        arguments.refuse(options, "azimuths", because="--azimuth asks for one")
     if options.azimuth is not None and not np.isfinite(options.azimuth):
         raise ArgumentError("", "--azimuth", f"must be finite, it is {options.azimuth}")
     stored, terrain = read(options)
@@ -40,9 +41,9 @@ def run(options: argparse.Namespace) -> None:
 
     begin = time.perf_counter()
     azimuths = even_azimuths(options.azimuths) if options.azimuth is None else np.array([options.azimuth])
-    whole = path.suffix.lower() == ".npy" and len(azimuths) > 1
-    maps, highest = [], 0.0
-    with compiled_bar(unit=" angles", unit_scale=True) as advance:
+    tiff, one = path.suffix.lower() != ".npy", options.azimuth is not None
+    paths, maps, highest = [path if one or not tiff else _of(path, azimuth) for azimuth in azimuths], [], 0.0
+    with replacing_all(paths if tiff else [path]) as temporaries, compiled_bar(unit=" angles", unit_scale=True) as advance:
         for number, azimuth in enumerate(azimuths):
 
             def grown(done: int, total: int, number: int = number) -> None:
@@ -50,16 +51,17 @@ def run(options: argparse.Namespace) -> None:
 
             (angles,) = np.asarray(horizon(terrain, [azimuth], progress=grown))
             highest = max(highest, float(np.nanmax(angles)))
-            if whole:
+            if tiff:
+                temporaries[number].write_bytes(geotiff(angles, stored, np.nan))
+            else:
                 maps.append(angles)
-                continue
-            interruption.raise_from_now_on()
-            degrees = f"{azimuth:03.0f}" if azimuth == round(azimuth) else f"{azimuth:06.2f}"
-            one = path if options.azimuth is not None else path.with_name(f"{path.stem}_{degrees}{path.suffix}")
-            save_raster(one, angles, stored, nodata=np.nan)
-    if whole:
-        interruption.raise_from_now_on()
-        with replacing(path) as temporary:
-            write_npy(temporary, np.stack(maps))
+        if maps:
+            write_npy(temporaries[0], maps[0] if one else np.stack(maps))
     took = time.perf_counter() - begin
-    print(f"{path}: horizon angles up to {highest:.2f} degrees, {len(azimuths)} azimuths, {took:.1f} s")
+    print(f"{path}: horizon angles up to {highest:.2f} degrees, {counted(len(azimuths), 'azimuth')}, {took:.1f} s")
+
+
+def _of(path: Path, azimuth: float) -> Path:
+    """The file of one direction: out_090.tif."""
+    degrees = f"{azimuth:03.0f}" if azimuth == round(azimuth) else f"{azimuth:06.2f}"
+    return path.with_name(f"{path.stem}_{degrees}{path.suffix}")

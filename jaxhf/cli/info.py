@@ -19,6 +19,7 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
+    from ..core.errors import counted
     from ..io.files import by_ending
     from ..io.load_terrain import ENDINGS, read_terrain
 
@@ -33,6 +34,6 @@ def run(options: argparse.Namespace) -> None:
     from .scene_warnings import warn
 
     scene = load_scene(options.file)
-    print(f"{options.file}: {scene.camera.width} x {scene.camera.height} pixels, {scene.samples} samples a pixel")
+    print(f"{options.file}: {scene.camera.width} x {scene.camera.height} pixels, {counted(scene.samples, 'sample')} a pixel")
     print("\n".join(scene_lines(scene)))
     warn([scene])

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from ..core.errors import UserError
+from ..core.errors import UserError, counted
 from ..core.machine import available_bytes, default_devices, usable_cores
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def require_memory(scene: "Scene", devices: int) -> None:
     needed, available = single * (_BYTES_A_HEIGHT * heights * devices + _BYTES_A_PIXEL * width * height), available_bytes()
     if needed > available:
         raise UserError(
-            f"{width} x {height} pixels of {heights} heights take more than {needed / 1e9:.3g} GB of memory on {devices} "
-            f"device{'s' * (devices > 1)}, {available / 1e9:.3g} GB are free; a smaller picture or terrain, or fewer "
+            f"{width} x {height} pixels of {heights} heights take more than {needed / 1e9:.3g} GB of memory on "
+            f"{counted(devices, 'device')}, {available / 1e9:.3g} GB are free; a smaller picture or terrain, or fewer "
             "--devices, take less"
         )

@@ -1,12 +1,18 @@
 """The command line: how it begins and how errors end. Ctrl-C is looked after first; all else is imported after that."""
 
+import codecs
 import gc
+import io
 import os
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from . import interruption
+
+if TYPE_CHECKING:
+    import argparse
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -18,6 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         interruption.end_at_once()
         gc.set_threshold(50_000, 50, 100)  # tracing makes many objects that live on, and so do imports
+        _show_any_name()
     from ..core.errors import UserError
     from .overwriting import require_no_input
     from .parser import make_parser
@@ -30,6 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             warnings.showwarning = lambda message, *_, **__: print(
                 f"jaxhf: warning: {' '.join(str(message).split())}", file=sys.stderr
             )
+            _require_no_address(options)
             require_no_input(options)
             with quiet(options.quiet):
                 options.run(options)
@@ -55,3 +63,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if arguments is None:
             gc.freeze()  # nothing is looked through once more at the end
     return 0
+
+
+def _show_any_name() -> None:
+    """Lets what an output's encoding lacks be printed all the same: as \\u5c71, or as the bytes that stand in a name."""
+
+    def shown(error: UnicodeError) -> tuple[str | bytes, int]:
+        try:
+            return codecs.lookup_error("surrogateescape")(error)
+        except UnicodeError:
+            return codecs.backslashreplace_errors(error)
+
+    codecs.register_error("jaxhf", shown)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # and not None, where there is no console
+            utf8 = codecs.lookup(stream.encoding).name == "utf-8"
+            stream.reconfigure(errors="backslashreplace" if utf8 else "jaxhf")
+
+
+def _require_no_address(options: "argparse.Namespace") -> None:
+    """FileError where an option is an address on the network, as it was written: a path would lose one of its slashes."""
+    from ..io.files import file_path
+
+    for value in vars(options).values():
+        if isinstance(value, str):
+            file_path("", value)

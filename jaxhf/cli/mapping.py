@@ -36,26 +36,32 @@ def add_spacing(command: argparse.ArgumentParser, scale: bool = True) -> None:
 
 def add_slope(command: argparse.ArgumentParser, edges: bool = True) -> None:
     group = command.add_argument_group("slopes")
-    group.add_argument("--algorithm", choices=ALGORITHMS, default="horn", help="slopes from eight neighbours or four [horn]")
+    group.add_argument("--algorithm", choices=ALGORITHMS, help="slopes from eight neighbours or four [horn]")
     if edges:
         group.add_argument("--compute-edges", action="store_true", help="also at the border and beside holes")
 
 
 def add_light(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("light")
+    group.add_argument("--azimuth", type=float, metavar="DEGREES", help="of the light, from north, clockwise [315]")
+    group.add_argument("--altitude", type=float, metavar="DEGREES", help="of the light, above the horizon [45]")
+    group.add_argument("--z-factor", type=float, metavar="Z", help="heights are multiplied by it [1]")
+    group.add_argument("--variant", choices=VARIANTS, help="kind of hillshade [regular]")
     group.add_argument(
-        "--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the light, from north, clockwise [315]"
-    )
-    group.add_argument("--altitude", type=float, default=45.0, metavar="DEGREES", help="of the light, above the horizon [45]")
-    group.add_argument("--z-factor", type=float, default=1.0, metavar="Z", help="heights are multiplied by it [1]")
-    group.add_argument("--variant", choices=VARIANTS, default="regular", help="kind of hillshade [regular]")
-    group.add_argument(
-        "--shadows", action="store_true", help="what terrain keeps the light from is black: shadows as they fall"
+        "--shadows", action="store_true", default=None, help="what terrain keeps the light from is black: shadows as they fall"
     )
 
 
-def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in names}
+LIGHT = ("azimuth", "altitude", "z_factor", "variant", "shadows")
+SPACING = ("scale", "dx", "dy")
+
+
+def light(options: argparse.Namespace) -> dict[str, Any]:
+    """The options of `add_light` and `add_spacing`, and the algorithm of slopes; UserError where one says nothing."""
+    for variant, angle in (("multidirectional", "azimuth"), ("igor", "altitude")):
+        if options.variant == variant and not options.shadows:
+            arguments.refuse(options, angle, because=f"--variant {variant} has lights of its own, without --shadows")
+    return arguments.given(options, *LIGHT, "algorithm", *SPACING)
 
 
 def make(
@@ -79,7 +85,6 @@ def make(
     """
     from ..io.load_terrain import read_terrain
     from ..io.rasters import require_writable_raster, save_raster
-    from . import interruption
 
     if numbers:
         require_numbers(options.output, kind)
@@ -89,7 +94,6 @@ def make(
     values = draw(terrain)
     if scaled and options.scale is None:
         report_spacing(options, terrain)
-    interruption.raise_from_now_on()
     save_raster(path, values, terrain, nodata)
     ny, nx = terrain.heights.shape
     print(f"{path}: {kind}, {nx} x {ny} pixels, {time.perf_counter() - begin:.2f} s")

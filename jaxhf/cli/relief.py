@@ -33,8 +33,9 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     from ..maps.relief import color_relief, relief
 
-    tint = mapping.given(options, "ramp", "entries", "alpha")
+    tint = arguments.given(options, "ramp", "entries", "alpha")
     if not options.shading:
+        arguments.refuse(options, *mapping.LIGHT, "algorithm", *mapping.SPACING, because="--no-shading leaves the light out")
         return mapping.make(options, lambda terrain: color_relief(terrain, **tint), kind="color relief", scaled=False)
-    light = mapping.given(options, "azimuth", "altitude", "z_factor", "variant", "shadows", "algorithm", "scale", "dx", "dy")
+    light = mapping.light(options)
     mapping.make(options, lambda terrain: relief(terrain, **tint, **light), kind="relief")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.errors import UserError
 from ..core.settings import Settings
-from . import arguments, interruption
+from . import arguments
 
 if TYPE_CHECKING:
     from ..scene.scene import Scene
@@ -40,6 +40,8 @@ def run(options: argparse.Namespace) -> None:
 
     if options.aovs and Path(options.output).suffix.lower() != ".exr":
         raise UserError(f"--aovs are layers of an .exr, {options.output} is none")
+    if getattr(options, "shading", None) == "flat" and hasattr(options, "normals"):
+        raise UserError("--normals would change nothing: --shading flat takes those of the triangles")
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)
@@ -49,7 +51,6 @@ def run(options: argparse.Namespace) -> None:
     scene = _load(options)
     warn([scene])
     image, found, report = _timed_render(scene, settings, options.devices, aovs)
-    interruption.raise_from_now_on()
     save_image(options.output, image, aovs=found)
     print(f"{options.output}: {report}")
 

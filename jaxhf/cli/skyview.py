@@ -4,7 +4,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
-from . import arguments, interruption, mapping
+from . import arguments, mapping
 
 if TYPE_CHECKING:
     from ..io.terrain import Terrain
@@ -29,7 +29,7 @@ def add_terrain(command: argparse.ArgumentParser, output: str) -> None:
     command.set_defaults(placed=True)
     command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("-o", "--output", required=True, metavar="OUT", help=output)
-    command.add_argument("--azimuths", type=int, default=32, metavar="K", help="directions, at even steps from north on [32]")
+    command.add_argument("--azimuths", type=int, metavar="K", help="directions, at even steps from north on [32]")
     mapping.add_spacing(command, scale=False)
     arguments.add_raster(command)
     arguments.add_machine(command)
@@ -45,6 +45,7 @@ def read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
     from ..maps.surface import spacing
 
     given = spacing("", options.dx, options.dy)
+    options.azimuths = 32 if options.azimuths is None else options.azimuths
     if options.azimuths < 1:
         raise ArgumentError("", "--azimuths", f"must be a whole number from 1 on, it is {options.azimuths}")
     stored = read_terrain(options.terrain, options.z_scale, options.nodata)
@@ -61,6 +62,7 @@ def read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
 def run(options: argparse.Namespace) -> None:
     import numpy as np
 
+    from ..core.errors import counted
     from ..io.rasters import require_writable_raster, save_raster
 
     path = require_writable_raster(options.output)
@@ -74,6 +76,6 @@ def run(options: argparse.Namespace) -> None:
         seen = np.asarray(sky_view(terrain, options.azimuths, weighting=options.weighting, progress=advance))
     took = time.perf_counter() - begin
     values = np.rint(255 * np.nan_to_num(np.clip(seen, 0, 1))).astype(np.uint8) if path.suffix.lower() == ".png" else seen
-    interruption.raise_from_now_on()
     save_raster(path, values, stored, nodata=None if values.dtype == np.uint8 else np.nan)
-    print(f"{path}: sky-view factor {np.nanmin(seen):.3f} .. {np.nanmax(seen):.3f}, {options.azimuths} azimuths, {took:.1f} s")
+    about = f"{counted(options.azimuths, 'azimuth')}, {took:.1f} s"
+    print(f"{path}: sky-view factor {np.nanmin(seen):.3f} .. {np.nanmax(seen):.3f}, {about}")

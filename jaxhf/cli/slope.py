@@ -23,5 +23,5 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     from ..maps.slope import NODATA, slope
 
-    wanted = mapping.given(options, "percent", "algorithm", "compute_edges", "scale", "dx", "dy")
+    wanted = arguments.given(options, "percent", "algorithm", "compute_edges", "scale", "dx", "dy")
     mapping.make(options, lambda terrain: slope(terrain, **wanted), kind="slope", nodata=NODATA, numbers=True)

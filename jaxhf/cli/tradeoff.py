@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..core.errors import UserError
+    from ..core.errors import UserError, counted
     from ..core.extras import import_extra
     from ..study.pareto import advice, markdown
     from ..study.plan import plan
@@ -76,9 +76,9 @@ def run(options: argparse.Namespace) -> None:
         print(markdown(measured), end="\n\n")
     if asks or not options.markdown:
         print("\n".join(advice(measured, options.error, options.time)))
-    print(f"{len(measured)} configurations: {sweep.table}, {plot}")
+    print(f"{counted(len(measured), 'configuration')}: {sweep.table}, {plot}")
     if failures:
-        raise UserError(f"{len(failures)} configurations failed")
+        raise UserError(f"{counted(len(failures), 'configuration')} failed")
 
 
 def _watched(sweep: "Sweep", repeats: int) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import ArgumentError, UserError
-from . import arguments, interruption
+from . import arguments
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ..scene.scene import Scene
 
 _PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
+
+_TALLEST = 100  # times its length: beyond, a terrain is a needle that no pixel shows
 
 
 def add(commands: Any) -> None:
@@ -42,7 +44,7 @@ def add(commands: Any) -> None:
         default="balanced",
         help="1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]",
     )
-    size.add_argument("--frames", type=int, default=72, metavar="N", help="of a film, 24 a second [72]")
+    size.add_argument("--frames", type=int, metavar="N", help="of a film, 24 a second [72]")
     camera = command.add_argument_group("camera")
     camera.add_argument(
         "--from", dest="camera_azimuth", type=float, metavar="DEGREES",
@@ -53,8 +55,8 @@ def add(commands: Any) -> None:
     )
     camera.add_argument("--fov", type=float, default=30.0, metavar="DEGREES", help="angle of view [30]")
     light = command.add_argument_group("light")
-    light.add_argument("--azimuth", type=float, default=315.0, metavar="DEGREES", help="of the sun, clockwise from north [315]")
-    light.add_argument("--altitude", type=float, default=45.0, metavar="DEGREES", help="of the sun, above the horizon [45]")
+    light.add_argument("--azimuth", type=float, metavar="DEGREES", help="of the sun, clockwise from north [315]")
+    light.add_argument("--altitude", type=float, metavar="DEGREES", help="of the sun, above the horizon [45]")
     light.add_argument(
         "--sun-from", type=_sun, metavar="AZ,ALT|TIME",
         help="a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00",
@@ -146,6 +148,11 @@ def run(options: argparse.Namespace) -> None:
     for name, value, low in (("exaggeration", options.exaggeration, 0.0), ("water", options.water, -math.inf)):
         if value is not None and not low < value < math.inf:
             raise UserError(f"view: --{name} must be {'finite' if low else 'positive and finite'}, it is {value}")
+    if not film:
+        arguments.refuse(options, "frames", because=f"{output} is one picture, a film is {' or '.join(FILMS)}")
+    if options.sun_from is not None:
+        arguments.refuse(options, "azimuth", "altitude", because="the sun moves from --sun-from to --sun-to")
+    options.frames = 72 if options.frames is None else options.frames
     if options.frames < 2:
         raise UserError(f"view: --frames must be 2 or more, it is {options.frames}")
     require_no_input(options, output)
@@ -189,11 +196,15 @@ class _Stage:
             if not low < options.water < high:
                 warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {options.water:g}", stacklevel=2)
             z, self.colours = with_water(z, self.colours, options.water)
+        reach = max((n - 1) * d for n, d in zip(z.shape, (terrain.dy, terrain.dx), strict=True))
+        times = (float(np.nanmax(z)) - float(np.nanmin(z))) * self.exaggeration / reach
+        if times > _TALLEST:
+            found = f"times {self.exaggeration:g} it is {times:.3g} times its length high"
+            raise UserError(f"view: --exaggeration must leave a terrain at most {_TALLEST} times its length high; {found}")
         self.heights = z * z.dtype.type(self.exaggeration)
         low, high = np.nanmin(self.heights), np.nanmax(self.heights)
-        reach = max((n - 1) * d for n, d in zip(z.shape, (terrain.dy, terrain.dx), strict=True))
         self.base = float(low - max(0.25 * (high - low), 0.02 * reach)) if options.skirt else None
-        self.look = Look(options.azimuth, options.altitude, options.haze, _PRESETS[options.preset])
+        self.look = Look(**arguments.given(options, "azimuth", "altitude", "haze"), samples=_PRESETS[options.preset])
 
     def _colours(self) -> "np.ndarray":
         import numpy as np
@@ -241,7 +252,6 @@ class _Stage:
         camera = self._camera(field, self._azimuth)
         with bar(total=self.look.samples, unit=" samples", delay=0.5) as shown:
             image = photograph(self._scene(field, camera, self.look), camera, self.look, shown.update)
-        interruption.raise_from_now_on()
         save_image(output, image)
         return f"{self.size[0]} x {self.size[1]} pixels"
 
@@ -271,5 +281,4 @@ class _Stage:
                 image = photograph(ready, camera, look)
                 add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
                 shown.update()
-            interruption.raise_from_now_on()
         return f"{options.frames} frames of {self.size[0]} x {self.size[1]} pixels"

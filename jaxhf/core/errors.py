@@ -56,3 +56,8 @@ def kind_of(value: Any) -> str:
     """The name of its type, with an article."""
     name = type(value).__name__
     return f"{'an' if name[0] in 'AEIOaeio' else 'a'} {name}"
+
+
+def counted(number: int, noun: str) -> str:
+    """1 hole, 2 holes."""
+    return f"{number} {noun}{'s' * (number != 1)}"

@@ -44,7 +44,8 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | int | N
             "fit", "prior_std", f"must be a number or of shape {shape}, as the heights; its shape is {std.shape}"
         )
     if not (std > 0).all():
-        raise ArgumentError("fit", "prior_std", f"must be positive, it is {std.min()} to {std.max()}")
+        given = f"{std:g}" if std.ndim == 0 else f"{std.min():g} to {std.max():g}"
+        raise ArgumentError("fit", "prior_std", f"must be positive, it is {given}")
     padding = prior_padding(field, length)
     if length is not None:
         _require_plausible(field, length)

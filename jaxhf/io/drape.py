@@ -1,16 +1,16 @@
 """Pictures to be laid over a terrain."""
 
+import importlib
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from ..core.extras import import_extra
 from .errors import FileError
-from .files import PathLike, reading, require_file, require_pixels
+from .files import PathLike, reading, require_file
+from .gdal import opened
 from .images import linear_from_srgb, load_image
 from .terrain import Terrain
 
@@ -28,38 +28,32 @@ def load_drape(path: PathLike, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
     """
     path = require_file(path)
     if path.suffix.lower() not in (".tif", ".tiff"):
-        image = np.asarray(load_image(path))
+        image = np.asarray(load_image(path, transfer="srgb"))
         return image[::-1] if image.ndim == 3 else np.repeat(image[::-1, :, None], 3, axis=-1)
     with reading(path):
         return _placed(path, terrain)
 
 
 def _placed(path: Path, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
-    rasterio = import_extra("rasterio", "reading .tif needs", "geo")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-        warnings.simplefilter("ignore", PendingDeprecationWarning)  # of its windows' own arithmetic
-        with rasterio.open(path.absolute(), driver="GTiff") as dataset:
-            require_pixels(dataset.height, dataset.width)
-            if dataset.count not in (1, 3, 4) or set(dataset.dtypes) != {"uint8"}:
-                raise FileError(f"it must have 1, 3 or 4 bands of bytes, it has {dataset.count} of {dataset.dtypes[0]}")
-            _require_same_system(dataset, terrain, rasterio)
-            dx, dy, x0, y0 = terrain.in_file
-            ny, nx = terrain.heights.shape
-            west, south, east, north = x0, y0, x0 + (nx - 1) * dx, y0 + (ny - 1) * dy
-            if dataset.transform.is_identity:
-                west, south, east, north = 0, dataset.height, dataset.width, 0
-            window = rasterio.windows.from_bounds(west, south, east, north, dataset.transform)
-            covers = window.col_off + window.width >= 0 and window.col_off <= dataset.width
-            if not (covers and window.row_off + window.height >= 0 and window.row_off <= dataset.height):
-                raise FileError(
-                    f"it must cover the terrain; it spans {tuple(dataset.bounds)}, that {(west, south, east, north)}"
-                )
-            shape = tuple(min(_MOST, max(2, math.ceil(side))) for side in (window.height, window.width))
-            bands = dataset.read(
-                indexes=[1, 2, 3] if dataset.count > 1 else [1, 1, 1], window=window, out_shape=(3, *shape), boundless=True,
-                fill_value=0, resampling=rasterio.enums.Resampling.bilinear,
-            )  # fmt: skip
+    with opened(path) as dataset:
+        rasterio = importlib.import_module("rasterio")
+        if dataset.count not in (1, 3, 4) or set(dataset.dtypes) != {"uint8"}:
+            raise FileError(f"it must have 1, 3 or 4 bands of bytes, it has {dataset.count} of {dataset.dtypes[0]}")
+        _require_same_system(dataset, terrain, rasterio)
+        dx, dy, x0, y0 = terrain.in_file
+        ny, nx = terrain.heights.shape
+        west, south, east, north = x0, y0, x0 + (nx - 1) * dx, y0 + (ny - 1) * dy
+        if dataset.transform.is_identity:
+            west, south, east, north = 0, dataset.height, dataset.width, 0
+        window = rasterio.windows.from_bounds(west, south, east, north, dataset.transform)
+        covers = window.col_off + window.width >= 0 and window.col_off <= dataset.width
+        if not (covers and window.row_off + window.height >= 0 and window.row_off <= dataset.height):
+            raise FileError(f"it must cover the terrain; it spans {tuple(dataset.bounds)}, that {(west, south, east, north)}")
+        shape = tuple(min(_MOST, max(2, math.ceil(side))) for side in (window.height, window.width))
+        bands = dataset.read(
+            indexes=[1, 2, 3] if dataset.count > 1 else [1, 1, 1], window=window, out_shape=(3, *shape), boundless=True,
+            fill_value=0, resampling=rasterio.enums.Resampling.bilinear,
+        )  # fmt: skip
     return linear_from_srgb(np.moveaxis(bands, 0, -1)[::-1] / 255)
 
 

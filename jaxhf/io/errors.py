@@ -1,6 +1,7 @@
 """What all readers share: where an error is, which word was meant, and which files a scene may open."""
 
 import difflib
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -41,7 +42,7 @@ def resolve_inside(root: Path, folder: Path, name: str) -> Path:
     if "\0" in name:
         raise FileError(f"{name!r} is no file's name")
     root = root.resolve()
-    path = (folder / name).resolve()
+    path = (folder / os.fsdecode(name.encode())).resolve()  # in a C locale letters are bytes in the names of files
     if not path.is_relative_to(root):
         raise FileError(f"{name!r} lies outside the scene's folder {str(root)!r}")
     if path.suffix.lower() == ".vrt":

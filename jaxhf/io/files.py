@@ -1,9 +1,12 @@
 """What the readers of scenes, heights and images share: which files there are, and how errors name them."""
 
 import contextlib
+import glob
 import math
 import os
+import re
 import secrets
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -45,8 +48,10 @@ def _fitting(ending: str, known: Iterable[str], task: str) -> str:
 
 
 def file_path(owner: str, path: Any) -> Path:
-    """A path of pathlib's; ArgumentError where something else stands in the place of a file's name."""
+    """A path of pathlib's; ArgumentError where something else stands in the place of a file's name, as an address does."""
     require_kind(owner, "path", path, (str, os.PathLike), "the name of a file")
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", str(path)):
+        raise FileError(f"{path}: this is an address, files are neither read from the network nor written there; download it")
     return Path(path)
 
 
@@ -93,33 +98,68 @@ def require_folder(path: Path, what: str) -> None:
 def replacing(path: Path, beside: Mapping[Path, str] | None = None) -> Iterator[Path]:
     """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong.
 
-    The new content is on the disk before it gets the name, and the name when this ends: a power failure leaves the old file
-    or the new one, not an empty one (Pillai et al., All file systems are not created equal, 2014).
-
     Args:
       path: the file.
       beside: small text files that go with it, and their contents, which are written before any file takes its place.
     """
-    path = path.resolve()  # what a link points to is replaced, not the link
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
+    beside = beside or {}
+    with replacing_all([path, *beside]) as (temporary, *others):
         yield temporary
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        with contextlib.ExitStack() as others:
-            for other, text in (beside or {}).items():
-                others.enter_context(replacing(other)).write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-        with contextlib.suppress(OSError):  # Windows opens no folders, some network file systems synchronise none
-            _synchronise_folder(path.parent)
+        for other, text in zip(others, beside.values(), strict=True):
+            other.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def replacing_all(paths: Iterable[Path]) -> Iterator[list[Path]]:
+    """Yields a temporary name beside each path; at the end all take their places, or vanish if anything goes wrong with one.
+
+    The new content is on the disk before it gets the name, and the name when this ends: a power failure leaves the old file
+    or the new one, not an empty one (Pillai et al., All file systems are not created equal, 2014).
+    """
+    paths = [path.resolve() for path in paths]  # what a link points to is replaced, not the link
+    temporaries = [path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp") for path in paths]
+    TEMPORARIES.update(temporaries)
+    try:
+        yield temporaries
+        for temporary in temporaries:
+            with temporary.open("rb+") as file:
+                os.fsync(file.fileno())
+        for path, temporary in zip(paths, temporaries, strict=True):
+            os.replace(temporary, path)
+        for folder in {path.parent for path in paths}:
+            with contextlib.suppress(OSError):  # Windows opens no folders, some network file systems synchronise none
+                _synchronise_folder(folder)
     except OSError as error:
         if error.errno is None:
             raise
-        named = type(error)(f"{path}: cannot be written: {error.strerror}")
+        named = type(error)(f"{paths[0]}: cannot be written: {error.strerror}")
         named.errno = error.errno
         raise named from error
     finally:
-        temporary.unlink(missing_ok=True)
+        for temporary in temporaries:
+            temporary.unlink(missing_ok=True)
+        TEMPORARIES.difference_update(temporaries)
+
+
+TEMPORARIES: set[Path] = set()  # that there may be now: for Ctrl-C, which ends a command wherever it is
+
+
+@contextlib.contextmanager
+def utf8_name(path: Path) -> Iterator[str]:
+    """The file's name as GDAL and OpenEXR take it, in UTF-8; where it is not, another name that links to it.
+
+    Links to the files that say where it lies stand beside that, too.
+    """
+    path, named = path.absolute(), None
+    with contextlib.suppress(UnicodeDecodeError):
+        named = os.fsencode(path).decode()
+    with contextlib.ExitStack() as folders:
+        if named is None:
+            folder = Path(folders.enter_context(tempfile.TemporaryDirectory()))
+            for other in {path, *path.parent.glob(f"{glob.escape(path.stem)}.*")}:
+                (folder / f"linked{other.name.removeprefix(path.stem)}").symlink_to(other)
+            named = str(folder / f"linked{path.suffix}")
+        yield named
 
 
 def _synchronise_folder(folder: Path) -> None:
@@ -132,7 +172,7 @@ def _synchronise_folder(folder: Path) -> None:
 
 def require_writable_text(path: PathLike, ending: str) -> Path:
     """Checks that `save_text` can write to `path`, and that it has this ending; errors as those of `require_folder`."""
-    path = Path(path)
+    path = file_path("save_text", path)
     by_ending({ending: None}, path, "write a page with")
     require_folder(path, "a page")
     return path
@@ -141,7 +181,7 @@ def require_writable_text(path: PathLike, ending: str) -> Path:
 def save_text(path: PathLike, text: str) -> None:
     """Writes a text as UTF-8; the file appears whole or not at all."""
     with replacing(Path(path)) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="surrogateescape")  # names in it may be in no encoding
 
 
 def require_precision(dtype: DTypeLike) -> np.dtype:

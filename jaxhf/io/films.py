@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..core.extras import import_extra
-from .files import PathLike, by_ending, reading, replacing, require_folder
+from .files import PathLike, by_ending, file_path, reading, replacing, require_folder
 
 Add = Callable[[UInt8[np.ndarray, "h w 3"]], None]
 
@@ -25,7 +25,7 @@ def require_writable_film(path: PathLike) -> Path:
       FileNotFoundError: the folder does not exist.
       PermissionError: the folder cannot be written to.
     """
-    path = Path(path)
+    path = file_path("writing_film", path)
     by_ending(dict.fromkeys(FILMS), path, "write a film with")
     require_folder(path, "a film")
     if path.suffix.lower() == ".mp4":

@@ -58,13 +58,13 @@ class Georeference(NamedTuple):
     def name(self) -> str:
         """That of the reference system, "" where it is not known."""
         found = re.search(r'"([^"]*)"', self.wkt)
-        return found[1] if found else ""
+        return found[1] if found and found[1] != "unnamed" else ""
 
     @property
     def unit(self) -> str:
         """The name of the unit of x and y, "" where it is not known."""
         found = re.findall(r'\b(?:ANGLE|LENGTH)?UNIT\["([^"]*)"', _horizontal(self.wkt))
-        return found[-1] if found else ""
+        return found[-1] if found and found[-1] != "unknown" else ""
 
 
 _GEOGRAPHIC = r'\s*(?:COMP\w*\["[^"]*",\s*)?(?:GEOGCS|GEOGCRS|GEODCRS|GEOGRAPHICCRS|GEODETICCRS)\b'

@@ -8,6 +8,7 @@ import contextlib
 import errno
 import re
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,39 +31,62 @@ from .files import (
     require_file,
     require_folder,
     require_pixels,
+    utf8_name,
     write_npy,
 )
+from .gdal import opened
 from .png import require_whole
 
 
-def load_image(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
+def load_image(path: PathLike, *, transfer: str | None = None) -> Float32[np.ndarray, "h w 3"]:
     """Reads an image as linear radiance: float32, shape (h, w, 3), top row first.
 
-    .png and .jpg hold sRGB, and are decoded by the curve of IEC 61966-2-1; .exr (needs OpenEXR), .pfm and .npy (of
-    floats, shape (h, w, 3) or (h, w)) hold linear radiance. Grey becomes three equal channels, alpha is dropped, colour
-    profiles and EXIF rotations are not looked at.
+    .png, .jpg and .tif (a GeoTIFF such as an orthophoto; needs rasterio) hold whole numbers of 8 or, if grey or .tif, 16 bits,
+    which `transfer` explains. Floats are linear radiance as they are: in a .tif too, in .exr (needs OpenEXR), .pfm and .npy
+    (shape (h, w, 3) or (h, w)). Grey becomes three equal channels, alpha is dropped, colour profiles and EXIF rotations are
+    not looked at. Pixels of a .tif that its nodata value, mask or alpha leaves out are nan.
+
+    Args:
+      path: the file.
+      transfer: what whole numbers are: "srgb", decoded by the curve of IEC 61966-2-1; "linear", shares of 255 or 65535, as in
+        what cameras and satellites measure. None: sRGB, as nearly all pictures of 8 bits are; of 16 bits many are not, so a
+        warning says what was taken.
 
     Raises:
       FileNotFoundError: no file is there.
-      ValueError: the ending is not known, or the file is not a whole image of that kind.
+      ValueError: the ending or `transfer` is not known, or the file is not a whole image of that kind.
     """
-    return _load(path, linear_from_srgb)
+    return _load(path, transfer, np.nan)
 
 
 def load_numbers(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
-    """As `load_image`, for values that are no colours: .png and .jpg hold shares of 255, or of 65535 in 16-bit grey."""
-    return _load(path, lambda encoded: encoded)
+    """As `load_image`, for values that are no colours: whole numbers are shares of 255, or of 65535; what is left out is 0."""
+    return _load(path, "linear", 0.0)
 
 
-def _load(path: PathLike, decode: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _load(path: PathLike, transfer: str | None, left_out: float) -> np.ndarray:
+    require_transfer("load_image", transfer or "srgb")
     path = require_file(path)
     reader = by_ending(_READERS, path, "read an image with")
     with reading(path):
-        image = reader(path)
+        stored = reader(path)
+    image = np.ma.getdata(stored)
     if image.dtype.kind == "u":
         top = np.iinfo(image.dtype).max
-        image = decode(np.arange(top + 1) / top).astype(np.float32)[image]
+        if transfer is None and top > 255:
+            warnings.warn(
+                f"{path}: its 16-bit values are taken for sRGB; transfer = 'srgb' or 'linear' says what they are",
+                stacklevel=3,
+            )
+        image = TRANSFERS[transfer or "srgb"][1](np.arange(top + 1) / top).astype(np.float32)[image]
+    if np.ma.is_masked(stored):
+        image = np.where(np.ma.getmaskarray(stored), np.float32(left_out), image)
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
+
+
+def require_transfer(owner: str, transfer: Any) -> None:
+    if transfer not in TRANSFERS:
+        raise ArgumentError(owner, "transfer", f"must be one of {', '.join(TRANSFERS)}; it is {transfer!r}")
 
 
 def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapping[str, Any] | None = None) -> None:
@@ -86,8 +110,7 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         is another, or there are `aovs` of another size, or without .exr.
     """
     path = require_writable(path)
-    if transfer not in _TRANSFERS:
-        raise ArgumentError("save_image", "transfer", f"must be one of {', '.join(_TRANSFERS)}; it is {transfer!r}")
+    require_transfer("save_image", transfer)
     pixels = np.asarray(image)
     if pixels.dtype.kind == "V":  # bfloat16 and its like, which .npy would store without their meaning
         pixels = pixels.astype(np.float32)
@@ -102,7 +125,7 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         if layers:
             write_exr(temporary, _planes(pixels) | layers)
         else:
-            _WRITERS[path.suffix.lower()](temporary, pixels, _TRANSFERS[transfer])
+            _WRITERS[path.suffix.lower()](temporary, pixels, TRANSFERS[transfer][0])
 
 
 def _layers(aovs: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
@@ -213,11 +236,12 @@ def _exr_channels(path: Path) -> dict[str, np.ndarray]:
     """The channels of an .exr by their names, float32."""
     exr = import_extra("OpenEXR", "reading .exr needs", "exr")
     try:
-        with exr.File(str(path), separate_channels=True, header_only=True) as file:
-            (x0, y0), (x1, y1) = file.header()["dataWindow"]
-        require_pixels(int(y1) - int(y0) + 1, int(x1) - int(x0) + 1)
-        with exr.File(str(path), separate_channels=True) as file:
-            return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+        with utf8_name(path) as name:
+            with exr.File(name, separate_channels=True, header_only=True) as file:
+                (x0, y0), (x1, y1) = file.header()["dataWindow"]
+            require_pixels(int(y1) - int(y0) + 1, int(x1) - int(x0) + 1)
+            with exr.File(name, separate_channels=True) as file:
+                return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
     except RuntimeError as error:
         raise FileError("it is not an OpenEXR file, or damaged") from error
     except ValueError as error:
@@ -265,6 +289,23 @@ def _read_npy(path: Path) -> np.ndarray:
     return image.astype(np.float32)
 
 
+def _read_tiff(path: Path) -> np.ma.MaskedArray:
+    """A GeoTIFF's first three bands, or its only one, or its palette's colours; masked where it says that there is nothing."""
+    with opened(path) as dataset:
+        kinds, words = set(dataset.dtypes), [found.name for found in dataset.colorinterp]
+        if len(kinds) > 1 or not kinds <= {"uint8", "uint16", "float32", "float64"}:
+            raise FileError(f"a picture must be of uint8, uint16, float32 or float64, it is of {', '.join(sorted(kinds))}")
+        if dataset.count > 4 or (dataset.count == 2 and words[1] != "alpha"):
+            raise FileError(f"a picture must have 1, 3 or 4 bands, it has {dataset.count} (gdal_translate -b takes some)")
+        pixels, there = dataset.read([1, 2, 3] if dataset.count > 2 else [1]), dataset.dataset_mask() > 0
+        palette = dataset.colormap(1) if words[0] == "palette" else None
+    image = np.moveaxis(pixels, 0, -1) if len(pixels) > 1 else pixels[0]
+    if palette is not None:
+        image = np.array([palette.get(k, (0, 0, 0))[:3] for k in range(max(palette) + 1)], np.uint8)[image]
+    image = image.astype(np.float32) if image.dtype.kind == "f" else image
+    return np.ma.array(image, mask=np.broadcast_to(~there if image.ndim == 2 else ~there[..., None], image.shape))
+
+
 # One writer a format; the last argument maps linear values in 0..1 to those that a .png holds.
 
 
@@ -297,8 +338,8 @@ def write_exr(path: Path, planes: Mapping[str, np.ndarray]) -> None:
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
     options, found = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {}
     with contextlib.suppress(FileError, OSError, RuntimeError):
-        with exr.File(options, dict(channels)) as file:
-            file.write(str(path))
+        with utf8_name(path) as name, exr.File(options, dict(channels)) as file:
+            file.write(name)
         found = _exr_channels(path)
     if not all(name in found and np.array_equal(found[name], plane, equal_nan=True) for name, plane in channels.items()):
         raise OSError(errno.ENOSPC, "OpenEXR left it incomplete, the disk is probably full")
@@ -321,6 +362,8 @@ _READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".exr": _read_exr,
     ".pfm": _read_pfm,
     ".npy": _read_npy,
+    ".tif": _read_tiff,
+    ".tiff": _read_tiff,
 }
 _WRITERS: dict[str, Callable[[Path, np.ndarray, Callable[[np.ndarray], np.ndarray]], None]] = {
     ".png": _write_png,
@@ -328,4 +371,8 @@ _WRITERS: dict[str, Callable[[Path, np.ndarray, Callable[[np.ndarray], np.ndarra
     ".pfm": _write_pfm,
     ".npy": _write_npy,
 }
-_TRANSFERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"srgb": srgb_from_linear, "linear": np.asarray}
+# How values in 0..1 are encoded in whole numbers, and decoded.
+TRANSFERS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]] = {
+    "srgb": (srgb_from_linear, linear_from_srgb),
+    "linear": (np.asarray, np.asarray),
+}

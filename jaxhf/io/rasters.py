@@ -1,9 +1,7 @@
 """GeoTIFF and the other rasters of GDAL, read and written through rasterio."""
 
-import contextlib
 import math
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,43 +10,17 @@ import numpy as np
 from ..core.errors import ArgumentError
 from ..core.extras import import_extra
 from .errors import FileError
-from .files import PathLike, by_ending, reading, replacing, require_folder, require_pixels, write_npy
+from .files import PathLike, by_ending, file_path, reading, replacing, require_folder, write_npy
+from .gdal import opened
 from .georeference import CoordinateSystem, Georeference, coordinate_system
 from .images import write_png
 from .sidecars import beside
 from .terrain import Terrain, heights_of
 
-# GDAL's driver by ending: what a file holds does not decide, as some drivers follow addresses on the network.
-DRIVERS = {
-    **dict.fromkeys((".tif", ".tiff"), "GTiff"),
-    **dict.fromkeys((".dt0", ".dt1", ".dt2"), "DTED"),
-    **dict.fromkeys((".bil", ".flt"), "EHdr"),
-    ".dem": "USGSDEM",
-    ".grd": "GSBG",
-    ".img": "HFA",
-    ".jp2": "JP2OpenJPEG",
-    ".nc": "netCDF",
-    ".vrt": "VRT",
-    ".xyz": "XYZ",
-}
-
-
-@contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    rasterio = import_extra("rasterio", f"reading {path.suffix.lower()} needs", "geo")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(path.absolute(), driver=DRIVERS[path.suffix.lower()]) as dataset:
-                yield dataset
-    except rasterio.errors.RasterioError as error:
-        raise FileError(f"it is cut off, damaged or of another kind: {error.__cause__ or error}") from error
-
 
 def read_raster(path: Path, nodata: float | None, overrules: bool) -> Terrain:
     """The heights in a raster, in its own coordinates; `nodata` counts where the file names none, or where it `overrules`."""
-    with _opened(path) as dataset:
-        require_pixels(dataset.height, dataset.width)
+    with opened(path) as dataset:
         if dataset.count != 1:
             raise FileError(f"heights must be one band, it has {dataset.count}")
         tagged, (scale,), (offset,) = dataset.nodata, dataset.scales, dataset.offsets
@@ -63,7 +35,7 @@ def read_raster(path: Path, nodata: float | None, overrules: bool) -> Terrain:
 
 def georeference_of(path: Path) -> tuple[Terrain, tuple[int, int]]:
     """A raster's place, on a terrain of 2 x 2 heights, and its shape (ny, nx)."""
-    with _opened(path) as dataset:
+    with opened(path) as dataset:
         shape = dataset.height, dataset.width
         corner = _placed(np.zeros((2, 2), np.float32), dataset, dataset.nodata)
         return corner, shape
@@ -95,7 +67,7 @@ def require_writable_raster(path: PathLike) -> Path:
       FileNotFoundError: the folder does not exist.
       PermissionError: the folder cannot be written to.
     """
-    path = Path(path)
+    path = file_path("save_raster", path)
     by_ending(dict.fromkeys((".npy", ".png", ".tif", ".tiff")), path, "write a map with")
     require_folder(path, "a map")
     require_extras(path)

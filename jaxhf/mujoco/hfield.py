@@ -10,7 +10,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Float
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, UserError, kind_of
 from ..core.settings import Settings
 from ..core.types import AnyArray, float_leaf, height_leaf, require_finite
 from ..rendering.render import heightfield_grids
@@ -49,7 +49,10 @@ class HField(eqx.Module):
     _grid: Grid | None = eqx.field(init=False)
 
     def __init__(self, data: Any, size: Any, pos: Any = (0, 0, 0), quat: Any = (1, 0, 0, 0)):
-        data = height_leaf("HField", data)
+        try:
+            data = height_leaf("HField", data)
+        except TypeError as error:
+            raise ArgumentError("HField", "data", f"must be numbers, it is {kind_of(data)}") from error
         self.data = data if data.dtype in (jnp.float32, jnp.float64) else data.astype(jnp.float32)
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
             rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"
@@ -71,8 +74,7 @@ class HField(eqx.Module):
 
     def _numbers(self, name: str, value: Any, length: int) -> Any:
         """That many numbers for each height field of the batch, from as many or from those for all alike."""
-        leaf, wanted = float_leaf(value), (*self.batch, length)
-        require_finite("HField", name, leaf)
+        leaf, wanted = known_numbers("HField", name, value), (*self.batch, length)
         if leaf.shape == wanted:
             return leaf
         if leaf.shape != (length,):
@@ -127,6 +129,32 @@ class HField(eqx.Module):
             pos, quat = np.array(model.body_pos[body]) + _rotated(parent, pos), _product(parent, quat)
             body = int(model.body_parentid[body])
         return cls(data, np.array(model.hfield_size[number], np.float64), pos, quat)
+
+
+def as_numbers(owner: str, name: str, value: Any, dtype: Any) -> jax.Array:
+    """An array of JAX's; ArgumentError where an argument is something else, as the `mjx.Data` whose `qpos` was meant."""
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(owner, name, f"must be numbers, it is {kind_of(value)}") from error
+
+
+def known_numbers(owner: str, name: str, value: Any) -> Any:
+    """See `float_leaf`; ArgumentError where an argument is something else, or not finite and not traced."""
+    try:
+        leaf = float_leaf(value)
+    except UserError as error:
+        raise ArgumentError(owner, name, f"must be numbers, it is {kind_of(value)}") from error
+    require_finite(owner, name, leaf)
+    return leaf
+
+
+def number_pair(owner: str, name: str, value: Any) -> tuple[float, float]:
+    """Two numbers that are known and finite."""
+    given = np.asarray(known_numbers(owner, name, value))
+    if given.shape != (2,):
+        raise ArgumentError(owner, name, f"must be two numbers, it is {value!r}")
+    return float(given[0]), float(given[1])
 
 
 def search_grid(data: Float[jax.Array, "nrow ncol"]) -> Grid:

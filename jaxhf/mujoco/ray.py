@@ -25,7 +25,7 @@ from ..trace.search import first_triangle
 from ..trace.status import Status
 from ..trace.triangle import plane_through, triangle_corners
 from ..trace.walk import WalkResult
-from .hfield import HField, search_grid
+from .hfield import HField, as_numbers, search_grid
 from .pose import pose
 from .solid import Ground, Side, base_faces, column, ground, walls
 
@@ -70,7 +70,7 @@ def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], 
     """
     require_kind("ray", "hfield", hfield, HField, "a jaxhf.mujoco.HField")
     dtype = hfield.data.dtype
-    pnt, vec = jnp.asarray(pnt, dtype), jnp.asarray(vec, dtype)
+    pnt, vec = as_numbers("ray", "pnt", pnt, dtype), as_numbers("ray", "vec", vec, dtype)
     for name, value in (("pnt", pnt), ("vec", vec)):
         if value.shape[-1:] != (3,):
             raise ArgumentError("ray", name, f"must have shape (..., 3), its shape is {value.shape}")

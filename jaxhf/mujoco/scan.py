@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.core import Tracer
 from jaxtyping import Bool, Float
 
 from ..core.autodiff import with_tangent
@@ -15,11 +16,11 @@ from ..core.compilation import compiled
 from ..core.errors import ArgumentError, require_kind
 from ..core.materialise import materialise
 from ..core.ray import Ray
-from ..core.types import Point2, Scalar, Vector
+from ..core.types import Point2, Scalar, Vector, require_number
 from ..trace.status import Status
 from ..trace.triangle import plane_through
 from ..trace.walk import WalkResult
-from .hfield import HField
+from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import Quaternion, pose, rotation, yaw
 from .ray import first_met, in_hfield, nearest, one_axis, triangle_heights
 from .solid import base_faces, column, ground
@@ -54,8 +55,16 @@ def grid_pattern(size: tuple[float, float] = (1.6, 1.0), resolution: float = 0.1
     Args:
       size: extent in x (ahead) and in y, which the grid reaches on both sides where it is a multiple of the resolution.
       resolution: from place to place.
+
+    Raises:
+      ValueError: an extent is negative, or the resolution not positive.
     """
-    x, y = (np.arange(-length / 2, length / 2 + 1e-9, resolution) for length in size)
+    sides = number_pair("grid_pattern", "size", size)
+    if min(sides) < 0:
+        raise ArgumentError("grid_pattern", "size", f"must not be negative, it is {size!r}")
+    if not 0 < resolution < np.inf:
+        raise ArgumentError("grid_pattern", "resolution", f"must be positive and finite, it is {resolution!r}")
+    x, y = (np.arange(-length / 2, length / 2 + 1e-9, resolution) for length in sides)
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
 
 
@@ -81,14 +90,16 @@ def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, of
       A `Scan` with the axes (..., n).
 
     Raises:
-      ValueError: shapes that do not fit, or an unknown `align`.
+      ValueError: shapes that do not fit, an unknown `align`, an `offset` that is not finite.
     """
     require_kind("height_scan", "hfields", hfields, HField, "a jaxhf.mujoco.HField")
     if align not in get_args(Align):
         raise ArgumentError("height_scan", "align", f"must be one of {', '.join(get_args(Align))}; it is {align!r}")
     dtype = hfields.data.dtype
     pos, quat = poses_for("height_scan", hfields, pos, quat)
-    places = jnp.asarray(grid_pattern() if pattern is None else pattern, dtype)
+    places = as_numbers("height_scan", "pattern", grid_pattern() if pattern is None else pattern, dtype)
+    offset = known_numbers("height_scan", "offset", offset)
+    require_number("height_scan", "offset", offset)
     if places.ndim != 2 or places.shape[1] != 2:
         raise ArgumentError("height_scan", "pattern", f"must have shape (n, 2), its shape is {places.shape}")
     starts = _starts(pos, quat, jnp.asarray(offset, dtype), align=align)
@@ -104,9 +115,10 @@ def poses_for(owner: str, hfields: HField, pos: Any, quat: Any) -> tuple[jax.Arr
     Raises:
       ValueError: their shapes are others, or an orientation given as plain numbers is zero; `owner` is who says so.
     """
-    if not isinstance(quat, jax.Array) and not np.any(quat, axis=-1).all():
+    given, dtype, batch = quat, hfields.data.dtype, hfields.batch
+    pos, quat = as_numbers(owner, "pos", pos, dtype), as_numbers(owner, "quat", quat, dtype)
+    if not isinstance(given, jax.Array) and not isinstance(quat, Tracer) and not np.any(given, axis=-1).all():
         raise ArgumentError(owner, "quat", "must not be zero, one is (0, 0, 0, 0)")
-    pos, quat, batch = jnp.asarray(pos, hfields.data.dtype), jnp.asarray(quat, hfields.data.dtype), hfields.batch
     for name, value, length in (("pos", pos, 3), ("quat", quat, 4)):
         if value.shape != (*pos.shape[:-1], length) or value.shape[: len(batch)] != batch or value.ndim <= len(batch):
             fits = name == "quat" and pos.ndim > len(batch)

@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.compilation import compiled
-from ..core.errors import ArgumentError, require_kind
-from .hfield import HField
+from ..core.errors import ArgumentError, require_kind, whole_number
+from ..scene.camera import require_size
+from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import rotation
 from .ray import first_met
 from .scan import Scan, poses_for
@@ -30,15 +31,25 @@ def lidar_pattern(
       vertical_fov: the lowest and the highest.
       horizontal_fov: azimuths in degrees, counter-clockwise seen from above.
       resolution: the largest step between two azimuths, in degrees.
+
+    Raises:
+      ValueError: no channel, a resolution that is not positive, azimuths that do not rise.
     """
-    first, last = horizontal_fov
-    if channels < 1 or not resolution > 0 or not last > first:
-        rule = f"must have channels, a positive resolution and a rising horizontal_fov, it has {channels}, {resolution}, "
-        raise ArgumentError("lidar_pattern", "pattern", f"{rule}{horizontal_fov}")
+    owner = "lidar_pattern"
+    if not isinstance(whole_number(channels), int) or channels < 1:
+        raise ArgumentError(owner, "channels", f"must be a whole number from 1 on, it is {channels!r}")
+    if not 0 < resolution < np.inf:
+        raise ArgumentError(owner, "resolution", f"must be positive and finite, it is {resolution!r}")
+    (first, last), elevations = (
+        number_pair(owner, "horizontal_fov", horizontal_fov),
+        number_pair(owner, "vertical_fov", vertical_fov),
+    )
+    if not last > first:
+        raise ArgumentError(owner, "horizontal_fov", f"must rise from the first to the last azimuth, it is {horizontal_fov!r}")
     steps = int(np.ceil((last - first) / resolution - 1e-9))
     azimuth = np.radians(np.linspace(first, last, steps + 1))
     azimuth = azimuth[:-1] if last - first >= 360 else azimuth
-    elevation = np.radians(np.linspace(*vertical_fov, channels))[:, None]
+    elevation = np.radians(np.linspace(*elevations, channels))[:, None]
     x, y, z = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation) + 0 * azimuth
     return np.stack([x, y, z], -1).reshape(-1, 3)
 
@@ -59,7 +70,7 @@ def lidar(hfields: HField, pos: Any, quat: Any, pattern: Any = None) -> Scan:
     """
     require_kind("lidar", "hfields", hfields, HField, "a jaxhf.mujoco.HField")
     pos, quat = poses_for("lidar", hfields, pos, quat)
-    directions = jnp.asarray(lidar_pattern() if pattern is None else pattern, hfields.data.dtype)
+    directions = as_numbers("lidar", "pattern", lidar_pattern() if pattern is None else pattern, hfields.data.dtype)
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ArgumentError("lidar", "pattern", f"must have shape (n, 3), its shape is {directions.shape}")
     met = first_met(hfields, *_turned(pos, quat, directions))
@@ -78,21 +89,23 @@ def depth_image(
       pos, quat: the cameras' positions and orientations, as in `height_scan`.
       width, height: pixels.
       fovy: vertical field of view, degrees.
-      intrinsics: (fx, fy, cx, cy) in pixels, (cx, cy) from the upper left corner of the picture; None: from fovy, with
-        square pixels and the axis in the middle.
+      intrinsics: (fx, fy, cx, cy) in pixels, (cx, cy) from the upper left corner of the picture, or the matrix
+        [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; None: from fovy, with square pixels and the axis in the middle.
 
     Returns:
       Depths and distances, top row first, shape (..., height, width).
 
     Raises:
-      ValueError: shapes that do not fit, or a fovy that is not between 0 and 180.
+      ValueError: shapes that do not fit, a size below 1, a fovy that is not between 0 and 180, focal lengths that are not
+        positive.
     """
     require_kind("depth_image", "hfields", hfields, HField, "a jaxhf.mujoco.HField")
     if not 0 < fovy < 180:
         raise ArgumentError("depth_image", "fovy", f"must lie between 0 and 180 degrees, it is {fovy}")
+    require_size("depth_image", width, height)
     pos, quat = poses_for("depth_image", hfields, pos, quat)
     f = height / 2 / np.tan(np.radians(fovy) / 2)
-    fx, fy, cx, cy = (f, f, width / 2, height / 2) if intrinsics is None else map(float, intrinsics)
+    fx, fy, cx, cy = (f, f, width / 2, height / 2) if intrinsics is None else _lens(intrinsics)
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (cy - np.arange(height) - 0.5) / fy)
     # With 1 along the axis a ray's t is the depth itself.
     pixels = np.stack([x, y, -np.ones_like(x)], -1).reshape(-1, 3)
@@ -101,6 +114,24 @@ def depth_image(
     dist = jnp.where(met.valid, met.t * jnp.broadcast_to(lengths, met.t.shape), -1)
     shape = *pos.shape[:-1], height, width
     return met.t.reshape(shape), dist.reshape(shape)
+
+
+def _lens(intrinsics: Any) -> list[float]:
+    """fx, fy, cx and cy from these four or from the matrix of a pinhole."""
+    owner, name = "depth_image", "intrinsics"
+    given = known_numbers(owner, name, intrinsics)
+    if given.shape == (3, 3):
+        fx, fy, cx, cy = numbers = np.asarray(given)[[0, 1, 0, 1], [0, 1, 2, 2]]
+        if not np.array_equal(given, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]):
+            rule = f"must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] as a matrix, it is {np.asarray(given).tolist()}"
+            raise ArgumentError(owner, name, rule)
+        given = numbers
+    if given.shape != (4,):
+        raise ArgumentError(owner, name, f"must be fx, fy, cx and cy, or a matrix of 3 x 3, the shape is {given.shape}")
+    fx, fy, cx, cy = map(float, given)
+    if not min(fx, fy) > 0:
+        raise ArgumentError(owner, name, f"must have positive focal lengths, fx is {fx:g} and fy {fy:g}")
+    return [fx, fy, cx, cy]
 
 
 @compiled

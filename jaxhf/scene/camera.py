@@ -105,7 +105,7 @@ class Perspective(eqx.Module):
             raise ArgumentError(
                 "from_intrinsics", "convention", f"must be one of {', '.join(get_args(Convention))}; it is {convention!r}"
             )
-        _require_pixels("from_intrinsics", width, height)
+        require_size("from_intrinsics", width, height)
         lens = {"fx": float_leaf(fx), "fy": float_leaf(fy), "cx": float_leaf(cx), "cy": float_leaf(cy)}
         for name, leaf in lens.items():
             require_number("from_intrinsics", name, leaf)
@@ -156,7 +156,7 @@ class Perspective(eqx.Module):
         Raises:
           ValueError: angles out of range, or a terrain without heights.
         """
-        _require_pixels("framing", width, height)
+        require_size("framing", width, height)
         pose = framing_pose(field, azimuth, altitude, fov, width, height, margin, base, around)
         return cls(pose, fov, width=width, height=height)
 
@@ -301,7 +301,7 @@ def _require_pose(matrix: Any) -> None:
             )
 
 
-def _require_pixels(owner: str, width: Any, height: Any) -> None:
+def require_size(owner: str, width: Any, height: Any) -> None:
     for side, value in (("width", width), ("height", height)):
         if not isinstance(whole_number(value), int) or value < 1:
             raise ArgumentError(owner, side, f"must be a whole number of pixels from 1 on, it is {value!r}")
@@ -310,4 +310,4 @@ def _require_pixels(owner: str, width: Any, height: Any) -> None:
 def _check_camera(camera: Camera) -> None:
     kind = type(camera).__name__
     require_invertible(kind, "world_from_camera", camera.world_from_camera)
-    _require_pixels(kind, camera.width, camera.height)
+    require_size(kind, camera.width, camera.height)

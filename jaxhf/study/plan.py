@@ -169,6 +169,9 @@ def plan(
     scene = load_scene(path)
     if not scene.heightfields:
         raise FileError(f"{path}: there is no heightfield whose rendering could be measured")
+    for knob, absent in _unused(scene).items():
+        if knob in knobs:
+            raise ArgumentError("tradeoff", "knobs", f"{knob!r} changes nothing here: the scene has no {absent}")
     fits = fits or not _VALUES["fit"].keys().isdisjoint(knobs)
     if fits and not np.isfinite(scene.heights).all():
         raise FileError(f"{path}: a fit's terrain must be without holes, this one has {np.sum(~np.isfinite(scene.heights))}")
@@ -186,11 +189,7 @@ def plan(
 
 def _configurations(scene: Scene, knobs: Collection[str], quick: bool, fits: bool) -> Iterator[Configuration]:
     """One knob at a time from each task's base; for pictures then samples together with what makes each of them cheaper."""
-    knobs = set(knobs)
-    if not any(isinstance(obj.material, Mirror) for obj in scene.objects):
-        knobs.discard("max_depth")
-    if all(isinstance(light, Sky) for light in scene.lights):
-        knobs.discard("shadows")
+    knobs = set(knobs) - _unused(scene).keys()
 
     def one_at_a_time(base: Configuration, swept: Collection[str]) -> Iterator[Configuration]:
         yield base
@@ -211,6 +210,16 @@ def _configurations(scene: Scene, knobs: Collection[str], quick: bool, fits: boo
     if fits:
         fit = Configuration("fit", settings=Settings(samples=4), tolerance=1e-4)
         yield from one_at_a_time(fit, _VALUES["fit"] if knobs.isdisjoint(_VALUES["fit"]) else knobs)
+
+
+def _unused(scene: Scene) -> dict[str, str]:
+    """Knobs that change nothing in this scene, each with what the scene lacks."""
+    unused = {}
+    if not any(isinstance(obj.material, Mirror) for obj in scene.objects):
+        unused["max_depth"] = "mirror"
+    if all(isinstance(light, Sky) for light in scene.lights):
+        unused["shadows"] = "light but the sky"
+    return unused
 
 
 def _identity(scene: Scene, devices: int, quick: bool) -> str:

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import importlib.util
+import os
 import re
 import subprocess
 import sys
@@ -240,6 +241,36 @@ def test_no_memory_is_an_error_in_one_line(monkeypatch, in_this_process, error):
     monkeypatch.setattr("jaxhf.cli.info.run", fail)
     said = "jaxhf: error: memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)\n"
     assert in_this_process("info", SCENE) == (2, "", said)
+
+
+C_LOCALE = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+
+@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="these take names in Unicode alone")
+@pytest.mark.parametrize(
+    ("variables", "source", "output", "shown"),
+    [
+        (C_LOCALE, "dém 1.tif", "c ü.tif", "c ü.tif"),
+        ({"PYTHONIOENCODING": "latin-1"}, "a.tif", "c 山.tif", r"c \u5c71.tif"),
+        ({}, os.fsdecode(b"d\xe9m.tif"), os.fsdecode(b"\xfc.tif"), r"\udcfc.tif"),
+        (C_LOCALE, "dém.toml", "ü.npy", "ü.npy"),
+    ],
+)
+def test_any_name_is_taken_and_shown(tmp_path, variables, source, output, shown):
+    """Also by a terminal whose encoding lacks its letters, and where a scene names another file."""
+    pytest.importorskip("rasterio")
+    heights = tmp_path / ("é.npy" if source.endswith(".toml") else source)
+    terrain = jaxhf.Terrain(np.random.default_rng(0).uniform(0, 9, (7, 8)), 10.0, 10.0)
+    jaxhf.save_heights(heights, terrain)
+    (tmp_path / "dém.toml").write_text(CAMERA + FIELD.replace("heights = [[0, 1], [2, 3]]", 'file = "é.npy"'), encoding="utf-8")
+    command = ["render", "--width", "8"] if source.endswith(".toml") else ["hillshade"]
+    run = subprocess.run(
+        [sys.executable, "-m", "jaxhf", *command, source, "-o", output], capture_output=True, timeout=120, cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(Path(jaxhf.__file__).parents[1]), **variables},
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.decode().startswith(f"{shown}: ")
+    assert (tmp_path / output).exists()
 
 
 # Errors of the user's.

@@ -86,6 +86,13 @@ def test_an_ending_gets_what_fits_the_command(folder, capsys, line, answer):
     assert (code, text.count("\n"), text.endswith(answer)) == (2, 1, True), text
 
 
+@pytest.mark.parametrize("line", ["info {}", "slope {} -o b.tif", "view {} -o b.png", "fit {} -o b.npz", "slope a.npy -o {}"])
+def test_an_address_is_refused_as_it_was_written(capsys, line):
+    code, text = said(capsys, *line.format("http://a/b.tif").split())
+    assert (code, text.count("\n")) == (2, 1)
+    assert text.startswith("jaxhf: error: http://a/b.tif: this is an address, files are neither read from the network nor")
+
+
 SCENE = """samples = 1
 [camera]
 type = "perspective"
@@ -98,6 +105,51 @@ shape = "heightfield"
 file = "hills.npy"
 albedo = "rock"
 """
+
+
+IGNORED = [
+    ("relief hills.npy -o a.png --no-shading --shadows", "--shadows would change nothing: --no-shading leaves the light out"),
+    ("relief hills.npy -o a.png --no-shading --azimuth 0", "--azimuth would change nothing: --no-shading"),
+    ("relief hills.npy -o a.png --no-shading --algorithm horn", "--algorithm would change nothing: --no-shading"),
+    ("relief hills.npy -o a.png --no-shading --z-factor 1", "--z-factor would change nothing: --no-shading"),
+    ("relief hills.npy -o a.png --no-shading --dx 2", "--dx would change nothing: --no-shading"),
+    ("relief hills.npy -o a.png --variant igor --altitude 9", "--altitude would change nothing: --variant igor has lights of"),
+    ("hillshade hills.npy -o a.png --variant multidirectional --azimuth 9", "--azimuth would change nothing: --variant multi"),
+    ("horizon hills.npy -o a.npy --azimuth 90 --azimuths 8", "--azimuths would change nothing: --azimuth asks for one"),
+    ("view hills.npy -o a.png --frames 24", "--frames would change nothing: a.png is one picture, a film is .gif or .mp4"),
+    (
+        "view hills.npy -o a.gif --sun-from 90,9 --sun-to 99,9 --altitude 8",
+        "--altitude would change nothing: the sun moves from",
+    ),
+    (
+        "render scene.toml -o a.png --shading flat --normals six",
+        "--normals would change nothing: --shading flat takes those of",
+    ),
+    ("convert hills.npy a.tif --base 0", "--base is for meshes (.glb, .obj, .ply), a.tif is none"),
+    ("render scene.toml -o a.png --aovs depth", "--aovs are layers of an .exr, a.png is none"),
+    ("tradeoff scene.toml --knobs max_depth", "tradeoff: knobs 'max_depth' changes nothing here: the scene has no mirror"),
+]
+
+
+@pytest.mark.parametrize(("line", "answer"), IGNORED)
+def test_no_option_is_ignored(folder, capsys, line, answer):
+    before = sorted(folder.iterdir())
+    code, text = said(capsys, *line.split())
+    assert (code, text.count("\n")) == (2, 1), text
+    assert text.startswith(f"jaxhf: error: {answer}"), text
+    assert sorted(folder.iterdir()) == before
+
+
+def test_options_that_change_something_are_taken(folder, capsys):
+    """Shadows have a direction, whatever the shade; defaults are those of the functions."""
+    for line in (
+        "hillshade hills.npy -o a.png --variant multidirectional --azimuth 9 --shadows",
+        "relief hills.npy -o a.png --no-shading --alpha",
+        "relief hills.npy -o a.png --azimuth 0",
+        "hillshade hills.npy -o b.npy",
+    ):
+        assert said(capsys, *line.split(), "--quiet")[0] == 0
+    np.testing.assert_array_equal(np.load("b.npy"), jaxhf.hillshade(np.eye(4), 1.0))
 
 
 @pytest.fixture

@@ -160,6 +160,13 @@ def test_conversion_to_exr_says_what_is_left_out(tmp_path, capsys):
     assert capsys.readouterr().out.endswith(" (.exr holds the heights alone)\n")
 
 
+def test_conversion_to_png_says_that_heights_are_rounded(tmp_path, capsys):
+    for top, said in ((0.25, " (.png holds whole numbers: heights are rounded to steps of 1)\n"), (1, "\n")):
+        jaxhf.save_heights(tmp_path / "in.npz", Terrain(top * np.eye(3)))
+        assert main(["convert", str(tmp_path / "in.npz"), str(tmp_path / "out.png")]) == 0
+        assert capsys.readouterr().out.endswith(f"range (0, {top}){said}")
+
+
 def test_conversion_refuses_before_it_reads(tmp_path, capsys):
     assert main(["convert", str(tmp_path / "missing.tif"), str(tmp_path / "out.jpg")]) == 2
     assert "cannot write heights with the ending '.jpg'" in capsys.readouterr().err

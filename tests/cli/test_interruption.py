@@ -42,6 +42,34 @@ def test_ctrl_c_in_the_first_second_ends_it_with_one_line(delay, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+ENCODING = """
+import os, pathlib, sys, zlib
+from jaxhf.cli import interruption
+interruption.end_at_once()
+from jaxhf.io.files import replacing
+with replacing(pathlib.Path(sys.argv[1])) as temporary:
+    temporary.write_bytes(b"half")
+    print("ready", flush=True)
+    while True:
+        zlib.compress(os.urandom(1 << 20) * 400, 9)
+"""
+
+
+def test_ctrl_c_waits_for_no_call_and_leaves_no_half_of_a_file(tmp_path):
+    """Such as the encoding of a PNG of 8192 x 8192 heights, 13 seconds: here one of more than that."""
+    process = started(ENCODING, tmp_path / "out.png")
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(1)
+        begin = time.perf_counter()
+        process.send_signal(2)
+        out, err = process.communicate(timeout=60)
+    assert time.perf_counter() - begin < 2
+    assert (process.returncode, out, err) == (130, "", "\njaxhf: interrupted\n")
+    assert not list(tmp_path.iterdir())
+
+
 COLLECTED = """
 def collected(phase, info):
     if "jax" in sys.modules:

@@ -1,5 +1,6 @@
 """`jaxhf skyview` and `jaxhf horizon`: the values of the functions of those names, where the terrain lies."""
 
+import errno
 import sys
 
 import numpy as np
@@ -100,3 +101,35 @@ def test_mistakes_are_one_line(run, arguments, message):
     assert said.startswith("jaxhf: error: ")
     assert message in said
     assert said.count("\n") == 1
+
+
+def test_a_full_disk_leaves_none_of_several_maps(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("rasterio")
+    from jaxhf.io import rasters
+
+    geotiff, written = rasters.geotiff, []
+
+    def full(*given):
+        written.append(given)
+        if len(written) == 4:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return geotiff(*given)
+
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
+    monkeypatch.setattr(rasters, "geotiff", full)
+    jaxhf.save_heights(tmp_path / "in.npz", jaxhf.Terrain(np.random.default_rng(0).random((6, 5)).astype("f"), 1.0, 1.0))
+    command = ["horizon", str(tmp_path / "in.npz"), "-o", str(tmp_path / "out.tif"), "--azimuths", "8"]
+    assert main(command) == 2
+    assert "cannot be written: No space left" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["in.npz"]
+    assert main(command) == 0
+    assert len(list(tmp_path.glob("out_*.tif"))) == 8
+
+
+def test_one_azimuth_is_one(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
+    jaxhf.save_heights(tmp_path / "in.npz", jaxhf.Terrain(np.eye(4, dtype=np.float32), 1.0, 1.0))
+    for command in ("horizon", "skyview"):
+        assert main([command, str(tmp_path / "in.npz"), "-o", str(tmp_path / "out.npy"), "--azimuths", "1"]) == 0
+        assert ", 1 azimuth, " in capsys.readouterr().out
+        assert np.load(tmp_path / "out.npy").shape == {"horizon": (1, 4, 4), "skyview": (4, 4)}[command]

@@ -29,7 +29,7 @@ def test_info_describes_terrain(folder, capsys):
                 "cells: 0.01 x 0.01 degree, in the middle 788.468 x 1111.32 metres",
                 "place: longitude 10 to 10.02, latitude 44.99 to 45.01",
                 "system: WGS 84 (EPSG:4326)",
-                "heights: 1 to 9, 1 holes (0.111 of all), stored as -9999",
+                "heights: 1 to 9, 1 hole (11.1 %), stored as -9999",
             ],
         ),
         (
@@ -48,7 +48,7 @@ def test_info_describes_terrain(folder, capsys):
                 "2 rows, 2 columns of float64",
                 "cells: not in the file, taken as 1 x 1",
                 "system: not known",
-                "heights: none, 4 holes (1 of all)",
+                "heights: none, 4 holes (100 %)",
             ],
         ),
     ):

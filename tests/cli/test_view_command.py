@@ -164,6 +164,10 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
         (["--above", "95"], "altitude must be from -90 to 90 degrees"),
         (["--water", "nan"], "--water must be finite"),
         (["--exaggeration", "0"], "--exaggeration must be positive and finite"),
+        (
+            ["--exaggeration", "1e9"],
+            "must leave a terrain at most 100 times its length high; times 1e+09 it",
+        ),
         (["-o", "out.bmp"], "cannot write an image with the ending '.bmp'"),
     ],
 )

@@ -416,6 +416,8 @@ BAD = {
         {},
         {"prior": 0.0, "prior_std": np.ones((5, 5))},
     ),
+    r"prior_std must be positive, it is -21$": ({}, {"prior": 0.0, "prior_std": -21}),
+    r"prior_std must be positive, it is 0 to 1$": ({}, {"prior": 0.0, "prior_std": np.eye(12)}),
     r"prior_exponent must stand with a prior_length": ({}, {"prior": 0.0, "prior_std": 1.0, "prior_exponent": 3}),
     r"prior_exponent must be at most 10, it is 99": ({}, {"prior_length": 0.3, "prior_exponent": 99}),
     r"albedo_smoothness must stand with albedo='map'": ({}, {"albedo_smoothness": 1.0}),

@@ -1,6 +1,7 @@
 """Files that take the place of others."""
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,36 @@ import pytest
 import jaxhf
 from jaxhf.io.checkpoint import save_checkpoint
 from jaxhf.io.files import save_text
+
+
+@pytest.mark.parametrize("name", ["http://a/b.tif", "s3://bucket/b.tif"])
+def test_an_address_is_no_file(name):
+    """It is named as it was given: `Path` would have http:/a/b.tif."""
+    for call in (jaxhf.load_heights, jaxhf.load_image, jaxhf.load_scene, lambda path: jaxhf.save_image(path, np.ones((2, 2)))):
+        with pytest.raises(ValueError, match=f"^{name}: this is an address, files are neither read from the network nor"):
+            call(name)
+
+
+@pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="these take names in Unicode alone")
+def test_names_that_are_not_utf_8(tmp_path):
+    """As bytes in Latin-1 are, on a disk of long ago; the header beside a raster is found."""
+    rasterio = pytest.importorskip("rasterio")
+    pytest.importorskip("OpenEXR")
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/d\xe9m"))
+    folder.mkdir()
+    terrain = jaxhf.Terrain(np.arange(6, dtype=np.float32).reshape(2, 3), 30.0, 30.0, 5e5, 4.1e6)
+    jaxhf.save_heights(folder / "a.tif", terrain)
+    place = {"width": 3, "height": 2, "count": 1, "transform": rasterio.Affine(20, 0, 5e5, 0, -20, 4.1e6)}
+    with rasterio.open(tmp_path / "b.bil", "w", driver="EHdr", dtype="float32", **place) as file:
+        file.write(terrain.heights, 1)
+    for ending in (".bil", ".hdr"):
+        (tmp_path / f"b{ending}").rename(folder / f"b{ending}")
+    for name, dx in (("a.tif", 30), ("b.bil", 20)):
+        assert jaxhf.load_heights(folder / name).dx == dx
+    jaxhf.save_image(folder / "c.exr", np.ones((2, 3), np.float32))
+    np.testing.assert_array_equal(jaxhf.load_image(folder / "c.exr"), 1)
+    assert {path.name for path in folder.iterdir()} == {"a.tif", "b.bil", "b.hdr", "c.exr"}
+
 
 WRITERS = {
     "a checkpoint": ("fit.checkpoint", lambda path: save_checkpoint(path, {"stage": 1}, [np.ones(3)])),

@@ -133,6 +133,35 @@ def test_weights_in_a_png_are_no_colours(folder, dtype, top):
     np.testing.assert_array_equal(weights, stored > 0)
 
 
+def test_what_a_picture_holds_is_for_the_file_to_say(folder):
+    """Whole numbers are sRGB, or linear; a texture's as well."""
+    stored = np.full((3, 4), 30000, np.uint16)
+    Image.fromarray(stored).save(folder / "deep.png")
+    share = 30000 / 65535
+    for transfer, value in (("linear", share), ("srgb", ((share + 0.055) / 1.055) ** 2.4)):
+        given = f'image = "deep.png"\ntransfer = "{transfer}"\n'
+        painted = SCENE + f'albedo = "grey"\n[textures.grey]\n{given}\n[[pictures]]\n{given}'
+        found = case(folder, painted)
+        np.testing.assert_allclose(found.targets[0], value, rtol=1e-6)
+        np.testing.assert_allclose(found.scenes[0].objects[0].material.albedo.texels, value, rtol=1e-6)
+
+
+def test_orthophotos_and_masks_of_geographic_programs(folder):
+    """Pixels without data do not count, with a mask and without one."""
+    rasterio = pytest.importorskip("rasterio")
+    place = {"driver": "GTiff", "width": 4, "height": 3, "count": 1, "transform": rasterio.Affine(30, 0, 5e5, 0, -30, 4.1e6)}
+    seen = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    for name, values, nodata in (("seen.tif", seen, 0), ("mask.tif", np.where(seen < 6, 255, 1).astype(np.uint8), 255)):
+        with rasterio.open(folder / name, "w", dtype="uint8", crs="EPSG:32616", nodata=nodata, **place) as file:
+            file.write(values, 1)
+    alone = case(folder, SCENE + '[[pictures]]\nimage = "seen.tif"\ntransfer = "linear"\n')
+    np.testing.assert_allclose(alone.targets[0][..., 0], np.where(seen == 0, np.nan, seen / 255), rtol=1e-6)
+    np.testing.assert_array_equal(alone.weights[0], seen > 0)
+    np.testing.assert_array_equal(case(folder, WHOLE + 'mask = "mask.tif"\n').weights[0], seen >= 6)
+    both = case(folder, SCENE + '[[pictures]]\nimage = "seen.tif"\nweights = "weights.npy"\n')
+    np.testing.assert_array_equal(both.weights[0], np.arange(12).reshape(3, 4) / 4 * (seen > 0))
+
+
 def test_what_is_not_given_is_left_to_fit(folder):
     found = case(folder, SCENE + PICTURE)
     assert found.options == {}
@@ -295,6 +324,10 @@ BAD = {
     "unknown key": (WHOLE + "\n[fits]\n", r":17: unknown key 'fits'; did you mean 'fit'"),
     "unknown option": (WHOLE + "\n[fit]\nmax_step = 3\n", r":18: unknown key 'max_step' in fit; did you mean 'max_steps'"),
     "unknown setting": (WHOLE + "\n[settings]\nshadow = true\n", r":18: unknown key 'shadow' in settings"),
+    "unknown transfer": (
+        WHOLE + 'transfer = "log"\n',
+        r":16: pictures\[0\]\.transfer must be one of srgb, linear; it is 'log'",
+    ),
     "unknown key of a picture": (WHOLE + "images = 1\n", r":16: unknown key 'images' in pictures\[0\]"),
     "wrong type": (WHOLE + "\n[fit]\nexposures = 1\n", r":18: fit\.exposures must be true or false, it is 1"),
     "wrong start": (WHOLE + "\n[fit]\nstart = [1]\n", r":18: fit\.start must be a finite number or a string, it is \[1\]"),

@@ -127,8 +127,87 @@ def test_16_bit_grey_keeps_every_bit(tmp_path, interlaced):
     rows = b"\x00\x01\x02" + b"\x00\xff\xfe" if interlaced else b"\x00\x01\x02\xff\xfe"
     write_png(tmp_path / "x.png", (2, 1, 16, 0, 0, 0, interlaced), rows)
     np.testing.assert_allclose(load_numbers(tmp_path / "x.png")[0, :, 1], np.array([0x0102, 0xFFFE]) / 65535, rtol=1e-6)
+    linear = load_image(tmp_path / "x.png", transfer="linear")
+    np.testing.assert_allclose(linear[0, :, 1], np.array([0x0102, 0xFFFE]) / 65535, rtol=1e-6)
     encoded = np.array([0x0102 / 65535 / 12.92, ((0xFFFE / 65535 + 0.055) / 1.055) ** 2.4])
-    np.testing.assert_allclose(load_image(tmp_path / "x.png")[0, :, 1], encoded, rtol=1e-6)
+    np.testing.assert_allclose(load_image(tmp_path / "x.png", transfer="srgb")[0, :, 1], encoded, rtol=1e-6)
+    with pytest.warns(UserWarning, match=r"x\.png: its 16-bit values are taken for sRGB; transfer = 'srgb' or 'linear' says"):
+        np.testing.assert_allclose(load_image(tmp_path / "x.png")[0, :, 1], encoded, rtol=1e-6)
+
+
+def test_bytes_are_srgb_unless_they_are_said_to_be_linear(tmp_path):
+    Image.new("RGB", (2, 1), (128, 128, 128)).save(tmp_path / "x.png")
+    np.testing.assert_allclose(load_image(tmp_path / "x.png"), ((128 / 255 + 0.055) / 1.055) ** 2.4, rtol=1e-6)
+    np.testing.assert_allclose(load_image(tmp_path / "x.png", transfer="linear"), 128 / 255, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"load_image: transfer must be one of srgb, linear; it is 'gamma'"):
+        load_image(tmp_path / "x.png", transfer="gamma")
+
+
+def geotiff(path, bands, **profile):
+    """A .tif of bands (count, h, w) that lies in UTM zone 16."""
+    rasterio = pytest.importorskip("rasterio")
+    count, h, w = bands.shape
+    place = {"crs": "EPSG:32616", "transform": rasterio.Affine(30, 0, 5e5, 0, -30, 4.1e6)}
+    with rasterio.open(
+        path, "w", driver="GTiff", width=w, height=h, count=count, dtype=bands.dtype, **place, **profile
+    ) as file:
+        file.write(bands)
+    return path
+
+
+def test_orthophotos(tmp_path):
+    """Top row first, as they are stored: colours and greys of bytes, of 16 bits and in floats."""
+    stored = np.random.default_rng(0).integers(0, 256, (4, 3, 5)).astype(np.uint8)
+    linear = np.where(stored / 255 <= 0.04045, stored / 255 / 12.92, ((stored / 255 + 0.055) / 1.055) ** 2.4)
+    found = load_image(geotiff(tmp_path / "rgb.tif", stored[:3], photometric="rgb"))
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, np.moveaxis(linear[:3], 0, -1), rtol=1e-6)
+    near_infrared = load_image(geotiff(tmp_path / "four.tiff", stored, photometric="rgb", alpha="unspecified"))
+    np.testing.assert_array_equal(near_infrared, found)
+    grey = load_image(geotiff(tmp_path / "grey.tif", stored[:1]), transfer="linear")
+    np.testing.assert_allclose(grey, np.repeat(stored[0, :, :, None], 3, -1) / 255, rtol=1e-6)
+    with pytest.warns(UserWarning, match=r"deep\.tif: its 16-bit values"):
+        load_image(geotiff(tmp_path / "deep.tif", stored[:1].astype(np.uint16)))
+    floats = (stored[:1] / np.float32(9)).astype(np.float32)
+    np.testing.assert_array_equal(load_image(geotiff(tmp_path / "f.tif", floats))[:, :, 1], floats[0])
+
+
+def test_palettes_of_geotiff_are_colours(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    path = geotiff(tmp_path / "x.tif", np.array([[[0, 1, 2]]], np.uint8))
+    with rasterio.open(path, "r+") as file:
+        file.write_colormap(1, {0: (0, 0, 0), 1: (255, 0, 0), 2: (255, 255, 255)})
+    np.testing.assert_array_equal(load_image(path), [[[0, 0, 0], [1, 0, 0], [1, 1, 1]]])
+
+
+def test_what_a_geotiff_leaves_out_is_nan_in_a_picture_and_0_in_weights(tmp_path):
+    stored = np.array([[[7, 255], [9, 255]]], np.uint8)
+    opacity = np.array([[[255, 255], [0, 255]]], np.uint8)
+    for path, where in (
+        (geotiff(tmp_path / "nodata.tif", stored, nodata=7), (0, 0)),
+        (geotiff(tmp_path / "alpha.tif", np.concatenate([stored] * 3 + [opacity]), photometric="rgb", alpha="yes"), (1, 0)),
+    ):
+        missing = np.zeros((2, 2), bool)
+        missing[where] = True
+        np.testing.assert_array_equal(np.isnan(load_image(path)), np.repeat(missing[..., None], 3, -1))
+        np.testing.assert_array_equal(load_numbers(path)[..., 0], np.where(missing, 0, stored[0] / np.float32(255)))
+
+
+def test_tiffs_that_are_no_pictures(tmp_path, monkeypatch):
+    bands = np.zeros((5, 2, 2), np.uint8)
+    for name, stored, message in (
+        ("five.tif", bands, r"five\.tif: a picture must have 1, 3 or 4 bands, it has 5"),
+        ("two.tif", bands[:2], r"two\.tif: a picture must have 1, 3 or 4 bands, it has 2"),
+        ("signed.tif", bands[:1].astype(np.int16), r"signed\.tif: a picture must be of uint8, .* it is of int16"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            load_image(geotiff(tmp_path / name, stored, photometric="minisblack"))
+    (tmp_path / "no.tif").write_bytes(b"no TIFF")
+    with pytest.raises(ValueError, match=r"no\.tif: it is cut off, damaged or of another kind"):
+        load_image(tmp_path / "no.tif")
+    monkeypatch.setattr("jaxhf.io.files.MAX_PIXELS", 3)
+    with pytest.raises(ValueError, match=r"x\.tif: it must hold at most 3 pixels, it declares 2 x 2"):
+        load_image(geotiff(tmp_path / "x.tif", bands[:1]))
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "P", "1", "RGB"])

@@ -45,8 +45,11 @@ def test_a_map_keeps_place_and_system(tmp_path, utm, values):
 
 @pytest.mark.parametrize(
     ("name", "driver"),
-    [("x.img", "HFA"), ("x.bil", "EHdr"), ("x.flt", "EHdr"), ("x.grd", "GSBG"), ("x.vrt", "VRT"), ("x.nc", "netCDF")],
-)
+    [
+        ("x.img", "HFA"), ("x.bil", "EHdr"), ("x.flt", "EHdr"), ("x.grd", "GSBG"), ("x.vrt", "VRT"), ("x.nc", "netCDF"),
+        ("x.bil", "ENVI"), ("x.img", "ENVI"),
+    ],
+)  # fmt: skip
 def test_other_rasters_of_gdal(tmp_path, utm, name, driver):
     rasterio_shutil = pytest.importorskip("rasterio.shutil")
     with rasterio.Env() as gdal:

@@ -480,6 +480,11 @@ def test_a_mistake_is_named_with_its_line(tmp_path, text, line, message):
     assert "\n" not in str(error.value)
 
 
+def test_what_is_known_is_told_once(tmp_path):
+    with pytest.raises(SceneError, match=r"camera\.type must be one of perspective, orthographic, pinhole; it is 'x'$"):
+        read(tmp_path, view('type = "x"'))
+
+
 def test_a_file_that_is_not_text(tmp_path):
     (tmp_path / "scene.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(SceneError, match="this is not TOML"):

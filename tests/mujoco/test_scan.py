@@ -7,7 +7,8 @@ import pytest
 from hfields import SIZE, Reference, heights, mujoco
 
 import jaxhf
-from jaxhf.mujoco import HField, grid_pattern, height_scan
+from jaxhf.core.errors import ArgumentError
+from jaxhf.mujoco import HField, grid_pattern, height_scan, ray
 
 GROUNDS = np.stack([heights(9, 6, seed) for seed in (1, 2)]).astype(np.float64)
 TURN, PLACE = (0.8, 0, 0, -0.6), np.array([[0.0, 0, 0], [7, -3, 0.4]])
@@ -121,3 +122,30 @@ def test_says_what_is_wrong():
         height_scan(FIELDS, pos, quat, align="roll")
     with pytest.raises(ValueError, match=r"pattern must have shape \(n, 2\)"):
         height_scan(FIELDS, pos, quat, np.zeros((3, 3)))
+    with pytest.raises(ArgumentError, match=r"^height_scan: offset must be finite, it is nan"):
+        height_scan(FIELDS, pos, quat, offset=np.nan)
+    with pytest.raises(ArgumentError, match=r"^height_scan: offset must be one number, its shape is \(2,\)"):
+        height_scan(FIELDS, pos, quat, offset=(1, 2))
+    for given in (object(), FIELDS, "robot", None):  # such as MJX's data, whose numbers are meant
+        with pytest.raises(ArgumentError, match=r"^height_scan: pos must be numbers, it is an? "):
+            height_scan(FIELDS, given, given)
+    with pytest.raises(ArgumentError, match=r"^ray: vec must be numbers, it is a str"):
+        ray(FIELDS, pos, "down")
+    with pytest.raises(ArgumentError, match=r"^HField: data must be numbers, it is an object"):
+        HField(object(), SIZE)
+    with pytest.raises(ArgumentError, match=r"^HField: size must be numbers, it is a str"):
+        HField(GROUNDS, "large")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"resolution": 0.0}, "resolution must be positive and finite, it is 0.0"),
+        ({"resolution": np.nan}, "resolution must be positive and finite, it is nan"),
+        ({"size": (-1.0, 1.0)}, r"size must not be negative, it is \(-1.0, 1.0\)"),
+        ({"size": (1.0, np.inf)}, "size must be finite"),
+    ],
+)
+def test_patterns_say_what_is_wrong(arguments, message):
+    with pytest.raises(ArgumentError, match=f"^grid_pattern: {message}"):
+        grid_pattern(**arguments)

@@ -150,7 +150,7 @@ def test_a_process_that_dies_is_listed(sweep, started, monkeypatch, capsys, ques
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert "2 configurations: " in out
-    assert err.splitlines()[1:] == ["failed: picture, traversal dda: killed", "jaxhf: error: 1 configurations failed"]
+    assert err.splitlines()[1:] == ["failed: picture, traversal dda: killed", "jaxhf: error: 1 configuration failed"]
     assert [one.settings.traversal for one in sweep.missing()] == ["dda"]
     monkeypatch.setattr(Pretended, "fatal", ("picture", "pyramid", question))
     with pytest.raises(MeasurementError, match="killed"):

@@ -266,7 +266,7 @@ class _Reader:
         texture = known[name]
         if texture.path not in self.images:
             with located(texture.place):
-                self.images[texture.path] = ImageTexture(load_image(texture.path))
+                self.images[texture.path] = ImageTexture(load_image(texture.path, transfer="srgb"))
         return self.images[texture.path]
 
 

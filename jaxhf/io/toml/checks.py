@@ -65,8 +65,8 @@ class Part(NamedTuple):
                 self._replace(table={meant: None}).require_known((name,))
             raise self.error(f"{self.name} must have {name!r}, one of {', '.join(options)}; it is missing")
         if value not in tuple(options):
-            tail = f"; {nearest(value, options)}" if isinstance(value, str) else ""
-            place = self.at(name)
+            place, close = self.at(name), difflib.get_close_matches(str(value), tuple(options), n=1, cutoff=0.5)
+            tail = "".join(f"; did you mean {meant!r}?" for meant in close)
             raise place.error(f"{place.name} must be one of {', '.join(options)}; it is {value!r}{tail}")
         return value
 

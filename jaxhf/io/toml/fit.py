@@ -23,7 +23,7 @@ from ..pbrt.reader import load_pbrt
 from ..terrain import Terrain
 from .checks import Part
 from .priors import Sought, known_deviations, known_heights
-from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene
+from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene, transfer_of
 from .tables import SCENE, Key, Keys
 from .values import flag, number, number_list, numbers, or_word, table, tables, whole, word
 
@@ -39,6 +39,7 @@ _CASE: Keys = {
 }
 _PICTURE: Keys = {
     "image": Key(word),
+    "transfer": Key(word, None),
     "mask": Key(word, None),
     "weights": Key(word, None),
     "noise": Key(number, None),
@@ -152,12 +153,12 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     for k, picture_table in enumerate(values["pictures"]):
         picture = part.at("pictures", k, table=picture_table)
         given = picture.read(_PICTURE)
-        target = _read(picture, "image", load_image, given["image"])
+        target = _read(picture, "image", partial(load_image, transfer=transfer_of(picture)), given["image"])
         lights = base.lights if given["lights"] is None else read_lights(picture, given["lights"], base.sought.stored)
         camera = _camera(picture, given["camera"], base, target.shape[:2])
         scenes.append(picture.made(Scene, base.objects, camera, lights, base.samples))
         targets.append(target)
-        weights.append(_weights(picture, given, target.shape[:2]))
+        weights.append(_weights(picture, given, target))
         noises.append(noise if given["noise"] is None else given["noise"])
         names.append(given["image"])
         if noises[-1] is not None and not noises[-1] > 0:
@@ -227,17 +228,21 @@ def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any
     return part.at(key).made(lambda: reader(named_file(part, name)))
 
 
-def _weights(picture: Part, given: dict[str, Any], size: tuple[int, ...]) -> Float32[np.ndarray, "h w"] | None:
+def _weights(picture: Part, given: dict[str, Any], target: np.ndarray) -> Float32[np.ndarray, "h w"] | None:
     present = [name for name in ("mask", "weights") if given[name] is not None]
+    size = target.shape[:2]
+    declares = Path(given["image"]).suffix.lower() in (".tif", ".tiff")  # a nan elsewhere is for `fit` to refuse
+    there = ~np.isnan(target[..., 0]) if declares else np.ones(size, bool)
     if not present:
-        return None
+        return None if there.all() else there.astype(np.float32)
     if len(present) > 1:
         raise picture.at("weights").error(f"{picture.name} must have mask or weights, it has both")
     weights = _read(picture, present[0], load_numbers, given[present[0]]).mean(axis=-1)
     if weights.shape != size:
         place = picture.at(present[0])
         raise place.error(f"{place.name} must have the size of the image, {_by(size)}; it is {_by(weights.shape)}")
-    return (weights > 0).astype(np.float32) if present[0] == "mask" else weights
+    weights = (weights > 0).astype(np.float32) if present[0] == "mask" else weights
+    return np.where(there, weights, np.zeros_like(weights))
 
 
 def _camera(picture: Part, view: dict[str, Any] | None, base: _Base, size: tuple[int, ...]) -> Camera:

@@ -24,7 +24,7 @@ from ...scene.scene import Object, Scene
 from ...scene.texture import ImageTexture
 from .. import procedural
 from ..errors import SceneError, nearest, resolve_inside
-from ..images import load_image
+from ..images import TRANSFERS, load_image
 from ..load_terrain import jacksboro_file, read_terrain
 from ..terrain import Terrain
 from .checks import Part
@@ -115,9 +115,14 @@ def _variant(part: Part, key: str, variants: Any) -> Any:
 def _texture(part: Part) -> ImageTexture:
     if part.one_of(("image", "source"), {key for _, keys in TEXTURES.values() for key in keys}) == "source":
         return ImageTexture(_variant(part, "source", TEXTURES))
-    name = part.read({"image": Key(word)})["image"]
+    name, transfer = part.read({"image": Key(word), "transfer": Key(word, None)})["image"], transfer_of(part)
     # An image starts at its top, a texture at v = 0: so it lies on a map with the north up.
-    return part.at("image").made(lambda: ImageTexture(load_image(named_file(part, name))[::-1]))
+    return part.at("image").made(lambda: ImageTexture(load_image(named_file(part, name), transfer=transfer)[::-1]))
+
+
+def transfer_of(part: Part) -> str | None:
+    """What the table of an image says of its whole numbers, see `load_image`."""
+    return part.choice("transfer", TRANSFERS) if "transfer" in part.table else None
 
 
 def named_file(part: Part, name: str) -> Path:
