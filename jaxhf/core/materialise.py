@@ -1,9 +1,12 @@
-"""Keeping XLA on the CPU from computing a value anew for each of its users."""
+"""Keeping XLA on the CPU from computing a value anew for each of its users, and from computing constants as it compiles."""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
+from jax import lax
+from jax.core import Tracer
 from jax.extend.core import Primitive
 from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import func
@@ -29,6 +32,18 @@ def apart(fun: Callable[..., Any], *args: Any) -> Any:
     twenty times as slow.
     """
     return materialise(fun(*materialise(args)))
+
+
+def unfolded(tree: Any) -> Any:
+    """The arrays of `tree`, of which the large ones that are constants of a program are hidden from XLA, which else computes
+    all that depends on them alone as it compiles, by an interpreter: for 1024 x 1024 heights that takes seconds."""
+    large = 1024
+
+    def hidden(leaf: Any) -> Any:
+        constant = isinstance(leaf, jax.Array | np.ndarray) and not isinstance(leaf, Tracer)
+        return lax.optimization_barrier(leaf) if constant and leaf.size > large else leaf
+
+    return jax.tree.map(hidden, tree)
 
 
 _in_memory = Primitive("in_memory")

@@ -18,10 +18,11 @@ from jaxtyping import Float
 from ..boundary.guiding import edge_sets
 from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
-from ..core.compilation import compiled
+from ..core.compilation import compiled, is_traced
 from ..core.devices import chosen_mesh, map_over, on_every_device
 from ..core.errors import UserError, require_kind, require_progress
 from ..core.kernel import in_turn, one_kernel
+from ..core.materialise import unfolded
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
@@ -157,6 +158,7 @@ def render(
     else:
         settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("render", mesh)
         local = on_every_device(localise(scene), mesh)
+        local = unfolded(local) if is_traced() else local
         outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhf.core.materialise import materialise
+from jaxhf.core.materialise import materialise, unfolded
 
 
 def chain(x: jax.Array, keep=materialise) -> jax.Array:
@@ -33,3 +33,11 @@ def test_values_and_derivatives_are_those_without_it():
         for found, expected in zip(jax.tree.leaves(mode(chain)), jax.tree.leaves(mode(plain)), strict=True):
             np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
     assert np.abs(jax.jvp(chain, (x,), (dx,))[1]).max() > 0.01
+
+
+def test_large_constants_are_not_computed_with_while_compiling():
+    """XLA would do so by an interpreter, for seconds, and say so in the user's terminal."""
+    table = np.linspace(0, 1, 1025)
+    for made, folded in ((lambda x: x + jnp.sin(unfolded(table)).sum(), False), (lambda x: x + jnp.sin(table).sum(), True)):
+        text = jax.jit(made).lower(1.0).compile().as_text() or ""
+        assert ("sine(" not in text) == folded
