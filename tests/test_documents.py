@@ -47,13 +47,16 @@ def blocks(language: str, evaluate: Callable[[Example], None]) -> Callable[[Docu
 
 def shell(example: Example) -> None:
     """Runs the lines of a block one by one: jaxhf's and Python's in this process, what installs only as far as its names."""
-    for line in example.parsed.replace("\\\n", " ").splitlines():
+    for line in re.split(r"\n|&&", example.parsed.replace("\\\n", " ")):
         program, *arguments = shlex.split(line, comments=True) or [""]
+        program = program.removeprefix(".venv/bin/")
         if program == "jaxhf":
             assert main(arguments) == 0, line
         elif (program, arguments[:1]) == ("python", ["-c"]):
             exec(arguments[1], {})
-        elif (program, arguments[:2]) == ("python", ["-m", "venv"]):
+        elif program == "pytest":
+            assert arguments == ["-n", "2"]
+        elif (program, arguments[:2]) == ("python3", ["-m", "venv"]):
             pass  # as below: tests/test_release.py installs
         elif program == "pip":
             assert set(re.findall(r"\w+", "".join(re.findall(r"\[(.*?)\]", line)))) <= EXTRAS.keys(), line

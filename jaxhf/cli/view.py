@@ -29,12 +29,13 @@ _TALLEST = 100  # times its length: beyond, a terrain is a needle that no pixel 
 def add(commands: Any) -> None:
     about = "Show a terrain as a solid block in colours, from a place that shows all of it. A .gif or .mp4 goes round it."
     examples = arguments.examples(
-        "jaxhf view dem.tif -o block.png", "jaxhf view dem.tif -o orbit.gif --size 640x400 --frames 48"
+        "jaxhf view --demo -o block.png", "jaxhf view dem.tif -o orbit.gif --size 640x400 --frames 48"
     )
     command = commands.add_parser(
         "view", help="show a terrain as a solid block, or fly round it", description=about, epilog=examples
     )
-    command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
+    command.add_argument("terrain", metavar="IN", nargs="?", help=f"heights: {arguments.TERRAIN}")
+    command.add_argument("--demo", action="store_true", help="in place of IN the Jacksboro fault, which matplotlib ships")
     command.add_argument("-o", "--output", metavar="OUT", help=".png, .exr, .npy, .pfm; a film: .gif, .mp4 [IN's name, .png]")
     size = command.add_argument_group("picture")
     size.add_argument("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]")
@@ -136,9 +137,13 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
 def run(options: argparse.Namespace) -> None:
     from ..io.films import FILMS, require_writable_film
     from ..io.images import require_writable
-    from ..io.load_terrain import load_heights
+    from ..io.load_terrain import jacksboro_file, load_heights
     from .overwriting import require_no_input
 
+    if options.demo == (options.terrain is not None):
+        raise UserError(f"view: IN or --demo must say what to show, {'not both' if options.demo else 'there is neither'}")
+    if options.demo:
+        options.terrain = jacksboro_file()
     output = Path(options.output or Path(options.terrain).with_suffix(".png").name)
     film = output.suffix.lower() in FILMS
     if (options.sun_from is None) != (options.sun_to is None):

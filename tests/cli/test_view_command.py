@@ -145,6 +145,14 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
         load_drape(tmp_path / "dem.tif", terrain)
 
 
+def test_there_is_a_terrain_to_try(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", "--demo", *SMALL]) == 0
+    assert np.ptp(imageio.imread("jacksboro_fault_dem.png")) > 100
+    assert main(["view"]) == 2
+    assert "there is neither" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -168,6 +176,7 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
             ["--exaggeration", "1e9"],
             "must leave a terrain at most 100 times its length high; times 1e+09 it",
         ),
+        (["--demo"], "IN or --demo must say what to show, not both"),
         (["-o", "out.bmp"], "cannot write an image with the ending '.bmp'"),
     ],
 )
