@@ -101,8 +101,7 @@ def blocked(
     found = first_triangle(surface, local, max_steps=max_steps, active=active, leaving=leaving, number=number, t_max=t_max)
     met = found.status == int(Status.HIT)
     if t_max is not None:
-        plane = triangle_plane(surface, found.ix, found.iy, found.upper)
-        met = met & (plane_distance(plane, local, found) < t_max)
+        met = met & _is_through(triangle_plane(surface, found.ix, found.iy, found.upper), local, found, t_max)
     return stored((met, found.status == int(Status.EXHAUSTED)))
 
 
@@ -182,6 +181,16 @@ def plane_distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: WalkRe
     step = jnp.where(grazing, 0, quotient(c + a * u + b * v - o[2], jnp.where(grazing, 1, slope)))
     t = found.t_near + step
     return t + lax.stop_gradient(jnp.clip(t, found.t_near, found.t_far) - t)
+
+
+def _is_through(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: WalkResult, t: Scalar) -> Flag:
+    """Whether the ray (in the grid's frame) is beyond the triangle's plane at t, by more than rounding can have moved it there:
+    a light that stands on the surface is not behind it."""
+    a, b, c = plane
+    o, end = ray.o, ray(t)
+    gap = end[2] - (c + a * (end[0] - found.ix.astype(a.dtype)) + b * (end[1] - found.iy.astype(a.dtype)))
+    x, y, z = jnp.abs(o) + jnp.abs(end)
+    return -found.side.astype(a.dtype) * gap > 8 * jnp.finfo(a.dtype).eps * (z + jnp.abs(a) * x + jnp.abs(b) * y)
 
 
 def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -151,6 +151,27 @@ def test_light_before_the_wall_is_not_blocked(p):
     np.testing.assert_allclose(image, expected, rtol=ROUNDING)
 
 
+@pytest.mark.parametrize("place", [(16, 16), (12, 20), (14.5, 18.25), (14.5, 18), (7.25, 21.5)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_light_on_the_ground_is_not_behind_it(place, dtype):
+    """In a bowl it lights all but the triangles that it stands on, whose planes it is in; just below the ground, nothing."""
+    y, x = np.mgrid[:33, :33] - 16
+    heights = ((x * x + y * y) / 64).astype(dtype)  # exact, and so on edges and in the middle of cells
+    ix, iy = (int(value) for value in place)
+    u, v = place[0] - ix, place[1] - iy
+    (a, b), (c, d) = heights[iy : iy + 2, ix : ix + 2].astype(float)
+    z = a + u * (b - a) + v * (d - b) if u > v else a + v * (c - a) + u * (d - c)
+
+    def dark(height):
+        made = jaxhf.Scene([ground(heights)], vertical(16, 16, 32, 1, 64, 64), [jaxhf.Point((*place, height))])
+        return np.asarray(jaxhf.render(made, aovs=("shadow",))[1]["shadow"])[..., 0]
+
+    east, north = places(16, 16, 32, 1, 64, 64)
+    beside = (np.abs(np.floor(east) + 0.5 - place[0]) <= 1) & (np.abs(np.floor(north) + 0.5 - place[1]) <= 1)
+    assert not (dark(z) & ~beside).any()
+    assert dark(z - 1e-3).all()
+
+
 def test_one_heightfield_shadows_another():
     # A tile over 3..5 by 1.5..2.5 at height 2; the light has slope 1 along x, so its shadow is 2 further west.
     tile = ground(np.full((5, 9), 2.0), dx=0.25, x0=3.0, y0=1.5)
