@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..io.toml.fit import Case
 
 _USUAL_STEPS = 30  # of a fit, until it says what is to come
-_EARLY = 5.0  # seconds, within which nothing is known
+_EARLY = 50.0  # seconds: most fits compile no longer, and JAX reports a compilation only when it is done
 
 
 def add(commands: Any) -> None:
