@@ -355,6 +355,12 @@ BAD = {
     "no such folder": (GOOD, "scene.toml", ["-o", "nowhere/out.png"], r"nowhere/out\.png: there is no folder"),
     "unknown ending of the picture": (GOOD, "scene.toml", ["-o", "out.bmp"], r"out\.bmp: .*'\.bmp'"),
     "layers of a .png": (GOOD, "scene.toml", ["--aovs", "depth"], r"--aovs are layers of an \.exr, out\.png is none"),
+    "no such layer after a space": (
+        GOOD,
+        "scene.toml",
+        ["-o", "out.exr", "--aovs", "depth, deep"],
+        r"aovs must be among depth, .*; one is 'deep'",
+    ),
     "no such layer": (GOOD, "scene.toml", ["-o", "out.exr", "--aovs", "deep"], r"aovs must be among depth, .*; one is 'deep'"),
     "heights from anywhere": (
         {"scene.toml": GOOD["scene.toml"] + '\n[[objects]]\nshape = "heightfield"\nfile = "x.vrt"\n', "x.vrt": "<VRTDataset/>"},
