@@ -24,7 +24,7 @@ def quiet(wanted: bool) -> Iterator[None]:
         return
     token = _QUIET.set(True)
     try:
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        with open(os.devnull, "w", errors="replace") as nowhere, contextlib.redirect_stdout(nowhere):
             yield
     finally:
         _QUIET.reset(token)

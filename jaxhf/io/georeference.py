@@ -45,8 +45,8 @@ class Georeference(NamedTuple):
       wkt: the file's reference system as well-known text (ISO 19162, or GDAL's older form); "": not known.
       scale, offset: each for x and y.
       nodata: the stored value that means no height there; None: there is none.
-      z_unit: the name of the heights' unit, where the file says it apart from its reference system; "": it does not.
       point: whether a pixel is said to be a point, PixelIsPoint in GeoTIFF; a height stands at its centre either way.
+      z_unit: the name of the heights' unit, where the file says it apart from its reference system; "": it does not.
     """
 
     wkt: str = ""

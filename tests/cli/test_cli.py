@@ -264,13 +264,14 @@ def test_any_name_is_taken_and_shown(tmp_path, variables, source, output, shown)
     jaxhf.save_heights(heights, terrain)
     (tmp_path / "dém.toml").write_text(CAMERA + FIELD.replace("heights = [[0, 1], [2, 3]]", 'file = "é.npy"'), encoding="utf-8")
     command = ["render", "--width", "8"] if source.endswith(".toml") else ["hillshade"]
-    run = subprocess.run(
-        [sys.executable, "-m", "jaxhf", *command, source, "-o", output], capture_output=True, timeout=120, cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(jaxhf.__file__).parents[1]), **variables},
-    )  # fmt: skip
+    words = [sys.executable, "-m", "jaxhf", *command, source, "-o", output]
+    environment = {**os.environ, "PYTHONPATH": str(Path(jaxhf.__file__).parents[1]), **variables}
+    run = subprocess.run(words, capture_output=True, timeout=120, cwd=tmp_path, env=environment)
     assert run.returncode == 0, run.stderr
     assert run.stdout.decode().startswith(f"{shown}: ")
     assert (tmp_path / output).exists()
+    quiet = subprocess.run([*run.args, "--quiet"], capture_output=True, timeout=120, cwd=tmp_path, env=environment)
+    assert (quiet.returncode, quiet.stdout) == (0, b""), quiet.stderr
 
 
 # Errors of the user's.
