@@ -143,21 +143,22 @@ def rendered(monkeypatch):
 
 def test_options_reach_the_renderer(tmp_path, in_this_process, rendered):
     options = [
-        "--precision", "float64", "--height", 12, "--samples", 1, "--max-steps", 1, "--no-early-exit", "--shading", "flat",
+        "--precision", "float64", "--height", 12, "--samples", 1, "--max-steps", 1, "--no-early-exit",
         "--no-shadows", "--traversal", "dda", "--normals", "central", "--max-depth", 2, "--chunk", 256,
     ]  # fmt: skip
     code, out, err = in_this_process("render", SCENE, "-o", tmp_path / "out.npy", *options)
     assert (code, err) == (0, "")
     ((scene, settings),) = rendered
     assert settings == jaxhf.Settings(
-        samples=1, max_steps=1, early_exit=False, shading="flat", shadows=False, traversal="dda", normals="central",
-        max_depth=2, chunk=256,
+        samples=1, max_steps=1, early_exit=False, shadows=False, traversal="dda", normals="central", max_depth=2, chunk=256,
     )  # fmt: skip
     assert (scene.camera.width, scene.camera.height, scene.heights.dtype) == (16, 12, np.float64)
     found = report(out)
     assert (found["width"], found["height"], found["samples"], found["exhausted"]) == ("16", "12", "1", "2")
     assert np.load(tmp_path / "out.npy").dtype == np.float64
 
+    assert in_this_process("render", SCENE, "-o", tmp_path / "out.npy", "--shading", "flat")[0] == 0
+    assert rendered.pop()[1] == jaxhf.Settings(shading="flat")
     assert in_this_process("render", SCENE, "-o", tmp_path / "out.npy")[0] == 0
     scene, settings = rendered[1]
     assert settings == jaxhf.Settings()
