@@ -287,7 +287,7 @@ class FitLoop:
         if not self._damped():
             return most
         usual, *later = [_USUAL_STEPS if share == 1 else _USUAL_COARSE_STEPS for share in self.stages[self.stage :]]
-        return min(most, max(1, usual - done) + sum(later))
+        return min(most, max(usual - done, 1 + done // 3) + sum(later))
 
     def _stage_ended(self) -> Stop | None:
         """Why this stage is over, or None; one that another follows ends sooner."""
