@@ -72,7 +72,7 @@ def add_size(command: argparse.ArgumentParser) -> None:
         metavar="PIXELS",
         help="of the picture; with one of the two, the other keeps the proportions",
     )
-    group.add_argument("--height", type=whole_number, metavar="PIXELS")
+    group.add_argument("--height", type=whole_number, metavar="PIXELS", help="of the picture")
 
 
 def size(options: argparse.Namespace) -> tuple[int | None, int | None]:
@@ -99,7 +99,7 @@ def add_machine(command: argparse.ArgumentParser) -> None:
         metavar="N",
         help="cores that share the work, each with a copy [all, at most 16, fewer for a small picture]",
     )
-    group.add_argument("--precision", choices=("float32", "float64"), default="float32", help="[float32]")
+    group.add_argument("--precision", choices=("float32", "float64"), default="float32", help="of heights and rays [float32]")
     group.add_argument(
         "--no-cache", dest="cache", action="store_false",
         help="keep no compiled programs for the next run [kept in the folder JAXHF_CACHE, by default one in the user's cache "

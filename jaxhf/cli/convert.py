@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,10 @@ def run(options: argparse.Namespace) -> None:
             raise UserError(f"--base is for meshes ({', '.join(MESHES)}), {options.output} is none")
     else:
         require_writable_mesh(options.output)
-    terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+    with warnings.catch_warnings():
+        if ending not in MESHES:  # which alone are in metres
+            warnings.filterwarnings("ignore", "degrees from latitude")
+        terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
     if ending in MESHES:
         save_mesh(options.output, terrain, base=options.base)
     else:

@@ -54,7 +54,7 @@ def terrain_lines(path: str, terrain: "Terrain") -> Iterator[str]:
     stored = f", stored as {place.nodata:.10g}" if holes and place.nodata is not None else ""
     lowest, highest = np.fmin.reduce(terrain.heights, axis=None), np.fmax.reduce(terrain.heights, axis=None)
     span = "none" if holes == terrain.heights.size else f"{lowest:.7g} to {highest:.7g}"
-    yield f"heights: {span}{share}{stored}"
+    yield f"heights: {span}{place.height_unit and ' '}{place.height_unit}{share}{stored}"
 
 
 def heightfield_line(field: "Heightfield | Terrain") -> str:

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,8 +14,11 @@ from .overwriting import require_no_input
 
 if TYPE_CHECKING:
     from ..fitting.fit import Fit
-    from ..fitting.history import Step
+    from ..fitting.history import Draws, Step
     from ..io.toml.fit import Case
+
+_USUAL_STEPS = 30  # of a fit, until it says what is to come
+_EARLY = 50.0  # seconds: most fits compile no longer, and JAX reports a compilation only when it is done
 
 
 def add(commands: Any) -> None:
@@ -99,10 +103,9 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence
     import numpy as np
 
     from ..fitting.fit import fit
-    from ..fitting.history import Draws
     from ..io.toml.fit import load_case
     from .limits import require_memory
-    from .progress import bar
+    from .progress import told
     from .scene_warnings import warn
 
     case = load_case(path, np.dtype(precision))
@@ -111,18 +114,11 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence
     options: dict[str, Any] = {"checkpoint": outputs.checkpoint, "resume": outputs.resume, **case.options}
     interruption.raise_from_now_on()
     try:
-        with bar(bar_format="{desc}", desc="compiling") as shown:
-
-            def progress(done: "Step | Draws") -> None:
-                if isinstance(done, Draws):
-                    text = f"deviations: sample {done.drawn} of {done.wanted}, {done.remaining:.0f} s to come (Ctrl-C: enough)"
-                else:
-                    text = f"step {done.step}: {done.level} DCT modes a side, loss {done.loss:.6g}, {done.seconds:.1f} s"
-                shown.set_description_str(text)
-
+        progress = _Progress(", then deviations" if "uncertainty" in case.options else "")
+        with told(progress.line) as tell:
             found = fit(
                 case.scenes, case.targets, settings=case.settings, weights=case.weights, noise=case.noise,
-                progress=progress, **options,
+                progress=lambda done: (progress.note(done), tell())[1], **options,
             )  # fmt: skip
     except KeyboardInterrupt:
         if not outputs.checkpoint.exists():
@@ -148,6 +144,41 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence
         f"chi2 {found.stats['chi2']:.4g}"
     )
     return "\n".join(lines), found.warnings
+
+
+class _Progress:
+    """What a fit is doing, in a line: how far it is, since when, and what is to come."""
+
+    def __init__(self, later: str):
+        from ..fitting.history import Pace
+        from .progress import CompileTime
+
+        self._compiling, self._begin, self._pace, self._later = CompileTime(), time.monotonic(), Pace(0.0), later
+        self._done, self._details, self._remaining, self._noted = "first step", "", None, 0.0
+
+    def note(self, done: "Step | Draws") -> None:
+        from ..fitting.history import Draws
+
+        self._noted = time.monotonic() - self._begin
+        if isinstance(done, Draws):
+            self._done, self._details = f"deviations: sample {done.drawn} of {done.wanted}", " (Ctrl-C: enough)"
+            self._remaining, self._later = done.remaining, ""
+        else:
+            self._done, self._details = f"step {done.step}", f"; {done.level} DCT modes a side, loss {done.loss:.6g}"
+            self._remaining = self._pace.remaining(self._noted - self._compiling.seconds, done.to_come)
+
+    def line(self, seconds: float) -> str:
+        from .progress import duration
+
+        remaining = self._remaining
+        if self._noted == 0.0:  # the step that is under way takes this long at least
+            remaining = _USUAL_STEPS * (seconds - self._compiling.seconds)
+            if seconds < _EARLY or remaining < seconds:
+                return f"compiling, {duration(seconds)} so far"
+        elif remaining is not None:
+            remaining -= seconds - self._noted
+        to_come = "" if remaining is None else f", about {duration(max(remaining, 1))} to come{self._later}"
+        return f"{self._done}, {duration(seconds)} so far{to_come}{self._details}"
 
 
 def _views(case: "Case", found: "Fit") -> list[str]:

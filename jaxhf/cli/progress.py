@@ -1,7 +1,10 @@
-"""Progress bars: on a terminal only, not under --quiet, and gone when the work is done."""
+"""Progress: on a terminal a bar or a line that is gone when the work is done, elsewhere a line a minute; none under --quiet."""
 
 import contextlib
 import os
+import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
@@ -10,6 +13,7 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
 _QUIET = ContextVar("_QUIET", default=False)
+_EACH_SECOND, _EACH_MINUTE = 1.0, 60.0
 
 
 @contextlib.contextmanager
@@ -20,7 +24,7 @@ def quiet(wanted: bool) -> Iterator[None]:
         return
     token = _QUIET.set(True)
     try:
-        with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        with open(os.devnull, "w", errors="replace") as nowhere, contextlib.redirect_stdout(nowhere):
             yield
     finally:
         _QUIET.reset(token)
@@ -34,7 +38,11 @@ def bar(**options: Any) -> "tqdm[Any]":
     """A bar on standard error, as `tqdm` with these options; in a pipe it shows nothing."""
     from tqdm import tqdm
 
-    return tqdm(disable=True if is_quiet() else None, leave=False, dynamic_ncols=True, **options)
+    window: dict[str, Any] = {"dynamic_ncols": True}
+    with contextlib.suppress(OSError, ValueError):  # which is what a stream without a descriptor raises
+        if os.get_terminal_size(sys.stderr.fileno()).columns == 0:  # of a terminal that has no window, as one in a container
+            window = {"ncols": 80, "nrows": 24}
+    return tqdm(disable=True if is_quiet() else None, leave=False, **window, **options)
 
 
 @contextlib.contextmanager
@@ -64,6 +72,48 @@ def compiled_bar(compiling: Callable[[], float] | None = None, **options: Any) -
             shown.update(done - shown.n)
 
         yield advance
+
+
+@contextlib.contextmanager
+def told(line: Callable[[float], str]) -> Iterator[Callable[[], None]]:
+    """Says what work of unknown length has come to: each second on a terminal, elsewhere once a minute on standard error.
+
+    Args:
+      line: what is to be said; it is given the seconds since the work began, in a thread of its own.
+
+    Yields:
+      What says it at once on a terminal.
+    """
+    begin, ended = time.monotonic(), threading.Event()
+    with bar(bar_format="{desc}") as shown:
+
+        def tell() -> None:
+            if not shown.disable:
+                shown.set_description_str(line(time.monotonic() - begin))
+
+        def keep_telling() -> None:
+            while not ended.wait(_EACH_MINUTE if shown.disable else _EACH_SECOND):
+                if shown.disable:
+                    print(f"jaxhf: {line(time.monotonic() - begin)}", file=sys.stderr, flush=True)
+                tell()
+
+        tell()
+        thread = threading.Thread(target=keep_telling, daemon=True)
+        if not is_quiet():
+            thread.start()
+        try:
+            yield tell
+        finally:
+            ended.set()
+            if thread.is_alive():
+                thread.join()
+
+
+def duration(seconds: float) -> str:
+    """In the unit that suits: 45 s, 12 min, 3.5 h."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5940 else f"{seconds / 3600:.1f} h"
 
 
 class CompileTime:

@@ -21,7 +21,9 @@ def add(commands: Any) -> None:
         metavar="FILE|NAME",
         help="a colour file as gdaldem reads it, or a matplotlib colour map [green lowlands to pale heights, blue below 0]",
     )
-    group.add_argument("--entries", choices=ENTRIES, default="interpolate", help="of the ramp [interpolate]")
+    group.add_argument(
+        "--entries", choices=ENTRIES, default="interpolate", help="colours between the heights of the ramp [interpolate]"
+    )
     group.add_argument("--alpha", action="store_true", help="a fourth band: opacity, 0 where there is no height")
     group.add_argument("--no-shading", dest="shading", action="store_false", help="colours alone")
     mapping.add_light(command)

@@ -25,8 +25,9 @@ def add(commands: Any) -> None:
         "-o", "--output", required=True, metavar="OUT", help="the picture: .png (sRGB), .exr, .npy or .pfm (linear)"
     )
     command.add_argument(
-        "--aovs", type=lambda names: tuple(names.split(",")), default=(), metavar="NAMES",
-        help="what rays met besides, as layers of an .exr: depth,normal,uv,object,cell,shadow,status,steps,exhausted [none]",
+        "--aovs", type=lambda names: tuple(name.strip() for name in names.split(",")), default=(), metavar="NAMES",
+        help="what rays met besides, as layers of an .exr: some of depth, normal, uv, object, cell, shadow, status, steps and "
+        "exhausted, with commas between [none]",
     )  # fmt: skip
     arguments.add_size(command)
     arguments.add_settings(command, Settings.__dataclass_fields__.keys() - {"edge_samples"})  # nothing is differentiated

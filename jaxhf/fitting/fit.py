@@ -183,7 +183,7 @@ def fit(
         two on. Where pictures are not explained to their noise, or boundaries stand elsewhere in them, deviations are those
         that residuals bear out.
       progress: called after each step with a `Step`, and after each sample of the deviations with a `Draws`, which says what
-        is left to do; True prints lines to standard error.
+        is left to do, as `Step.to_come` does; True prints lines to standard error.
       checkpoint: a file in which the state is kept every `checkpoint_every` steps, after the last one and on Ctrl-C;
         `fit` never removes it.
       resume: goes on from that file if it is there; the result is bitwise that of a fit that was not interrupted. Without

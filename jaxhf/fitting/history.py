@@ -2,6 +2,7 @@
 
 import enum
 import sys
+from collections.abc import Callable
 from typing import NamedTuple
 
 
@@ -25,6 +26,7 @@ class Step(NamedTuple):
       damping: Levenberg-Marquardt's λ; 0 for other solvers.
       change: of the heights, root mean square, height units.
       seconds: since the fit began; a resumed one goes on counting.
+      to_come: about how many steps will follow, by what fits take as a rule; None in `Fit.history`.
     """
 
     step: int
@@ -34,6 +36,7 @@ class Step(NamedTuple):
     damping: float
     change: float
     seconds: float
+    to_come: int | None = None
 
 
 class Draws(NamedTuple):
@@ -51,19 +54,35 @@ class Draws(NamedTuple):
     remaining: float
 
 
-def print_progress(done: Step | Draws) -> None:
-    if isinstance(done, Draws):
-        line = f"sample {done.drawn} of {done.wanted}, {done.seconds:.1f} s, {done.remaining:.1f} s to come"
-        print(line, file=sys.stderr, flush=True)
-    else:
-        _print_step(done)
+class Pace:
+    """How long steps take, by when the last few of them ended."""
+
+    def __init__(self, begin: float | None = None):
+        """
+        Args:
+          begin: when the first step began; None: how long that took, compilation above all, says nothing.
+        """
+        self._ends = [] if begin is None else [begin]
+
+    def remaining(self, end: float, to_come: int | None) -> float | None:
+        """The seconds that so many steps will take after one that ended now; None: not known."""
+        self._ends = [*self._ends, end][-6:]
+        steps = len(self._ends) - 1
+        return None if steps < 1 or to_come is None else (self._ends[-1] - self._ends[0]) / steps * to_come
 
 
-def _print_step(step: Step) -> None:
-    suffix = "" if step.accepted else ", not accepted"
-    print(
-        f"step {step.step}: {step.level} modes a side, loss {step.loss:.6g}, λ {step.damping:.2g}, "
-        f"change {step.change:.3g}, {step.seconds:.1f} s{suffix}",
-        file=sys.stderr,
-        flush=True,
-    )
+def printed_progress() -> Callable[[Step | Draws], None]:
+    """A function that prints a line on standard error for each step, and for each sample of the deviations."""
+    pace = Pace()
+
+    def line(done: Step | Draws) -> str:
+        if isinstance(done, Draws):
+            return f"sample {done.drawn} of {done.wanted}, {done.seconds:.1f} s, {done.remaining:.1f} s to come"
+        remaining = pace.remaining(done.seconds, done.to_come)
+        to_come = "" if remaining is None else f", about {remaining:.0f} s to come"
+        return (
+            f"step {done.step}: {done.level} modes a side, loss {done.loss:.6g}, λ {done.damping:.2g}, "
+            f"change {done.change:.3g}, {done.seconds:.1f} s{to_come}{'' if done.accepted else ', not accepted'}"
+        )
+
+    return lambda done: print(line(done), file=sys.stderr, flush=True)

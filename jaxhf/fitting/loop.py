@@ -20,7 +20,7 @@ from ..scene.heightfield import Heightfield
 from .basis import Unknowns, balanced_units, make_basis
 from .curvature import mode_curvature
 from .fingerprint import fingerprint
-from .history import Step, Stop, print_progress
+from .history import Step, Stop, printed_progress
 from .jacobian import Sparse, in_rows, picture_values
 from .known import Known, KnownPictures, jacobian_at, pictures_and_influence, spreads_of
 from .normal_equations import NormalEquations, advance, has_damping, init_state, reset_state, step_size, with_rejections
@@ -37,6 +37,7 @@ _FLAT_STEPS = 3  # accepted in a row that hardly lower the loss
 _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviation that their noise leaves them with
 _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
+_USUAL_STEPS, _USUAL_COARSE_STEPS = 5, 4  # of a stage, for what progress says is to come
 _LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
 _TRIAL_STEPS = 6  # with other normals
 _EVIDENCE = 3.0  # for these, standard deviations, to try them
@@ -55,7 +56,7 @@ class FitLoop:
         self.solver = make_solver(options)
         self.stages = make_stages(field.heights.shape, options)
         self.path = None if options.checkpoint is None else Path(options.checkpoint)
-        self.progress = print_progress if options.progress is True else options.progress or None
+        self.progress = printed_progress() if options.progress is True else options.progress or None
         self.stage = -1
         self.history: list[Step] = []
         self.stage_start = 0  # steps taken before this stage
@@ -278,7 +279,15 @@ class FitLoop:
         self.predicted = float(outcome.predicted)
         self._take_snapshot()
         if self.progress:
-            self.progress(step)
+            self.progress(step._replace(to_come=self._steps_to_come()))
+
+    def _steps_to_come(self) -> int:
+        """About how many: as many as stages take as a rule, or, of other solvers than Levenberg-Marquardt, as there may be."""
+        most, done = self.options.max_steps - len(self.history), len(self.history) - self.stage_start
+        if not self._damped():
+            return most
+        usual, *later = [_USUAL_STEPS if share == 1 else _USUAL_COARSE_STEPS for share in self.stages[self.stage :]]
+        return min(most, max(usual - done, 1 + done // 3) + sum(later))
 
     def _stage_ended(self) -> Stop | None:
         """Why this stage is over, or None; one that another follows ends sooner."""

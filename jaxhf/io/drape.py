@@ -39,6 +39,8 @@ def _placed(path: Path, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
         rasterio = importlib.import_module("rasterio")
         if dataset.count not in (1, 3, 4) or set(dataset.dtypes) != {"uint8"}:
             raise FileError(f"it must have 1, 3 or 4 bands of bytes, it has {dataset.count} of {dataset.dtypes[0]}")
+        if dataset.colorinterp[0].name == "palette":
+            raise FileError("its bands must be colours, it has a palette (gdal_translate -expand rgb makes colours of it)")
         _require_same_system(dataset, terrain, rasterio)
         dx, dy, x0, y0 = terrain.in_file
         ny, nx = terrain.heights.shape

@@ -23,7 +23,7 @@ PathLike = str | os.PathLike[str]
 Codec = TypeVar("Codec")
 _KINDS = {
     **dict.fromkeys((".toml", ".pbrt"), "a scene, for jaxhf render"),
-    **dict.fromkeys((".tif", ".tiff", ".npz", ".asc", ".hgt"), "a terrain, for jaxhf hillshade, relief or convert"),
+    **dict.fromkeys((".tif", ".tiff", ".npz", ".asc", ".hgt"), "a terrain, for jaxhf view, hillshade, relief or convert"),
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".exr", ".npy", ".pfm"), "a picture"),
     **dict.fromkeys((".glb", ".obj", ".ply"), "a mesh"),
 }

@@ -46,6 +46,7 @@ class Georeference(NamedTuple):
       scale, offset: each for x and y.
       nodata: the stored value that means no height there; None: there is none.
       point: whether a pixel is said to be a point, PixelIsPoint in GeoTIFF; a height stands at its centre either way.
+      z_unit: the name of the heights' unit, where the file says it apart from its reference system; "": it does not.
     """
 
     wkt: str = ""
@@ -53,6 +54,7 @@ class Georeference(NamedTuple):
     offset: tuple[float, float] = (0.0, 0.0)
     nodata: float | None = None
     point: bool = False
+    z_unit: str = ""
 
     @property
     def name(self) -> str:
@@ -63,8 +65,18 @@ class Georeference(NamedTuple):
     @property
     def unit(self) -> str:
         """The name of the unit of x and y, "" where it is not known."""
-        found = re.findall(r'\b(?:ANGLE|LENGTH)?UNIT\["([^"]*)"', _horizontal(self.wkt))
-        return found[-1] if found and found[-1] != "unknown" else ""
+        return _unit(_horizontal(self.wkt))
+
+    @property
+    def height_unit(self) -> str:
+        """The name of the unit of heights, "" where it is not known."""
+        return self.z_unit or _unit(self.wkt[len(_horizontal(self.wkt)) :])
+
+
+def _unit(wkt: str) -> str:
+    """The name of the last unit in well-known text."""
+    found = re.findall(r'\b(?:ANGLE|LENGTH)?UNIT\["([^"]*)"', wkt)
+    return found[-1] if found and found[-1] != "unknown" else ""
 
 
 _GEOGRAPHIC = r'\s*(?:COMP\w*\["[^"]*",\s*)?(?:GEOGCS|GEOGCRS|GEODCRS|GEOGRAPHICCRS|GEODETICCRS)\b'

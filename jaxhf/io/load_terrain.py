@@ -5,8 +5,10 @@ Whatever the file's order, in memory row 0 is the southernmost: `heights[iy, ix]
 
 import dataclasses
 import math
+import re
+import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -77,14 +79,37 @@ def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = No
     with reading(path):
         if not math.isfinite(z_scale) or z_scale == 0:
             raise FileError(f"z_scale must be finite and not zero, it is {z_scale}")
-        terrain = reader(path, nodata, nodata_overrules)
-        if z_scale == 1:
-            return terrain
-        with np.errstate(over="ignore", invalid="ignore"):
-            scaled = terrain.heights * terrain.heights.dtype.type(z_scale)
-        if np.isinf(scaled).any():
-            raise FileError(f"heights times z_scale must fit into {scaled.dtype}, z_scale is {z_scale}")
-        return dataclasses.replace(terrain, heights=scaled)
+        terrain = stored = reader(path, nodata, nodata_overrules)
+        if z_scale != 1:
+            with np.errstate(over="ignore", invalid="ignore"):
+                scaled = terrain.heights * terrain.heights.dtype.type(z_scale)
+            if np.isinf(scaled).any():
+                raise FileError(f"heights times z_scale must fit into {scaled.dtype}, z_scale is {z_scale}")
+            terrain = dataclasses.replace(terrain, heights=scaled)
+    for hint in _hints(stored, z_scale):
+        warnings.warn(f"{path}: {hint}", stacklevel=2)
+    return terrain
+
+
+_UNDECLARED = (-999, -9999, -99999, -32767, -32768, 9999, 32767, 65535)  # what often means no height
+
+
+def _hints(terrain: Terrain, z_scale: float) -> Iterator[str]:
+    """What is hardly meant in a file, in words."""
+    heights, place = terrain.heights, terrain.georeference or Georeference()
+    for value in (float(end.reduce(heights, axis=None)) for end in (np.fmin, np.fmax)):
+        if value in _UNDECLARED or abs(value) > 1e30:
+            others = heights[np.isfinite(heights) & (heights != value)]
+            below, above = float(others.min(initial=np.inf)), float(others.max(initial=-np.inf))
+            if others.size and max(below - value, value - above) > 0.1 * (above - below):
+                count = heights.size - others.size - int(np.isnan(heights).sum())
+                span = f"{count} of {heights.size} heights, the others go from {below:.6g} to {above:.6g}"
+                yield f"{value:.10g} stands for {span}; where it means that there is none, nodata is to say so"
+    across, up = (re.search(r"foot|feet|\bft", unit.lower()) is not None for unit in (place.unit, place.height_unit))
+    if z_scale == 1 and up and not across:
+        yield f"its heights are in {place.height_unit}, x and y are not: in metres they would be 0.3048 times that"
+    if z_scale == 1 and across and not up:
+        yield f"x and y are in {place.unit}, and heights count as such: in metres they must be multiplied by 3.28084"
 
 
 def jacksboro() -> Terrain:

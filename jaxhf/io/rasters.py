@@ -1,5 +1,6 @@
 """GeoTIFF and the other rasters of GDAL, read and written through rasterio."""
 
+import dataclasses
 import math
 import warnings
 from pathlib import Path
@@ -30,7 +31,11 @@ def read_raster(path: Path, nodata: float | None, overrules: bool) -> Terrain:
         heights = heights_of(dataset.read(1), used, scale, offset)
         if any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[0]):
             heights[dataset.dataset_mask() == 0] = np.nan
-        return _placed(heights, dataset, nodata if used is None else used)
+        terrain = _placed(heights, dataset, nodata if used is None else used)
+        if terrain.georeference is None:
+            return terrain
+        named = terrain.georeference._replace(z_unit=dataset.units[0] or "")
+        return dataclasses.replace(terrain, georeference=named)
 
 
 def georeference_of(path: Path) -> tuple[Terrain, tuple[int, int]]:

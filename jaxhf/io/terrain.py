@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from .georeference import (
     WGS84,
     WGS84_DEGREES,
     CoordinateSystem,
+    Ellipsoid,
     Georeference,
     coordinate_system,
     geographic,
@@ -151,6 +153,8 @@ class Terrain:
                 raise FileError("its degrees are on a globe of unknown size: dx and dy must be given, in metres")
             middle = self.y0 + (len(self.heights) - 1) / 2 * self.dy
             along_x, along_y = metres_per_degree(middle, crs.globe or WGS84)
+            if "dx" not in given:
+                _warn_of_many_latitudes(self.y0, 2 * middle - self.y0, crs.globe or WGS84)
             crs, grid = CoordinateSystem(), {"dx": self.dx * along_x, "dy": self.dy * along_y, "x0": 0.0, "y0": 0.0}
         if grid.keys() <= given.keys():
             crs = crs or CoordinateSystem()
@@ -162,6 +166,20 @@ class Terrain:
         return dataclasses.replace(self, **grid, crs=crs, georeference=place)
 
 
+def _warn_of_many_latitudes(south: float, north: float, globe: Ellipsoid) -> None:
+    """UserWarning where a degree of longitude, measured in the middle, is far from that at an end."""
+    middle = (south + north) / 2
+    here, *ends = (metres_per_degree(latitude, globe)[0] for latitude in (middle, south, north))
+    off = max(abs(end / here - 1) for end in ends) if here else 0.0
+    if off > _FAR_OFF:
+        warnings.warn(
+            f"degrees from latitude {south:.4g} to {north:.4g} are measured in metres at {middle:.4g}: farther north or south "
+            f"a column's width is off by up to {100 * off:.0f} % (gdalwarp projects a terrain)",
+            stacklevel=3,
+        )
+
+
+_FAR_OFF = 0.05
 _AXES = ("y", "northing", "lat", "latitude"), ("x", "easting", "lon", "longitude")
 
 

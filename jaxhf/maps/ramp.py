@@ -122,7 +122,7 @@ def read_ramp(path: PathLike, low: float, high: float) -> Ramp:
     """
     path = require_file(path)
     with reading(path):
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     entries: list[tuple[float, Colour]] = []
     special: dict[str, Colour] = {}
     for number, line in enumerate(lines, 1):

@@ -143,21 +143,22 @@ def rendered(monkeypatch):
 
 def test_options_reach_the_renderer(tmp_path, in_this_process, rendered):
     options = [
-        "--precision", "float64", "--height", 12, "--samples", 1, "--max-steps", 1, "--no-early-exit", "--shading", "flat",
+        "--precision", "float64", "--height", 12, "--samples", 1, "--max-steps", 1, "--no-early-exit",
         "--no-shadows", "--traversal", "dda", "--normals", "central", "--max-depth", 2, "--chunk", 256,
     ]  # fmt: skip
     code, out, err = in_this_process("render", SCENE, "-o", tmp_path / "out.npy", *options)
     assert (code, err) == (0, "")
     ((scene, settings),) = rendered
     assert settings == jaxhf.Settings(
-        samples=1, max_steps=1, early_exit=False, shading="flat", shadows=False, traversal="dda", normals="central",
-        max_depth=2, chunk=256,
+        samples=1, max_steps=1, early_exit=False, shadows=False, traversal="dda", normals="central", max_depth=2, chunk=256,
     )  # fmt: skip
     assert (scene.camera.width, scene.camera.height, scene.heights.dtype) == (16, 12, np.float64)
     found = report(out)
     assert (found["width"], found["height"], found["samples"], found["exhausted"]) == ("16", "12", "1", "2")
     assert np.load(tmp_path / "out.npy").dtype == np.float64
 
+    assert in_this_process("render", SCENE, "-o", tmp_path / "out.npy", "--shading", "flat")[0] == 0
+    assert rendered.pop()[1] == jaxhf.Settings(shading="flat")
     assert in_this_process("render", SCENE, "-o", tmp_path / "out.npy")[0] == 0
     scene, settings = rendered[1]
     assert settings == jaxhf.Settings()
@@ -264,13 +265,14 @@ def test_any_name_is_taken_and_shown(tmp_path, variables, source, output, shown)
     jaxhf.save_heights(heights, terrain)
     (tmp_path / "dém.toml").write_text(CAMERA + FIELD.replace("heights = [[0, 1], [2, 3]]", 'file = "é.npy"'), encoding="utf-8")
     command = ["render", "--width", "8"] if source.endswith(".toml") else ["hillshade"]
-    run = subprocess.run(
-        [sys.executable, "-m", "jaxhf", *command, source, "-o", output], capture_output=True, timeout=120, cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(jaxhf.__file__).parents[1]), **variables},
-    )  # fmt: skip
+    words = [sys.executable, "-m", "jaxhf", *command, source, "-o", output]
+    environment = {**os.environ, "PYTHONPATH": str(Path(jaxhf.__file__).parents[1]), **variables}
+    run = subprocess.run(words, capture_output=True, timeout=120, cwd=tmp_path, env=environment)
     assert run.returncode == 0, run.stderr
     assert run.stdout.decode().startswith(f"{shown}: ")
     assert (tmp_path / output).exists()
+    quiet = subprocess.run([*run.args, "--quiet"], capture_output=True, timeout=120, cwd=tmp_path, env=environment)
+    assert (quiet.returncode, quiet.stdout) == (0, b""), quiet.stderr
 
 
 # Errors of the user's.
@@ -355,6 +357,12 @@ BAD = {
     "no such folder": (GOOD, "scene.toml", ["-o", "nowhere/out.png"], r"nowhere/out\.png: there is no folder"),
     "unknown ending of the picture": (GOOD, "scene.toml", ["-o", "out.bmp"], r"out\.bmp: .*'\.bmp'"),
     "layers of a .png": (GOOD, "scene.toml", ["--aovs", "depth"], r"--aovs are layers of an \.exr, out\.png is none"),
+    "no such layer after a space": (
+        GOOD,
+        "scene.toml",
+        ["-o", "out.exr", "--aovs", "depth, deep"],
+        r"aovs must be among depth, .*; one is 'deep'",
+    ),
     "no such layer": (GOOD, "scene.toml", ["-o", "out.exr", "--aovs", "deep"], r"aovs must be among depth, .*; one is 'deep'"),
     "heights from anywhere": (
         {"scene.toml": GOOD["scene.toml"] + '\n[[objects]]\nshape = "heightfield"\nfile = "x.vrt"\n', "x.vrt": "<VRTDataset/>"},

@@ -4,9 +4,12 @@ All that surrounds the fit is tested with one that is pretended: a real one take
 """
 
 import base64
+import contextlib
 import dataclasses
 import io
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -20,6 +23,9 @@ import jaxhf
 from jaxhf.cli.main import main
 from jaxhf.core.affine import rotate
 from jaxhf.io.toml.fit import load_case
+
+if sys.platform != "win32":
+    import pty
 
 pytestmark = pytest.mark.unoptimised
 
@@ -206,11 +212,12 @@ def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch)
     (folder / "case.toml").write_text(plain)
     (scene,) = load_case(folder / "case.toml", np.float64).scenes
     np.save(folder / "seen.npy", np.asarray(jaxhf.render(scene.with_heights(TRUTH), SETTINGS)))
-    real, steps = jaxhf.fit, []
+    real, steps, to_come = jaxhf.fit, [], []
 
     def fit(*arguments, progress, **options):
         def watch(step):
             steps.append(step.step)
+            to_come.append(step.to_come)
             progress(step)
             if step.step == 6 and not options["resume"]:
                 raise KeyboardInterrupt
@@ -223,6 +230,8 @@ def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch)
         assert not (folder / "cut.tif").exists()
         assert run(folder, "cut.tif", "--resume") == 0
     assert steps == [1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert to_come[-1] == 0
+    assert all(1 <= left <= 9 - step for step, left in zip(steps[:-1], to_come[:-1], strict=True))  # as this file allows
     assert run(folder, "whole.tif") == 0
     assert (folder / "cut.tif").read_bytes() == (folder / "whole.tif").read_bytes()
 
@@ -255,13 +264,80 @@ def test_bad_input_gets_one_line(folder, name, monkeypatch, capsys):
 
 
 def test_steps_are_shown_on_a_terminal(folder, monkeypatch, capsys):
-    """In a pipe nothing is, see `found`."""
+    """In a pipe nothing is within a minute, see `found`."""
     monkeypatch.setattr("jaxhf.fitting.fit.fit", pretended({}))
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     assert run(folder, "shown.tif") == 0
     shown = [part.rstrip() for part in capsys.readouterr().err.split("\r")]
     assert [part for part in shown if part] == [
-        "compiling",
-        *(f"step {k}: 9 DCT modes a side, loss {10.0**-k:g}, {k / 2} s" for k in (1, 2, 3)),
+        "compiling, 0 s so far",
+        *(f"step {k}, 0 s so far; 9 DCT modes a side, loss {10.0**-k:g}" for k in (1, 2, 3)),
         "jaxhf: warning: chi2 is 9",
     ]
+
+
+SLOW = """
+import sys, time
+import jaxhf.fitting.fit
+from jaxhf.fitting.history import Draws, Step
+from jaxhf.cli import fit, main, progress
+
+def pretended(scenes, targets, *, progress, **options):
+    time.sleep(1.5)
+    for k in (1, 2, 3):
+        progress(Step(k, 9, 10.0**-k, True, 0.1, 0.2, 0.5 * k, 12 - 4 * k))
+        time.sleep(0.5)
+    progress(Draws(1, 3, 1.0, 2.0))
+    time.sleep(0.5)
+    raise KeyboardInterrupt
+
+jaxhf.fitting.fit.fit = pretended
+progress._EACH_SECOND = 0.2
+progress._EACH_MINUTE = float(sys.argv.pop(1))
+fit._EARLY = 1.0
+sys.exit(main.main())
+"""
+
+
+def slow(folder, minute, *more, **streams):
+    (folder / "case.toml").write_text(CASE)
+    words = ["fit", str(folder / "case.toml"), "-o", str(folder / "slow.tif"), *more]
+    return subprocess.Popen([sys.executable, "-c", SLOW, str(minute), *words], **streams)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no pseudo-terminals")
+def test_a_terminal_is_told_what_is_to_come(folder):
+    """Before the first step is done, while one is under way, and of the deviations."""
+    terminal, other = pty.openpty()
+    process, shown = slow(folder, 0.0, stderr=other, stdout=subprocess.DEVNULL), b""
+    os.close(other)
+    with contextlib.suppress(OSError):  # as Linux ends it
+        while piece := os.read(terminal, 4096):
+            shown += piece
+    os.close(terminal)
+    assert process.wait(60) == 130
+    lines = [line.strip() for line in shown.decode().split("\r") if line.strip()]
+    assert lines[0] == "compiling, 0 s so far"
+    assert any(re.fullmatch(r"first step, [12] s so far, about \d+ \w+ to come, then deviations", line) for line in lines)
+    first, second, third = ([line for line in lines if re.match(rf"step {k}, \d s so far, .*; 9 DCT", line)] for k in (1, 2, 3))
+    assert min(len(first), len(second), len(third)) > 1  # also within a step
+    left = re.fullmatch(r"step 1, [1-3] s so far, about (\d+) s to come, then deviations; .*", first[0])
+    assert left
+    assert 8 <= int(left[1]) <= 20  # eight steps of 1.5 s, or of some more where others work
+    assert any(re.search(r"sample 1 of 3, \d s so far, about 2 s to come \(Ctrl-C: enough\)", line) for line in lines)
+
+
+@pytest.mark.parametrize("quiet", [False, True])
+def test_elsewhere_a_line_a_minute_tells_it(folder, quiet):
+    """Here of 0.7 s; a minute without one is silent, and so is --quiet."""
+    process = slow(folder, 0.7, *["--quiet"] * quiet, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    lines = err.splitlines()[:-2]
+    if quiet:
+        assert lines == []
+        return
+    assert 3 <= len(lines) <= 6
+    assert lines[0] == "jaxhf: compiling, 1 s so far"
+    assert re.fullmatch(r"jaxhf: step \d, \d s so far, about \d+ s to come, then deviations; 9 DCT modes .*", lines[-2])
+    assert "\r" not in err

@@ -143,6 +143,10 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
         load_drape(write(tmp_path / "far.tif", colours, (7e5, 5e6), 5.0), terrain)
     with pytest.raises(FileError, match="bands of bytes, it has 1 of float32"):
         load_drape(tmp_path / "dem.tif", terrain)
+    with rasterio.open(write(tmp_path / "palette.tif", colours[:1], (499955.0, 5000045.0), 5.0), "r+") as file:
+        file.write_colormap(1, {0: (0, 0, 0), 255: (9, 9, 9)})
+    with pytest.raises(FileError, match="its bands must be colours, it has a palette"):
+        load_drape(tmp_path / "palette.tif", terrain)
 
 
 def test_there_is_a_terrain_to_try(tmp_path, monkeypatch, capsys):

@@ -11,6 +11,7 @@ import optimistix as optx
 import pytest
 
 import jaxhf
+from jaxhf.fitting.history import Pace, printed_progress
 from jaxhf.fitting.solvers import LevenbergMarquardt
 
 pytestmark = pytest.mark.unoptimised
@@ -31,6 +32,27 @@ def scene(heights: np.ndarray) -> jaxhf.Scene:
 def fitted(**options: Any) -> jaxhf.Fit:
     target = np.asarray(jaxhf.render(scene(TRUTH), SETTINGS))
     return jaxhf.fit([scene(PRIOR)], [target], settings=SETTINGS, prior=PRIOR, **options)
+
+
+def test_what_is_to_come_is_told_by_the_last_steps():
+    """The first, which compiles, tells nothing, unless it is said when it began."""
+    unknown, known = Pace(), Pace(0.0)
+    assert unknown.remaining(60.0, 7) is None
+    assert known.remaining(60.0, 7) == 420
+    assert unknown.remaining(62.0, 6) == 12
+    for end in (63.0, 64.0, 65.0, 66.0, 67.0):
+        last = unknown.remaining(end, 3)
+    assert last == 3
+    assert unknown.remaining(68.0, None) is None
+
+
+def test_lines_tell_what_is_to_come(capsys):
+    tell = printed_progress()
+    for k, seconds in ((1, 20.0), (2, 22.0)):
+        tell(jaxhf.Step(k, 9, 0.5, k == 1, 0.1, 0.2, seconds, 8))
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "step 1: 9 modes a side, loss 0.5, λ 0.1, change 0.2, 20.0 s"
+    assert second == "step 2: 9 modes a side, loss 0.5, λ 0.1, change 0.2, 22.0 s, about 16 s to come, not accepted"
 
 
 def test_rejected_steps_are_damped_until_one_is_short_enough():

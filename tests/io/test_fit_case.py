@@ -1,6 +1,7 @@
 """What a fit file says is what `fit` gets; what is wrong in it is named with its line. Nothing here is traced."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,7 +144,8 @@ def test_what_a_picture_holds_is_for_the_file_to_say(folder):
         painted = SCENE + f'albedo = "grey"\n[textures.grey]\n{given}\n[[pictures]]\n{given}'
         found = case(folder, painted)
         np.testing.assert_allclose(found.targets[0], value, rtol=1e-6)
-        np.testing.assert_allclose(found.scenes[0].objects[0].material.albedo.texels, value, rtol=1e-6)
+        material: Any = found.scenes[0].objects[0].material
+        np.testing.assert_allclose(material.albedo.texels, value, rtol=1e-6)
 
 
 def test_orthophotos_and_masks_of_geographic_programs(folder):

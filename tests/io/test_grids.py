@@ -40,7 +40,26 @@ def test_ascii_grid(tmp_path, place, expected):
 def test_a_height_may_be_what_usually_means_none(tmp_path):
     heights = np.array([[-9999, np.nan], [3, 7]], np.float32)
     save_heights(tmp_path / "x.asc", Terrain(heights))
-    np.testing.assert_array_equal(load_heights(tmp_path / "x.asc").heights, heights)
+    hint = r"x\.asc: -9999 stands for 1 of 4 heights, the others go from 3 to 7; where it means that there is none, nodata is"
+    with pytest.warns(UserWarning, match=hint):
+        np.testing.assert_array_equal(load_heights(tmp_path / "x.asc").heights, heights)
+
+
+@pytest.mark.parametrize("value", [-9999, -32768, 65535, np.finfo(np.float32).min])
+def test_a_value_that_may_mean_none_is_named(tmp_path, value):
+    """Not where it is declared, nor where heights lead up to it, as those of a sea bed do."""
+    heights = np.arange(12, dtype=np.float32).reshape(3, 4)
+    heights[1, 1:3] = value
+    np.save(tmp_path / "x.npy", heights)
+    with pytest.warns(
+        UserWarning, match=re.escape(f"x.npy: {value:.10g} stands for 2 of 12 heights, the others go from 0 to 11")
+    ):
+        load_heights(tmp_path / "x.npy")
+    assert load_heights(tmp_path / "x.npy", nodata=float(value)).nodata.sum() == 2
+    np.save(tmp_path / "bed.npy", np.linspace(-9999, 100, 100).reshape(10, 10))
+    np.save(tmp_path / "flat.npy", np.full((2, 2), -9999.0))
+    assert load_heights(tmp_path / "bed.npy").heights.min() == -9999
+    assert load_heights(tmp_path / "flat.npy").heights.min() == -9999
 
 
 @pytest.mark.parametrize("name", ["x.asc", "x.tif", "x.png"])

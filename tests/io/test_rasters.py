@@ -1,9 +1,12 @@
 """Maps lie where their terrain does, as GDAL and GIS programs see it."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from jaxhf import Terrain, load_heights, save_heights
+from jaxhf.cli.main import main
 from jaxhf.io.rasters import save_raster
 
 rasterio = pytest.importorskip("rasterio")
@@ -148,3 +151,49 @@ def test_what_is_no_map_is_refused(tmp_path, utm):
         with pytest.raises(ValueError, match=message):
             save_raster(tmp_path / name, values, utm)
     assert [path.name for path in tmp_path.iterdir()] == ["utm.tif"]
+
+
+@pytest.mark.parametrize(
+    ("crs", "unit", "hint"),
+    [
+        ("EPSG:32616", "ft", "its heights are in ft, x and y are not: in metres they would be 0.3048 times that"),
+        ("EPSG:4326", "US survey foot", "its heights are in US survey foot, x and y are not"),
+        ("EPSG:2263", None, "x and y are in US survey foot, and heights count as such: in metres they must be multiplied"),
+        ("EPSG:2263", "m", "x and y are in US survey foot, and heights count as such"),
+        ("EPSG:2263", "US survey foot", None),
+        ("EPSG:32616", "metre", None),
+    ],
+)
+def test_feet_are_named_where_they_meet_other_units(tmp_path, capsys, crs, unit, hint):
+    """By the commands in one line; `z_scale` says that they are known."""
+    place = (1e-3, 0, 7, 0, -1e-3, 46) if crs == "EPSG:4326" else (30, 0, 5e5, 0, -20, 4e6)
+    with rasterio.open(write(tmp_path / "x.tif", VALUES, place, crs=crs), "r+") as dataset:
+        dataset.units = (unit,)
+    if hint is None:
+        load_heights(tmp_path / "x.tif")
+        return
+    with pytest.warns(UserWarning, match=rf"x\.tif: {hint}"):
+        load_heights(tmp_path / "x.tif")
+    load_heights(tmp_path / "x.tif", z_scale=0.3048)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(["aspect", str(tmp_path / "x.tif"), "-o", str(tmp_path / "y.npy")]) == 0
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith(f"jaxhf: warning: {tmp_path}/x.tif: {hint}")
+
+
+def test_many_latitudes_are_no_metres(tmp_path, capsys):
+    """Not those of a tile; converting measures nothing, but for a mesh."""
+    write(tmp_path / "tile.tif", VALUES, (1 / 3, 0, 7, 0, -1 / 3, 61), crs="EPSG:4326")
+    load_heights(tmp_path / "tile.tif")
+    write(tmp_path / "wide.tif", VALUES, (10, 0, 7, 0, -10, 65), crs="EPSG:4326")
+    off = r"degrees from latitude 40 to 60 are measured in metres at 50: .* a column's width is off by up to 22 %"
+    with pytest.warns(UserWarning, match=off):
+        load_heights(tmp_path / "wide.tif")
+    load_heights(tmp_path / "wide.tif", dx=1000.0, dy=1000.0)
+    assert main(["convert", str(tmp_path / "wide.tif"), str(tmp_path / "wide.npz")]) == 0
+    assert capsys.readouterr().err == ""
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(["slope", str(tmp_path / "wide.tif"), "-o", str(tmp_path / "slope.npy")]) == 0
+    assert sum("off by up to 22 %" in line for line in capsys.readouterr().err.splitlines()) == 1

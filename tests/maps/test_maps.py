@@ -261,3 +261,11 @@ def test_colour_files_are_refused(tmp_path, text, message):
     (tmp_path / "ramp.txt").write_text(text)
     with pytest.raises(jaxhf.SceneError, match=re.escape(message)):
         jaxhf.color_relief(np.eye(3), tmp_path / "ramp.txt")
+
+
+def test_colour_files_of_other_encodings_and_what_is_none(tmp_path):
+    (tmp_path / "ramp.txt").write_bytes("# Höhe\n0 1 2 3\n9 4 5 6\n".encode("latin-1"))
+    assert jaxhf.color_relief(np.array([[0.0, 9.0], [0.0, 9.0]]), tmp_path / "ramp.txt")[0, 1].tolist() == [4, 5, 6]
+    (tmp_path / "dem.tif").write_bytes(b"II*\x00\x83\xff")
+    with pytest.raises(ValueError, match=r"dem\.tif:1: a height must be followed by red, green and blue"):
+        jaxhf.color_relief(np.eye(2), tmp_path / "dem.tif")
