@@ -36,6 +36,7 @@ from .findings import (
 from .groups import masked_targets
 from .history import Draws, Step, Stop
 from .loop import FitLoop
+from .noise import chi_squared
 from .options import Albedo, FitOptions, Loss, Solver
 from .problem import Problem, make_problem
 from .residuals import found_scenes
@@ -65,8 +66,9 @@ class Fit:
       residuals: `images` - targets; 0 where a target has no weight.
       regions: the three blocks of the pictures with the largest residuals.
       warnings: what speaks against trusting the heights, a sentence each; empty where nothing does.
-      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals in units of `noise` and the error
-        of their samples, without a background that is explained: about 1 where `noise` is right and all is explained.
+      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals, by degree of freedom, in units of
+        `noise` and the error of their samples, without a background that is explained: about 1 where `noise` is right and all
+        is explained.
       history: a `Step` for each step.
     """
 
@@ -282,16 +284,15 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
             images[k], differences[k] = _in_shape(image, shape), _in_shape(values, shape)
             left[k] = Left(image, target, values * weight, informing[k], float(problem.noise[k]), float(problem.brightness[k]))
     in_noise = [picture.residual for picture in left]
-    counted = np.concatenate(
-        [picture.residual[picture.informing | (np.abs(picture.residual) > _OFF)] for picture in left]
-    ).astype(np.float64)
+    counts = [picture.informing | (np.abs(picture.residual) > _OFF) for picture in left]
+    counted = np.concatenate([values[which] for values, which in zip(in_noise, counts, strict=True)]).astype(np.float64)
     with np.errstate(over="ignore"):
         regions, where = worst_regions(in_noise), where_residuals_are(in_noise, boundary_places(problem))
-        chi2 = float(np.mean(np.square(counted))) if len(counted) else 0.0
+        chi2, free = chi_squared(problem, counted, [int(which.sum()) for which in counts], loop.freedom)
     seen = influence != 0
     std, scaled, draws, displaced = None, None, None, None
     if options.uncertainty is not None and result is not Stop.NON_FINITE:
-        borne_out, scaled = with_unexplained(problem, counted)
+        borne_out, scaled = with_unexplained(problem, counted, free)
         found = standard_deviations(unknowns, borne_out, options.uncertainty, options.inner_steps, loop.progress)
         std, drawn, displaced = found.std, found.drawn, (found.displacement, found.raised)
         draws = None if drawn is None else (int(options.uncertainty), drawn)

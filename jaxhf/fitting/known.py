@@ -80,31 +80,3 @@ def pictures_and_influence(
     if known.images is None:
         known.images = picture_values(unknowns, problem).images
     return known.images, (jacobian_at(unknowns, problem, known).T @ draw).reshape(shape)
-
-
-def spreads_of(pictures: Sequence[jax.Array], problem: Problem) -> Float[np.ndarray, " pictures"]:
-    """The standard deviation of each picture's values at weight 1, by its residuals; radiance.
-
-    By their median, as some are unexplained, or by their root mean square, which is less where they are all of one size, as
-    those from rounding to 8 bits.
-
-    Pixels that do not change with the heights, such as the background, do not count, nor the half of the others whose samples
-    differ most.
-    """
-    spreads = np.zeros(problem.count)
-    for number, (picture, group) in enumerate(zip(pictures, problem.groups, strict=True)):
-        given = np.asarray(group.given)
-        errors = np.abs(given * (np.asarray(picture) - np.asarray(group.targets)))
-        known = None if problem.linearised is None else problem.linearised[number]
-        depends, sampling = (None, None) if known is None else (np.asarray(known.depends), np.asarray(known.sampling))
-        for position, k in enumerate(group.indices):
-            counted = given[position] > 0
-            if depends is not None and sampling is not None:
-                shown = counted & depends[position][..., None]
-                if shown.any():
-                    error = np.broadcast_to(sampling[position][..., None], shown.shape)
-                    counted = shown & (error <= np.median(error[shown]))
-            left = errors[position][counted].astype(np.float64)
-            with np.errstate(over="ignore"):
-                spreads[k] = min(1.4826 * np.median(left), np.sqrt(np.mean(left * left)))
-    return spreads

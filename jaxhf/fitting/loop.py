@@ -22,7 +22,8 @@ from .curvature import mode_curvature
 from .fingerprint import fingerprint
 from .history import Step, Stop, printed_progress
 from .jacobian import Sparse, in_rows, picture_values
-from .known import Known, KnownPictures, jacobian_at, pictures_and_influence, spreads_of
+from .known import Known, KnownPictures, jacobian_at, pictures_and_influence
+from .noise import Freedom, estimated_noise, explains_noise, freedom, spreads_of
 from .normal_equations import NormalEquations, advance, has_damping, init_state, reset_state, step_size, with_rejections
 from .normals import evidence_for_angles
 from .options import FitOptions, make_stages
@@ -67,6 +68,8 @@ class FitLoop:
         self.final_loss_scale = None if problem.loss_scale is None else float(problem.loss_scale)
         self.units: np.ndarray | None = None  # see `make_basis`
         self.pictures = KnownPictures()
+        self.estimate: tuple[Unknowns, Any] | None = None  # see `_restricted`
+        self.freedom: Freedom | None = None  # of the pictures' residuals, where it is known
         self.seconds = 0.0  # spent before a resumption
 
     def run(self) -> Stop:
@@ -132,7 +135,7 @@ class FitLoop:
         share, repeats = self.stages[self.stage + 1], self.stage >= 0 and self.stages[self.stage] == 1
         refined = repeats and self._take_other_settings(surface)
         known, spreads = self.known(self.best[1]), self._spreads(self.best[1])
-        noise = self._estimated_noise(spreads, share)
+        noise = self._estimated_noise(spreads, repeats, share)
         spread = _rms(spreads / noise)
         scale = None
         if self.final_loss_scale is not None:
@@ -207,7 +210,7 @@ class FitLoop:
     def _set_problem(self, problem: Problem) -> None:
         """Renders otherwise; the solver's state may have another structure then."""
         self.problem = dataclasses.replace(problem, linearised=None)
-        self.pictures = KnownPictures()
+        self.pictures, self.estimate = KnownPictures(), None
         self.initial_state = self._initial_state(self.best[1])
 
     def _loss_scale(self) -> float | None:
@@ -221,19 +224,31 @@ class FitLoop:
         """Weighs residuals by this noise and by the error of the samples of the pictures that are known."""
         self.problem = dataclasses.replace(known.with_noise(noise), linearised=None)
 
-    def _estimated_noise(self, spreads: np.ndarray, share: float) -> np.ndarray:
+    def _estimated_noise(self, spreads: np.ndarray, repeats: bool, share: float) -> np.ndarray:
         """The noise of each picture by its residuals, where none is given; unchanged where it would hardly change.
 
         Args:
           spreads: of each picture's residuals, radiance.
+          repeats: whether all modes were varied; before, what is left is mostly for shorter ones to explain.
           share: of the modes that the stage to come varies.
         """
         before = self.problem.noise
         if self.options.noise is not None:
             return before
-        noise = np.maximum(spreads, self.problem.least_noise)
+        restricted = self._restricted(self.best[1]) if repeats else None
+        noise = np.maximum(spreads, self.problem.least_noise) if restricted is None else restricted[0]
         changes = np.maximum(noise / before, before / noise)
         return before if share == 1 and changes.max() < _LEAST_CHANGE else noise
+
+    def _restricted(self, unknowns: Unknowns) -> tuple[np.ndarray, np.ndarray] | None:
+        """See `estimated_noise`; None where heights explain little of it, or the pictures' derivatives are not known."""
+        known = self.known(unknowns)
+        if not (is_sparse(known) and explains_noise(known)):
+            return None
+        if self.estimate is None or self.estimate[0] is not unknowns:
+            found = estimated_noise(unknowns, known, self._jacobian(unknowns)(), self.options.noise is None)
+            self.estimate = unknowns, found
+        return self.estimate[1]
 
     def _measured_units(self, unknowns: Unknowns) -> tuple[np.ndarray, float]:
         """Units of the modes by the curvature of the loss at these unknowns, and that curvature, see `balanced_units`."""
@@ -245,7 +260,13 @@ class FitLoop:
     def set_all_modes(self) -> None:
         """Varies all modes about the present surface, whatever the level at which the fit stopped."""
         surface = np.asarray(surface_of(self.unknowns, self.problem.basis))
+        fitted = self.stages[self.stage] == 1 and math.isfinite(self.best[0])
+        restricted = self._restricted(self.unknowns) if fitted else None
+        if restricted is not None:
+            self._set_noise(restricted[0], self.known(self.unknowns))
         known = self.known(self.unknowns)
+        if restricted is not None:
+            self.freedom = freedom(self.unknowns, known, self._jacobian(self.unknowns)(), restricted[1])
         if self.options.uncertainty is not None and not is_sparse(known):  # for LSMR, of which draws are then made
             self.units, _ = self._measured_units(self.unknowns)
         basis = make_basis(self.field, surface, 1.0, self.units)

@@ -188,7 +188,7 @@ def _on_boundaries(problem: Problem) -> Bool[np.ndarray, " rows"]:
     return in_rows(masks) > 0
 
 
-def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tuple[Problem, float]:
+def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"], free: float | None = None) -> tuple[Problem, float]:
     """The problem with the noise that its residuals bear out, and the factor on the noise, at least 1.
 
     An M-estimate's covariance is f² (JᵀWJ)⁻¹, with f² = N / (N - p) · mean(ψ²) · mean(w) / mean(ψ')² over the N residuals r in
@@ -199,13 +199,15 @@ def with_unexplained(problem: Problem, residuals: Float[np.ndarray, " n"]) -> tu
     Args:
       problem: of the fit.
       residuals: of the pictures, in units of the noise, without those of a background that is explained.
+      free: (N - p) / N, see `Freedom`; None: p is how many heights there are.
     """
     if len(residuals) == 0:
         return problem, 1.0
     influence = influence_function(jnp.asarray(residuals), problem.loss, problem.loss_scale)
     psi, slope, weight = map(np.asarray, influence)
-    free = max(1 - problem.basis.crop(np.asarray(problem.basis.base)).size / len(residuals), 0.5)
-    factor = float(np.sqrt(np.mean(psi**2) * np.mean(weight) / np.mean(slope) ** 2 / free))
+    heights = problem.basis.crop(np.asarray(problem.basis.base)).size
+    share = max(1 - heights / len(residuals), 0.5) if free is None else free
+    factor = float(np.sqrt(np.mean(psi**2) * np.mean(weight) / np.mean(slope) ** 2 / share))
     if not factor > 1:
         return problem, 1.0
     scale = None if problem.loss_scale is None else problem.loss_scale / factor

@@ -15,8 +15,9 @@ from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_
 from jaxhf.fitting.findings import Left, dependent_channels, neighbour_correlation, shows_mean, unlike_noise, what_may_help
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.jacobian import in_rows
-from jaxhf.fitting.known import Known, pictures_and_influence, spreads_of
+from jaxhf.fitting.known import Known, pictures_and_influence
 from jaxhf.fitting.linearise import linearise_each
+from jaxhf.fitting.noise import spreads_of
 from jaxhf.fitting.normal_matrix import NormalMatrix
 from jaxhf.fitting.normals import deviations_above_zero, evidence_for_angles, share_of_normals
 from jaxhf.fitting.problem import make_problem

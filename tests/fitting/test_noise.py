@@ -1,0 +1,68 @@
+"""How large noise is where heights are as many as pixels, and so explain a part of it."""
+
+import jax
+import numpy as np
+import pytest
+
+import jaxhf
+
+pytestmark = pytest.mark.unoptimised
+
+SUNS = ((315, 20), (60, 30), (180, 40))
+SETTINGS = jaxhf.Settings(normals="six", edge_samples=0)
+N = 33
+NOISE = 0.001
+
+
+def terrain(seed: int, relief: float) -> tuple[np.ndarray, np.random.Generator]:
+    """Fractal heights whose spectrum is not the prior's, and what draws the noise."""
+    rng = np.random.default_rng(seed)
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(N, 1 / N), np.fft.fftfreq(N, 1 / N)))
+    amplitude = np.where(frequency > 0, np.maximum(frequency, 1) ** -2.3, 0)
+    heights = np.fft.ifft2(np.fft.fft2(rng.standard_normal((N, N))) * amplitude).real
+    return heights * relief / heights.std(), rng
+
+
+def scenes(heights: np.ndarray, count: int) -> list[jaxhf.Scene]:
+    """One pixel a height, from straight above."""
+    middle = (N - 1) / 2
+    camera = jaxhf.Orthographic.look_at(
+        (middle, middle, 1e3), (middle, middle, 0), up=(0, 1, 0), extent=N - 1, width=N - 1, height=N - 1
+    )
+    ground = jaxhf.Object(jaxhf.Heightfield(heights.astype(np.float32), dx=1.0), jaxhf.Matte(0.3))
+    return [jaxhf.Scene([ground], camera, [jaxhf.Directional.from_angles(*sun, 1.0)]) for sun in SUNS[:count]]
+
+
+def fitted(seed: int, relief: float, count: int, **options) -> jaxhf.Fit:
+    """As a user's process has it, in single precision."""
+    heights, rng = terrain(seed, relief)
+    with jax.enable_x64(False):
+        exact = [np.asarray(jaxhf.render(scene, jaxhf.Settings(samples=16)))[..., 0] for scene in scenes(heights, count)]
+        targets = [image + NOISE * rng.standard_normal(image.shape) for image in exact]
+        known = {"settings": SETTINGS, "prior": 0.0, "prior_std": relief, "prior_length": 4.0}
+        return jaxhf.fit(scenes(0 * heights, count), targets, **known | options)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_noise_is_found_where_heights_explain_a_part_of_it(count):
+    """To a tenth, and chi2 by degree of freedom is about 1; raw residuals say 0.15 and 0.5 to 0.8 of the noise."""
+    for seed in (1, 2):
+        found = fitted(seed, 0.6, count)
+        np.testing.assert_allclose(found.noise, NOISE, rtol=0.1)
+        assert 0.9 < found.stats["chi2"] < 1.2
+        assert found.warnings == ()
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_noise_is_found_in_spite_of_shadows_that_stand_elsewhere(count):
+    """No points on edges move them, so a part of the pictures is never explained; chi2 says so."""
+    found = fitted(0, 1.2, count)
+    np.testing.assert_allclose(found.noise, NOISE, rtol=0.12)  # some of what is left is their doing
+    assert found.stats["chi2"] > 1.2
+
+
+@pytest.mark.parametrize("loss", ["geman", "squares"])
+def test_chi2_is_by_degree_of_freedom_where_the_noise_is_given(loss):
+    found = fitted(1, 0.6, 1, noise=NOISE, loss=loss)
+    assert 0.9 < found.stats["chi2"] < 1.2
+    assert found.warnings == ()
