@@ -85,9 +85,10 @@ def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = No
                 scaled = terrain.heights * terrain.heights.dtype.type(z_scale)
             if np.isinf(scaled).any():
                 raise FileError(f"heights times z_scale must fit into {scaled.dtype}, z_scale is {z_scale}")
-            terrain = dataclasses.replace(terrain, heights=scaled)
+            place = stored.georeference and stored.georeference._replace(z_unit="")  # they are in another unit now
+            terrain = dataclasses.replace(terrain, heights=scaled, georeference=place)
     for hint in _hints(stored, z_scale):
-        warnings.warn(f"{path}: {hint}", stacklevel=2)
+        warnings.warn(f"{path}: {hint}", stacklevel=3)
     return terrain
 
 
@@ -156,7 +157,8 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
             if "crs" in members:  # as `save_heights` writes it
                 scale, offset = ((float(x), float(y)) for x, y in (array("crs_scale"), array("crs_offset")))
                 nodata_there = number("nodata") if "nodata" in members else None
-                place = Georeference(str(array("crs", "U")), scale, offset, nodata_there, bool(number("point")))
+                unit = str(array("z_unit", "U")) if "z_unit" in members else ""
+                place = Georeference(str(array("crs", "U")), scale, offset, nodata_there, bool(number("point")), unit)
                 plain = place[1:3] == Georeference()[1:3]
                 grid |= {"georeference": place, "crs": coordinate_system(place.wkt) if plain else CoordinateSystem()}
             return Terrain(heights_of(array(name), nodata), **grid)

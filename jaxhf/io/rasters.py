@@ -125,7 +125,7 @@ def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None
             temporary.write_bytes(geotiff(values, like, nodata))
 
 
-def geotiff(values: np.ndarray, like: Terrain, nodata: float | None) -> memoryview:
+def geotiff(values: np.ndarray, like: Terrain, nodata: float | None, unit: str = "") -> memoryview:
     """The bytes of a GeoTIFF; see `save_raster`. In memory first, as GDAL does not always say that a disk is full."""
     rasterio = import_extra("rasterio", "writing .tif needs", "geo")
     dx, dy, x0, y0 = like.in_file
@@ -143,4 +143,6 @@ def geotiff(values: np.ndarray, like: Terrain, nodata: float | None) -> memoryvi
         with memory.open(**profile) as dataset:
             dataset.update_tags(AREA_OR_POINT="Point" if place.point else "Area")
             dataset.write(np.moveaxis(bands, -1, 0))
+            if unit:
+                dataset.units = (unit,)
         return memoryview(memory.read())

@@ -98,6 +98,7 @@ def _write_npz(path: Path, terrain: Terrain) -> None:
     place: dict[str, Any] = {name: getattr(terrain, name) for name in ("dx", "dy", "x0", "y0")}
     if (known := terrain.georeference) is not None:
         place |= {"crs": known.wkt, "crs_scale": known.scale, "crs_offset": known.offset, "point": known.point}
+        place |= {"z_unit": known.z_unit} if known.z_unit else {}
         place |= {} if known.nodata is None else {"nodata": known.nodata}
     with path.open("wb") as file:
         np.savez(file, heights=terrain.heights, **place)
@@ -109,7 +110,8 @@ def _write_tiff(path: Path, terrain: Terrain) -> None:
         nodata = None  # after scaling it may be a height
     if nodata is not None:
         heights = np.where(np.isnan(heights), heights.dtype.type(nodata), heights)
-    path.write_bytes(geotiff(heights, terrain, np.nan if nodata is None else nodata))
+    unit = terrain.georeference.z_unit if terrain.georeference else ""
+    path.write_bytes(geotiff(heights, terrain, np.nan if nodata is None else nodata, unit))
 
 
 def _write_exr(path: Path, terrain: Terrain) -> None:

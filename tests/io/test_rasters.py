@@ -182,6 +182,23 @@ def test_feet_are_named_where_they_meet_other_units(tmp_path, capsys, crs, unit,
     assert said.startswith(f"jaxhf: warning: {tmp_path}/x.tif: {hint}")
 
 
+def test_the_unit_of_heights_goes_with_them(tmp_path):
+    """Until they are scaled; not with a map of them."""
+    with rasterio.open(write(tmp_path / "x.tif", VALUES, (30, 0, 5e5, 0, -20, 4e6), crs="EPSG:2263"), "r+") as dataset:
+        dataset.units = ("US survey foot",)
+    for before, after in (("x.tif", "y.npz"), ("y.npz", "z.tif")):
+        save_heights(tmp_path / after, load_heights(tmp_path / before))
+        place = load_heights(tmp_path / after).georeference
+        assert place
+        assert place.height_unit == "US survey foot"
+    scaled = load_heights(tmp_path / "z.tif", z_scale=0.3048).georeference
+    assert scaled
+    assert scaled.height_unit == ""
+    save_raster(tmp_path / "map.tif", VALUES, load_heights(tmp_path / "x.tif"))
+    with rasterio.open(tmp_path / "map.tif") as dataset:
+        assert dataset.units == (None,)
+
+
 def test_many_latitudes_are_no_metres(tmp_path, capsys):
     """Not those of a tile; converting measures nothing, but for a mesh."""
     write(tmp_path / "tile.tif", VALUES, (1 / 3, 0, 7, 0, -1 / 3, 61), crs="EPSG:4326")
