@@ -118,6 +118,8 @@ class Findings(NamedTuple):
       scaled: by what the noise was multiplied for the standard deviations; None: there are none.
       displaced: by how much boundaries may be, height units, and what that multiplies the deviations by; None: as `scaled`.
       draws: asked for, made; None: none were asked for.
+      unsure_noise: why the noise that was estimated may be too small, in words; None: it was given, or is sure.
+      length: how the prior's correlation length does not fit, in words; None: it does.
       normals: the scheme that the fit chose in place of the default one; None: none.
     """
 
@@ -137,6 +139,8 @@ class Findings(NamedTuple):
     scaled: float | None
     displaced: tuple[float, float] | None
     draws: tuple[int, int] | None
+    unsure_noise: str | None
+    length: str | None
     normals: str | None
 
 
@@ -169,8 +173,12 @@ def warnings(found: Findings) -> tuple[str, ...]:
     if strays:
         said.append(
             f"the heights differ from the prior by {found.strayed:.2g} times prior_std, root mean square: either prior_std is "
-            "too small or the heights are wrong"
+            "too small or the heights are wrong, as where the surface does not reflect as Matte does"
         )
+    if found.length is not None and found.unlike_noise is None:
+        said.append(found.length)
+    if found.unsure_noise is not None:
+        said.append(f"{found.unsure_noise}: noise= tells the fit, where you know it")
     hidden = int((~found.seen).sum())
     if hidden > _UNSEEN * found.seen.size:
         kept = "what the prior makes of their neighbours"

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 
 from ..core.types import AnyArray
 from .diagnosis import Places
+from .noise import octaves
 from .normals import share_of_normals
 from .options import FitOptions
 from .problem import Problem
@@ -21,6 +22,9 @@ _FAR = 4.5  # times the median: three standard deviations of normal errors
 _EXPLAINED = 0.5  # share of the squared residuals that a factor or an offset of the picture must explain
 _TRIFLE = 0.1  # a factor or, over the brightness, an offset that is too small to be a cause
 _RELATIVE = 1e-5  # above what single precision leaves of a sum that is 0; oblique pictures have 1e-3 to 0.2
+_REFLECTANCE = "or the surface does not reflect as Matte does, by Lambert's law"
+_FAR_FROM_PRIOR = 2.5  # of its deviations, root mean square over an octave of its modes
+_LEAST_MODES = 8  # in an octave
 _LIKE_ONE = 0.5  # correlation of the channels' residuals
 _OUTLIER = 4.0  # standard deviations
 _LEAST_CHI2 = 0.5  # below which what is left is mostly the error of few samples, which all channels have
@@ -107,14 +111,17 @@ def _cause(left: Left, options: FitOptions) -> str:
     most = (1 - _EXPLAINED) * np.sum((target - image) ** 2)
     scaled, moved = np.sum((target - factor * image) ** 2), np.sum((target - image - offset) ** 2)
     if not options.offsets and moved < min(most, scaled) and abs(offset) > _TRIFLE * left.brightness:
-        return f"it is brighter than the scene by {offset:.3g}: offsets=True finds what haze or the sensor adds"
+        return f"it is brighter than the scene by {offset:.3g}: offsets=True finds what haze or the sensor adds; {_REFLECTANCE}"
     if not options.exposures and factor > 0 and scaled < most and abs(factor - 1) > _TRIFLE:
         return (
             f"it is {factor:.3g} times as bright as the scene: exposures=True finds such factors, if the exposure, the light "
-            "or the albedo is not known"
+            f"or the albedo is not known; {_REFLECTANCE}"
         )
-    prior = "prior_std may be too small, or " if options.prior is not None else ""
-    return f"{prior}lights, cameras or the albedo may be off: light_std, camera_std and albedo let the fit find them"
+    prior = "" if options.prior is None else "prior_std may be too small, or "
+    if options.prior_length is not None:
+        prior = "prior_std may be too small or prior_length too long, or "
+    off = "lights, cameras or the albedo may be off: light_std, camera_std and albedo let the fit find them"
+    return f"{prior}{off}; {_REFLECTANCE}"
 
 
 def informing_values(problem: Problem) -> list[Bool[np.ndarray, "h w c"]]:
@@ -168,7 +175,10 @@ def what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"], pictures:
             "Settings(samples=16) makes pictures of finer samples; if that changes nothing, camera_std finds a camera that is "
             "off, or mask those pixels by weights"
         )
-    return "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo)"
+    return (
+        "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo, a surface that "
+        "does not reflect as Matte does)"
+    )
 
 
 def _is_wider_noise(left: Left) -> bool:
@@ -182,6 +192,31 @@ def strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: 
         return None
     ratio = (heights - np.asarray(problem.basis.crop(problem.prior.heights))) / np.asarray(prior_std, np.float64)
     return float(np.sqrt(np.mean(np.broadcast_to(ratio, seen.shape)[seen] ** 2)))
+
+
+def misfit_of_length(problem: Problem, options: FitOptions) -> str | None:
+    """In which waves heights differ from a correlated prior by far more than its deviations, in words; None: in none."""
+    length, basis = options.prior_length, problem.basis
+    if problem.prior is None or problem.prior.stiffness is None or length is None:
+        return None
+    weight, stiffness = (np.asarray(values, np.float64) for values in (problem.prior.weight, problem.prior.stiffness))
+    off = weight * (np.asarray(basis.base, np.float64) - np.asarray(problem.prior.heights, np.float64))
+    modes = stiffness * (np.asarray(basis.rows, np.float64) @ off @ np.asarray(basis.columns, np.float64).T)
+    bands = octaves(modes.shape).ravel()
+    counts = np.bincount(bands)
+    sizes = np.sqrt(np.bincount(bands, (modes**2).ravel()) / counts)
+    worst = int(np.argmax(np.where(counts >= _LEAST_MODES, sizes, 0)))
+    if sizes[worst] < _FAR_FROM_PRIOR:
+        return None
+    field = problem.groups[0].shared.heightfields[0]
+    cell = min(field.dx, field.dy)
+    shortest = 2 * cell * 2**worst
+    kind = "short" if sizes[worst] > 2 * sizes[max(worst - 2, 0)] else "long"  # it is waves of all lengths that are off then
+    return (
+        f"in waves of {shortest:.3g} to {2 * shortest:.3g} the heights differ from the prior by {sizes[worst]:.2g} times its "
+        f"deviations there: prior_length, {length:.6g} or {length / cell:.3g} cells, may be too {kind}, or prior_std too "
+        f"small. prior_length is in the unit of dx and dy, of which a cell has {cell:.6g}, not in cells"
+    )
 
 
 def shows_mean(influence: Float[np.ndarray, "ny nx"]) -> bool:

@@ -28,6 +28,7 @@ from .findings import (
     dependent_channels,
     informing_values,
     light_directions,
+    misfit_of_length,
     shows_mean,
     strayed,
     unlike_noise,
@@ -36,7 +37,7 @@ from .findings import (
 from .groups import masked_targets
 from .history import Draws, Step, Stop
 from .loop import FitLoop
-from .noise import chi_squared
+from .noise import chi_squared, why_noise_is_unsure
 from .options import Albedo, FitOptions, Loss, Solver
 from .problem import Problem, make_problem
 from .residuals import found_scenes
@@ -314,6 +315,8 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
         noise_share=float(np.min(problem.noise / problem.brightness)),
         lights=light_directions(problem),
         normals=problem.found_settings.normals if options.settings.normals is None else None,
+        unsure_noise=why_noise_is_unsure(problem, unknowns, loop.freedom) if options.noise is None else None,
+        length=misfit_of_length(problem, options),
         scaled=scaled,
         displaced=displaced,
         draws=draws,

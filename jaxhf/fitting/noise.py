@@ -15,12 +15,17 @@ from .jacobian import PictureValues, Sparse, in_rows, picture_values
 from .normal_matrix import NormalMatrix
 from .problem import Problem
 from .robust import influence_function
+from .solvers import count_unknowns
 
 _FAR = 6.0  # times the median: four standard deviations of normal errors; what is farther off is not explained
 _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
 _NO_WEIGHT = 1e-3  # of a value that is far off
 _LEAST_SHARE = 0.1  # of heights in values: of fewer heights noise would be told by 5 % too small at most
-LEAST_FREE = 0.1  # of a picture's noise: where heights explain more, what is left does not tell the noise
+_LEAST_FREE = 0.1  # of a picture's noise: where heights explain more, what is left does not tell the noise
+_MOST_UNKNOWNS = (
+    0.25  # of the values, where it is not known how much of the noise is explained: it is told 13 % too small at most
+)
+_MOST_EXPLAINED = 0.75  # of a picture's noise: one sun without a prior has 0.8, and 0.65 to 1 of its noise is found
 _LEAST_SLOPE = 0.1  # of a robust loss, on average
 _OCTAVES = 6  # into which the prior's modes are divided, at most
 _ROUNDS = 8  # at most; three or four are usual
@@ -107,12 +112,12 @@ def estimated_noise(
       sought: whether the noise is to be found, or only how the heights vary.
     """
     noise, labels = problem.noise.copy(), values_that_tell(problem)
-    octaves = _octaves(problem.basis.base.shape)
-    widths, far = np.ones(octaves.max() + 1), np.zeros(labels.size, bool)
+    bands = octaves(problem.basis.base.shape)
+    widths, far = np.ones(bands.max() + 1), np.zeros(labels.size, bool)
     for _ in range(_ROUNDS):
         model = problem.with_noise(noise)
         values, left = _compared(unknowns, model, far)
-        matrix = NormalMatrix(unknowns, _widened(model, widths[octaves]), images, values)
+        matrix = NormalMatrix(unknowns, _widened(model, widths[bands]), images, values)
         change = matrix.step()
         left = left + matrix.seen(change)
         draws = [matrix.simulated(seed) for seed in range(_draws(labels))]
@@ -121,20 +126,20 @@ def estimated_noise(
             noise, deviations = noise.copy(), _deviations(model)
             for k, here in _each_picture(labels):
                 simulated = np.concatenate([draw.left[here] for draw in draws])
-                if np.mean(simulated**2) > LEAST_FREE:
+                if np.mean(simulated**2) > _LEAST_FREE:
                     noise[k] = _rms(deviations[here]) * _bounded(left[here]) / _bounded(simulated)
             noise = np.maximum(noise, problem.least_noise)
         far = _far_off(left, labels, problem)
         if problem.prior is not None:
             told = np.mean([draw.told for draw in draws], axis=0)
             parts = matrix.in_prior(unknowns, model, change) ** 2, told
-            squares, count = (np.bincount(octaves.ravel(), part.ravel(), widths.size) for part in parts)
+            squares, count = (np.bincount(bands.ravel(), part.ravel(), widths.size) for part in parts)
             factors = np.sqrt((squares + 1) / (np.maximum(count, 0) + 1))
             widths = widths * factors
         moved = [np.abs(np.log(part)).max() for part in (noise / before, factors)]
         if moved[0] < math.log(_NOISE_CHANGE) and moved[1] < math.log(_WIDTH_CHANGE):
             break
-    return noise, widths[octaves]
+    return noise, widths[bands]
 
 
 def freedom(unknowns: Unknowns, problem: Problem, images: Sparse, widths: Float[np.ndarray, "my mx"]) -> Freedom:
@@ -179,7 +184,7 @@ def _widened(problem: Problem, widths: Float[np.ndarray, "my mx"]) -> Problem:
     return dataclasses.replace(problem, prior=dataclasses.replace(problem.prior, stiffness=stiffness))
 
 
-def _octaves(shape: tuple[int, ...]) -> Int[np.ndarray, "my mx"]:
+def octaves(shape: tuple[int, ...]) -> Int[np.ndarray, "my mx"]:
     """The octave of each mode's frequency, 0 being that which ends at the highest along an axis."""
     y, x = (np.arange(n) / n for n in shape)
     frequency = np.maximum(np.hypot(y[:, None], x[None, :]), 1e-9)
@@ -217,6 +222,19 @@ def _far_off(left: Float[np.ndarray, " rows"], labels: Int[np.ndarray, " rows"],
         typical[k] = np.median(np.abs(left[here]))
     numbers = [np.broadcast_to(np.reshape(group.indices, (-1, 1, 1, 1)), group.targets.shape) for group in problem.groups]
     return np.abs(left) > _FAR * typical[in_rows(numbers).astype(int)]
+
+
+def why_noise_is_unsure(problem: Problem, unknowns: Unknowns, freedom: Freedom | None) -> str | None:
+    """Why an estimate of the noise may be too small, in words; None: it is sure."""
+    if freedom is not None:
+        worst = int(np.argmax(freedom.explained))
+        if freedom.explained[worst] <= _MOST_EXPLAINED:
+            return None
+        return f"heights explain {freedom.explained[worst]:.0%} of the noise of picture {worst}: what is left hardly tells it"
+    share = count_unknowns(unknowns) / sum(int(np.count_nonzero(np.asarray(group.given))) for group in problem.groups)
+    if share <= _MOST_UNKNOWNS:
+        return None
+    return f"there are {share:.2g} unknowns to each value of the pictures, which explain an unknown part of its noise"
 
 
 def chi_squared(

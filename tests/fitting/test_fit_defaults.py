@@ -322,7 +322,7 @@ def test_one_thing_to_try_is_enough(cause):
 GOOD = Findings(
     result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, channels=None,
     help="try this", strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, lights=3, scaled=1.0,
-    displaced=(0.5, 1.01), draws=(20, 20), normals=None,
+    displaced=(0.5, 1.01), draws=(20, 20), unsure_noise=None, length=None, normals=None,
 )  # fmt: skip
 
 
@@ -346,6 +346,9 @@ GOOD = Findings(
         ({"scaled": 1.8}, "1.8 times the noise"),
         ({"displaced": (0.5, 1.2)}, "were off by 0.5, and are 1.2 times as large for it"),
         ({"draws": (20, 7)}, "interrupted after 7 of 20"),
+        ({"unsure_noise": "heights explain 95%"}, "heights explain 95%: noise= tells the fit"),
+        ({"length": "prior_length is too short"}, "prior_length is too short"),
+        ({"strayed": 2.5}, "does not reflect as Matte does"),
         ({"normals": "six-angle"}, "weighted as Settings(normals='six-angle') says"),
     ],
 )
