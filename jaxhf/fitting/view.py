@@ -57,7 +57,10 @@ def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[
         for k in range(3):
             column = jnp.cross(q, world.linear[:, k])
             columns.append(world.linear[:, k] + factor * (column + jnp.cross(q, column)))
-        columns.append(world.offset + view.camera[:3])
+        moved_by = view.camera[:3]
+        if camera._ahead is not None:  # the eye is so far behind the place of the matrix
+            moved_by = moved_by + camera._ahead * (columns[2] - world.linear[:, 2])
+        columns.append(world.offset + moved_by)
         matrix = jnp.asarray(camera.world_from_camera).at[:3].set(jnp.stack(columns, axis=1))
         camera = eqx.tree_at(lambda camera: camera.world_from_camera, camera, matrix)
     return lights, camera
@@ -76,7 +79,8 @@ def motion(lights: tuple[Light, ...], camera: Camera, like: View) -> View:
         back = Affine(lax.stop_gradient(world.linear), jnp.zeros_like(world.offset)).inverse()
         turn = [world.vector(back.linear[:, k]) for k in range(3)]  # columns; their tangents are the cross products
         rotation = [turn[1][2] - turn[2][1], turn[2][0] - turn[0][2], turn[0][1] - turn[1][0]]
-        pose = jnp.concatenate([world.offset, jnp.stack(rotation) / 2])
+        eye = world.offset if camera._ahead is None else world.offset - camera._ahead * world.linear[:, 2]
+        pose = jnp.concatenate([eye, jnp.stack(rotation) / 2])
     return View(light, pose)
 
 

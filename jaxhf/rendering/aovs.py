@@ -37,7 +37,7 @@ def observe(world: World, ray: Ray, aovs: tuple[str, ...]) -> dict[str, jax.Arra
     hit = first_hit(world, ray, count_steps="steps" in aovs)
     found = hit.object >= 0
     makers: dict[str, Callable[[], jax.Array]] = {
-        "depth": lambda: jnp.where(found, hit.t, jnp.inf),
+        "depth": lambda: jnp.where(found, hit.t if ray.before is None else hit.t + ray.before, jnp.inf),
         "normal": lambda: jnp.where(found, hit.ns, 0),
         "uv": lambda: jnp.where(found, hit.uv, 0),
         "status": lambda: hit.status,

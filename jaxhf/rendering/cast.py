@@ -44,7 +44,9 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
     world = make_world(scene, settings)
 
     def one(x: jax.Array, y: jax.Array) -> Hit:
-        return first_hit(world, scene.camera.ray(x, y))
+        ray = scene.camera.ray(x, y)
+        hit = first_hit(world, ray)
+        return hit if ray.before is None else eqx.tree_at(lambda hit: hit.t, hit, hit.t + ray.before)
 
     return jax.vmap(one)(x, y)
 

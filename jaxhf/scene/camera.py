@@ -12,7 +12,7 @@ from ..core.affine import Affine, affine, require_invertible
 from ..core.errors import ArgumentError, whole_number
 from ..core.ray import Ray
 from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
-from ..core.vector import unit
+from ..core.vector import dot, unit
 from .framing import framing_pose
 from .heightfield import Heightfield
 from .show import known, numbers
@@ -58,6 +58,7 @@ class Perspective(eqx.Module):
     fov: ScalarLeaf = eqx.field(converter=float_leaf, default=45.0)
     width: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
     height: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
+    _ahead: ScalarLeaf | None = eqx.field(default=None, kw_only=True)  # see `localise_camera`
 
     def __check_init__(self):
         _check_camera(self)
@@ -165,16 +166,22 @@ class Perspective(eqx.Module):
         world = affine(jnp.asarray(self.world_from_camera))
         sx, sy = _screen(self, x, y)
         half = jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2)
-        return Ray(world.offset, unit(world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))))
+        along = world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))
+        if self._ahead is None:
+            return Ray(world.offset, unit(along))
+        across = world.vector(jnp.stack([sx * half, sy * half, jnp.zeros_like(half)]))
+        d = unit(along)
+        return Ray(world.offset + self._ahead * across, d, self._ahead * dot(along, d))
 
     def film_from_world(self) -> Projection:
         """The projection of points in the world to pixels, the inverse of `ray`."""
-        camera = affine(jnp.asarray(self.world_from_camera)).inverse()
+        camera = _camera_from_world(self)
         return _film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
 
     def viewpoint(self) -> tuple[Vector, bool]:
         """The position of the eye, and True: it is a point."""
-        return affine(jnp.asarray(self.world_from_camera)).offset, True
+        world = affine(jnp.asarray(self.world_from_camera))
+        return world.offset if self._ahead is None else world.offset - self._ahead * world.linear[:, 2], True
 
     def __repr__(self) -> str:
         return _shown(self, f"fov={numbers(self.fov)}")
@@ -193,6 +200,7 @@ class Orthographic(eqx.Module):
     extent: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
     width: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
     height: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
+    _ahead: ScalarLeaf | None = eqx.field(default=None, kw_only=True)  # see `localise_camera`
 
     def __check_init__(self):
         _check_camera(self)
@@ -212,12 +220,12 @@ class Orthographic(eqx.Module):
         world = affine(jnp.asarray(self.world_from_camera))
         sx, sy = _screen(self, x, y)
         half = jnp.asarray(self.extent) / 2
-        origin = world.point(jnp.stack([sx * half, sy * half, jnp.zeros_like(half)]))
-        return Ray(origin, unit(world.linear[:, 2]))
+        origin, d = world.point(jnp.stack([sx * half, sy * half, jnp.zeros_like(half)])), unit(world.linear[:, 2])
+        return Ray(origin, d, None if self._ahead is None else self._ahead * dot(world.linear[:, 2], d))
 
     def film_from_world(self) -> Projection:
         """The projection of points in the world to pixels, the inverse of `ray`."""
-        camera = affine(jnp.asarray(self.world_from_camera)).inverse()
+        camera = _camera_from_world(self)
         half = jnp.asarray(self.extent) / 2
         return _film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
 
@@ -245,6 +253,11 @@ def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
     """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
     short = min(camera.width, camera.height)
     return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
+
+
+def _camera_from_world(camera: Camera) -> Affine:
+    inverse = affine(jnp.asarray(camera.world_from_camera)).inverse()
+    return inverse if camera._ahead is None else Affine(inverse.linear, inverse.offset.at[2].add(camera._ahead))
 
 
 def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:

@@ -1,14 +1,18 @@
 """A scene moved to the terrain's corner, in the precision of its heights."""
 
 import dataclasses
+import functools
+import math
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from ..core.affine import affine, translate
+from ..core.compilation import compiled
 from .camera import Camera
 from .heightfield import Heightfield
 from .light import Light, Point
@@ -51,11 +55,65 @@ def localise(scene: Scene) -> Scene:
 
 
 def localise_camera(camera: Camera, scene: Scene) -> Camera:
-    """A camera for `localise(scene)`."""
-    matrix = camera.world_from_camera
-    moved = eqx.tree_at(lambda camera: camera.world_from_camera, camera, _shifted(matrix, -_like(matrix, anchor(scene))))
+    """A camera for `localise(scene)`.
+
+    From 700 km single precision tells places apart to 0.06. So of a camera that is far from all that it sees, and whose pose
+    is still NumPy's, rays begin on a plane in front of that: the matrix is moved there in double precision, and `_ahead` says
+    by how much, in units of its third column.
+    """
     dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
-    return jax.tree.map(lambda leaf: _in_precision(leaf, dtype), moved)
+    matrix: Any = camera.world_from_camera
+    moved = _shifted(matrix, -_like(matrix, anchor(scene)))
+    far = _far(matrix, scene)
+    if far is not None:
+        distance, size, shares = far
+        moved[:3, 3] += distance * moved[:3, 2]
+        shapes = tuple(obj.shape for obj in scene.objects)
+        numbers = (np.asarray(value, dtype) for value in (shares, moved, distance, size))
+        moved, ahead = _in_front(shapes, *numbers)
+        camera = dataclasses.replace(camera, _ahead=ahead)
+    camera = eqx.tree_at(lambda camera: camera.world_from_camera, camera, moved)
+    return jax.tree.map(lambda leaf: _in_precision(leaf, dtype), camera)
+
+
+_FAR = 16  # times the size of the scene: nearer cameras see well enough from where they are
+
+
+def _far(matrix: Any, scene: Scene) -> tuple[float, float, list[float]] | None:
+    """Of a far camera, in units of its third column: the depth of the nearest corner of what it sees, were heights 0; how large
+    that is; and how much nearer a height of 1 may be, for each object. None for other cameras.
+
+    Also where a matrix is JAX's, or there is a cylinder, on the inside of which a camera may be.
+    """
+    if not isinstance(matrix, np.ndarray):
+        return None
+    depth, nearest, size, shares = np.linalg.inv(matrix)[2], math.inf, 0.0, []
+    for obj in scene.objects:
+        shape, world = obj.shape, obj.world_from_object
+        if isinstance(world, jax.Array) or not isinstance(shape, Heightfield | Skirt):
+            return None
+        ny, nx = shape.heights.shape if isinstance(shape, Heightfield) else (len(shape.west), len(shape.south))
+        length_x, length_y = shape.dx * (nx - 1), shape.dy * (ny - 1)
+        x, y, z, corner = (depth if world is None else depth @ world).tolist()
+        nearest = min(nearest, corner + x * shape.x0 + y * shape.y0 + min(0, x * length_x) + min(0, y * length_y))
+        stretch = 1.0 if world is None else float(np.abs(world[:3, :2]).sum())
+        size = max(size, (length_x + length_y) * stretch * math.hypot(*depth[:3].tolist()))
+        shares.append(abs(z))
+    return (nearest, size, shares) if nearest > _FAR * size else None
+
+
+@compiled
+def _in_front(shapes: tuple[Shape, ...], shares: Any, matrix: Any, distance: Any, size: Any) -> tuple[jax.Array, jax.Array]:
+    """A pose at that distance, moved back until it is in front of all heights, and the distance that is left."""
+    reaches = [share * _highest(shape, share.dtype) for shape, share in zip(shapes, shares, strict=True)]
+    back = lax.stop_gradient(jnp.minimum(functools.reduce(jnp.maximum, reaches) + size, distance))
+    return matrix.at[:3, 3].add(-back * matrix[:3, 2]), distance - back
+
+
+def _highest(shape: Shape, dtype: Any) -> jax.Array:
+    """How far its heights are from 0."""
+    leaves = [jnp.asarray(leaf, dtype) for leaf in jax.tree.leaves(shape)]
+    return functools.reduce(jnp.maximum, [jnp.max(jnp.where(jnp.isfinite(leaf), jnp.abs(leaf), 0)) for leaf in leaves])
 
 
 def _in_precision(leaf: Any, dtype: Any) -> Any:
