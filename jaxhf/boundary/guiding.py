@@ -15,8 +15,10 @@ from ..core.vector import unit
 from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sun, casts_sharp_shadows
 from ..trace.grid import Grid
+from ..trace.skirt import Walls
 from ..trace.world import World
-from .silhouette import EdgeFlags, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
+from . import outline
+from .silhouette import EdgeFlags, EdgeWeights, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
 _TOTAL_WEIGHT = 2**30
@@ -39,16 +41,16 @@ class EdgeSet(NamedTuple):
 
 
 def edge_sets(world: World) -> tuple[EdgeSet, ...]:
-    """All edges of the scene that may bound something, in one numbering. A cylinder has none."""
+    """All edges of the scene that may bound something, in one numbering; for skirts see `outline`. A cylinder has none."""
     found, first = [], 0
     casting = (
         [number for number, light in enumerate(world.lights) if casts_sharp_shadows(light)] if world.settings.shadows else []
     )
     for k, surface in enumerate(world.surfaces):
-        if not isinstance(surface, Grid):
+        if not isinstance(surface, Grid | Walls):
             continue
         for light in (None, *casting):
-            ny, nx = surface.shape
+            ny, nx = surface.shape if isinstance(surface, Grid) else (2, outline.columns(surface))
             found.append(EdgeSet(k, light, first, ny, nx))
             first = found[-1].end
     return tuple(found)
@@ -61,6 +63,10 @@ def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
     weights = []
     for edges in edge_sets(world):
         surface = world.surfaces[edges.surface]
+        if isinstance(surface, Walls):
+            lengths = _outline_lengths(world, surface, camera, None if edges.light is None else lights[edges.light])
+            weights.append(_shares(lengths))
+            continue
         assert isinstance(surface, Grid)
         if edges.light is None:
             flags = _standing(surface, camera, standing, world.settings.shading)
@@ -68,12 +74,24 @@ def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
         else:
             flags = silhouettes(surface, lights[edges.light])
             lengths = lit_lengths(surface, lights[edges.light])
-        lengths = jnp.where(flags, lengths, 0).ravel()
-        largest = jnp.max(lengths)
-        lengths = lengths / jnp.where(largest > 0, largest, 1)
-        total = jnp.sum(lengths)
-        weights.append(lengths / jnp.where(total > 0, total, 1))
+        weights.append(_shares(jnp.where(flags, lengths, 0)))
     return jnp.concatenate(weights)
+
+
+def _shares(lengths: EdgeWeights) -> Float[jax.Array, " edges"]:
+    """Of their sum; zeros where all are zero."""
+    lengths = lengths.ravel()
+    largest = jnp.max(lengths)
+    lengths = lengths / jnp.where(largest > 0, largest, 1)
+    total = jnp.sum(lengths)
+    return lengths / jnp.where(total > 0, total, 1)
+
+
+def _outline_lengths(world: World, walls: Walls, camera: Camera, light: Viewpoint | None) -> EdgeWeights:
+    """Of the edges of a skirt that may bound what is seen, as seen; or those that throw a shadow, as lit."""
+    if light is None:
+        return jnp.where(outline.outline(world, walls), outline.seen_lengths(walls, camera), 0)
+    return jnp.where(outline.shading_edges(world, walls, light), outline.lit_lengths(walls, light), 0)
 
 
 def boundary_length(world: World, camera: Camera) -> Scalar:

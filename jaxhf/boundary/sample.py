@@ -29,10 +29,11 @@ from ..scene.camera import Camera
 from ..scene.light import Point, casts_sharp_shadows
 from ..trace.cylinder import Tube, tube_distance
 from ..trace.grid import Grid
-from ..trace.skirt import wall_distance
+from ..trace.skirt import Walls, wall_distance
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
 from ..trace.world import World
 from .guiding import GuidingDistribution, edge_sets
+from .outline import along_edge
 from .silhouette import STEPS, framed_part
 
 
@@ -120,7 +121,7 @@ def on_edge(
     offset: Vector | None = None,
     perturbation: Float[jax.Array, "5"] | None = None,
 ) -> Vector:
-    """World frame, moved by `offset` (in the grid's frame); differentiable in the heights and in the transform."""
+    """World frame, moved by `offset` (in the surface's own frame); differentiable in the heights and in the transform."""
     chosen = None
     for k, grid in enumerate(world.surfaces):
         if isinstance(grid, Grid):
@@ -132,6 +133,10 @@ def on_edge(
             z = z0 + s * (z1 - z0)
             p = jnp.stack([x, y, z])
             p = grid.world_from_grid.point(p if offset is None else p + offset)
+            chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
+        elif isinstance(grid, Walls):
+            p = along_edge(grid, point.start, point.end, s)
+            p = grid.world_from_object.point(p if offset is None else p + offset)
             chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
     assert chosen is not None
     return chosen
@@ -199,7 +204,7 @@ def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Float[
         else:
             ray = Ray(p, away)
             tube = isinstance(surface, Tube)
-            t, found = tube_distance(surface, ray, None) if tube else wall_distance(surface, ray, None, None)[:2]
+            t, found = tube_distance(surface, ray, None) if tube else wall_distance(surface, ray, None, k)[:2]
             landed = jnp.where(point.receiver == k, p + jnp.where(found, t, point.t) * away, landed)
     return landed
 

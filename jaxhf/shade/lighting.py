@@ -137,7 +137,8 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
         seen, exhausted = total
         half, foot = radius * node[1], wi[:2] + radius * node[0] * aside
         level = jnp.stack([*unit(foot), jnp.zeros((), dtype)])
-        centre = unit(jnp.stack([*foot, wi[2]]))
+        centre = jnp.stack([*foot, wi[2]])
+        centre = centre / jnp.sqrt(dot(centre, centre))  # about 1
         middle = jnp.arctan2(wi[2], dot(foot, level[:2]))
         lowest, mean, highest = (jnp.tan(within(middle + end, -_STEEPEST, _STEEPEST)) for end in (-half, 0, half))
         slope = greater(_own_slope(n, level, mean), lowest)

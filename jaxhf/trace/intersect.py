@@ -94,7 +94,7 @@ def blocked(
         t, found = tube_distance(surface, ray, leaving.object == number)
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
     if isinstance(surface, Walls):
-        t, found, _ = wall_distance(surface, ray, leaving.object == number, leaving.cell[0])
+        t, found, _ = wall_distance(surface, ray, leaving, number)
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
     local, scale = ray_in_grid(surface, ray)
     t_max = None if t_max is None else t_max * scale

@@ -1,5 +1,7 @@
 """Where a ray meets the walls and the floor under a terrain."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,12 +9,14 @@ from jaxtyping import Float
 
 from ..core.affine import Affine
 from ..core.ray import Ray
-from ..core.types import Flag, Index, Scalar
+from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, largest_component, time_to, unit
 from ..scene.skirt import Skirt
 from .hit import Hit, orthogonal_tangents
 from .status import Status
 
+# The directions out of the solid through the four walls and the floor, object frame.
+OUTWARDS = ((0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0), (0, 0, -1))
 _FLOOR = 4  # the number of that side; the walls are 0 to 3
 _WIDE = 16  # units in the last place by which a ray's place on a side may be off
 
@@ -47,7 +51,7 @@ def make_walls(skirt: Skirt, world_from_object: Affine | None) -> Walls:
     return Walls(tops, base, tallest, size, cells, world, world.inverse())
 
 
-def wall_distance(walls: Walls, ray: Ray, left: Flag | None, left_side: Index | None) -> tuple[Scalar, Flag, Index]:
+def wall_distance(walls: Walls, ray: Ray, leaving: Hit | None, number: int) -> tuple[Scalar, Flag, Index]:
     """The smallest t > 0 at which a world-frame ray meets a wall or the floor, whether it does, and which of the five.
 
     For rays from outside each side is wider by rounding, for those from inside narrower: so nothing gets in between two sides,
@@ -56,14 +60,15 @@ def wall_distance(walls: Walls, ray: Ray, left: Flag | None, left_side: Index | 
     Args:
       walls: the surface.
       ray: world frame.
-      left: whether it starts on these walls; None for rays that start in free space.
-      left_side: then, on which side, which it cannot meet again.
+      leaving: the hit from which it starts; if that lies on these walls, its side cannot be met again, nor, where it lies on an
+        edge (`triangle` is 1), that of `cell[1]`. None for rays that start in free space.
+      number: of the object.
     """
     local = walls.object_from_world.ray(ray)
     o, d = local.o, local.d
     (size_x, size_y), (cells_x, cells_y) = walls.size, walls.cells
     wide = _WIDE * jnp.finfo(o.dtype).eps
-    best, found, number = jnp.full_like(walls.base, jnp.inf), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+    best, found, nearest = jnp.full_like(walls.base, jnp.inf), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
     first = 0
     planes = [(1, 0.0, 0, size_x, cells_x), (1, size_y, 0, size_x, cells_x), (0, 0.0, 1, size_y, cells_y),
               (0, size_x, 1, size_y, cells_y), (2, walls.base, 0, size_x, 0)]  # fmt: skip
@@ -85,24 +90,38 @@ def wall_distance(walls: Walls, ray: Ray, left: Flag | None, left_side: Index | 
             inside = inside & (at[2] >= walls.base - wider[2]) & (at[2] <= top + more)
             first += cells + 1
         met = ever & (t > 0) & (t < best) & inside
-        if left is not None:
-            met = met & ~(left & (left_side == side))
-        best, found, number = jnp.where(met, t, best), found | met, jnp.where(met, side, number)
-    return jnp.where(found, best, 0), found, number
+        if leaving is not None:
+            left = (leaving.cell[0] == side) | ((leaving.triangle == 1) & (leaving.cell[1] == side))
+            met = met & ~((leaving.object == number) & left)
+        best, found, nearest = jnp.where(met, t, best), found | met, jnp.where(met, side, nearest)
+    return jnp.where(found, best, 0), found, nearest
 
 
 def wall_hit(walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: Flag | None, count_steps: bool) -> Hit:
     """The first hit of a world-frame ray on walls or floor; `number` is that of their object. `Hit.cell[0]` says which side."""
-    left = None if leaving is None else leaving.object == number
-    t, found, side = wall_distance(walls, ray, left, None if leaving is None else leaving.cell[0])
+    t, found, side = wall_distance(walls, ray, leaving, number)
     found = found if active is None else found & active
     valid = largest_component(ray.d) > 0
     met = found & valid
     t = jnp.where(found, t, 0)
-    p = ray(t)
+    hit = hit_on_side(walls, number, side, ray(t), ray.d)
+    # At the rim a wall comes before the terrain, whose lower side would be seen there.
+    t = t * jnp.where(hit.side > 0, 1 - _WIDE * jnp.finfo(t.dtype).eps, 1)
+    status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID))
+    return dataclasses.replace(
+        hit,
+        status=status.astype(jnp.int32),
+        object=jnp.where(met, hit.object, -1),
+        t=jnp.where(met, t, jnp.inf),
+        steps=jnp.zeros((), jnp.int32) if count_steps else None,
+    )
+
+
+def hit_on_side(walls: Walls, number: int, side: Index, p: Vector, d: Vector) -> Hit:
+    """The hit at a point of a wall, or of the floor, of a ray that comes along `d`; with t = 0."""
     local = walls.object_from_world.point(p)
-    (size_x, size_y), dtype = walls.size, t.dtype
-    outwards = jnp.array([[0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, -1]], dtype)[side]
+    (size_x, size_y), dtype = walls.size, p.dtype
+    outwards = jnp.array(OUTWARDS, dtype)[side]
     along_x, floor = (side < 2) | (side == _FLOOR), side == _FLOOR
     u = jnp.where(along_x, local[0] / size_x, local[1] / size_y)
     v = jnp.where(floor, local[1] / size_y, time_to(local[2] - walls.base, walls.tallest)[0])
@@ -112,14 +131,9 @@ def wall_hit(walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: F
     per_v = jnp.where(floor, jnp.stack([zero, zero + size_y, zero]), jnp.stack([zero, zero, walls.tallest]))
     dp_du, dp_dv = orthogonal_tangents(walls.world_from_object.vector(per_u), walls.world_from_object.vector(per_v), n)
     none = jnp.zeros((), jnp.int32)
-    faces = dot(n, ray.d) < 0
-    # At the rim a wall comes before the terrain, whose lower side would be seen there.
-    nearer = jnp.where(faces, 1 - _WIDE * jnp.finfo(dtype).eps, 1)
-    status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID))
-    t = jnp.where(met, t * nearer, jnp.inf)
+    faces = dot(n, d) < 0
     return Hit(
-        status=status.astype(jnp.int32), object=jnp.where(met, number, -1).astype(jnp.int32), t=t,
-        p=p, n=n, ns=n, uv=jnp.stack([u, v]), dp_du=dp_du, dp_dv=dp_dv, dn_du=jnp.zeros_like(n), dn_dv=jnp.zeros_like(n),
+        status=jnp.full((), int(Status.HIT), jnp.int32), object=jnp.full((), number, jnp.int32), t=zero, p=p, n=n, ns=n,
+        uv=jnp.stack([u, v]), dp_du=dp_du, dp_dv=dp_dv, dn_du=jnp.zeros_like(n), dn_dv=jnp.zeros_like(n),
         cell=jnp.stack([side, none]), triangle=none, side=jnp.where(faces, 1, -1).astype(jnp.int32),
-        steps=none if count_steps else None,
     )  # fmt: skip
