@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.boundary import guiding, sample
+from jaxhf.boundary import fold, guiding, outline, sample
 from jaxhf.core import affine, autodiff, masked
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import localise
 from jaxhf.shade import lighting, radiance
-from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, skyline, world as trace_world
+from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, skirt, skyline, world as trace_world
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
@@ -119,6 +119,7 @@ TEXTURE = jaxhf.Matte(jaxhf.ImageTexture(np.ones((2, 2, 3))))
 TILTED = np.array([[1, 0, 0, 0.1], [0, 1, 0.2, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 SMOOTH = jaxhf.Settings(shading="smooth", shadows=False)
 DEPTH = Case(scene(), aovs=("depth",))
+EDGES = Case(scene(), jaxhf.Settings(shading="flat", shadows=False, edge_samples=64))
 
 # feature: the baseline without it, the same with it, and the changes that make its code fail
 FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
@@ -137,6 +138,11 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
         "plain",
         Case(scene(jaxhf.Object(jaxhf.Cylinder()))),
         [fails_everywhere(cylinder.make_tube), fails_everywhere(cylinder.tube_distance), recognised(intersect, "Tube")],
+    ),
+    "skirt": (
+        "edges",
+        Case(scene(jaxhf.Object(jaxhf.Skirt.of(FIELD, -1))), EDGES.settings),
+        [fails_everywhere(function) for function in (skirt.make_walls, skirt.hit_on_side, outline.faces_of, fold._with_walls)],
     ),
     "second heightfield": (
         "smooth",
@@ -176,7 +182,7 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
     ),
     "edge samples": (
         "plain",
-        Case(scene(), jaxhf.Settings(shading="flat", shadows=False, edge_samples=64)),
+        EDGES,
         [fails_everywhere(sample.draw), fails_everywhere(guiding.initial_weights), fails_everywhere(autodiff.with_tangent)],
     ),
     "AOVs": ("plain", DEPTH, [fails_everywhere(rendering_aovs.observe)]),
@@ -199,7 +205,7 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
 }
 
 
-BASELINES = {"plain": PLAIN, "smooth": Case(scene(), SMOOTH), "depth": DEPTH}
+BASELINES = {"plain": PLAIN, "smooth": Case(scene(), SMOOTH), "depth": DEPTH, "edges": EDGES}
 
 
 @functools.cache
