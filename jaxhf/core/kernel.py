@@ -74,12 +74,12 @@ def _bound(primitive: Primitive, fun: _Function, args: Any, **params: Any) -> An
     return jax.tree.unflatten(jax.tree.structure(shapes), primitive.bind(*leaves, jaxpr=jaxpr, **params))
 
 
-def _batched_together(leaves: Any, axes: Any, *, jaxpr: ClosedJaxpr) -> tuple[list[jax.Array], list[int]]:
+def _batched_together(leaves: Any, axes: Any, *, jaxpr: ClosedJaxpr) -> tuple[list[Any], list[int]]:
     results = one_kernel(jax.vmap(jaxpr_as_fun(jaxpr), in_axes=tuple(axes)), *leaves)
     return results, [0] * len(results)
 
 
-def _batched_in_turn(leaves: Any, axes: Any, **params: Any) -> tuple[list[jax.Array], list[int]]:
+def _batched_in_turn(leaves: Any, axes: Any, **params: Any) -> tuple[list[Any], list[int]]:
     many = [axis is not None for axis in axes]
     moved = [jnp.moveaxis(leaf, axis, 0) for leaf, axis in zip(leaves, axes, strict=True) if axis is not None]
     results = lax.map(lambda own: _in_turn.bind(*_merged(many, own, leaves), **params), moved)
@@ -93,13 +93,13 @@ def _differentiated(
     *,
     jaxpr: ClosedJaxpr,
     derivative_of: _Function | None = None,
-) -> tuple[list[jax.Array], list[Any]]:
+) -> tuple[list[Any], list[Any]]:
     """The value and the tangent. What the linearised function stores of its arguments as they are does not leave the call."""
     moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
     fun = derivative_of or jaxpr_as_fun(jaxpr)
     forms: list[Any] = []
 
-    def linearised(*leaves: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+    def linearised(*leaves: Any) -> tuple[list[Any], list[Any]]:
         moved = (leaf for leaf, moves in zip(leaves, moving, strict=True) if moves)
         values, linear = jax.linearize(lambda *moved: jax.tree.leaves(fun(*_merged(moving, moved, leaves))), *moved)
         stored, structure = jax.tree.flatten(linear)
@@ -114,21 +114,21 @@ def _differentiated(
     return values, linear(*(tangent for tangent, moves in zip(tangents, moving, strict=True) if moves))
 
 
-def _merged(chosen: list[bool], own: Any, others: Any) -> list[jax.Array]:
+def _merged(chosen: list[bool], own: Any, others: Any) -> list[Any]:
     """Where chosen, the next of `own`, elsewhere the one of `others` in that place."""
     following = iter(own)
     return [next(following) if take else other for take, other in zip(chosen, others, strict=True)]
 
 
-def _called(*leaves: Any, jaxpr: ClosedJaxpr, **_: Any) -> list[jax.Array]:
+def _called(*leaves: Any, jaxpr: ClosedJaxpr, **_: Any) -> list[Any]:
     return jaxpr_as_fun(jaxpr)(*leaves)
 
 
-def _called_between_barriers(*leaves: jax.Array, jaxpr: ClosedJaxpr) -> list[jax.Array]:
+def _called_between_barriers(*leaves: Any, jaxpr: ClosedJaxpr) -> list[Any]:
     """XLA 0.10 ends the process where a small call does not use an argument, also where that is a constant, which it moves into
     the call. So a number of each argument is returned besides, and barriers hide what the arguments are."""
 
-    def with_uses(*leaves: jax.Array) -> tuple[list[jax.Array], jax.Array]:
+    def with_uses(*leaves: Any) -> tuple[list[Any], jax.Array]:
         return _called(*leaves, jaxpr=jaxpr), jnp.stack([leaf.reshape(-1)[0].astype(jnp.float32) for leaf in leaves])
 
     return lax.optimization_barrier(jax.jit(with_uses)(*lax.optimization_barrier(leaves)))[0]

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.boundary import guiding, sample
+from jaxhf.boundary import fold, guiding, outline, sample
 from jaxhf.core import affine, autodiff, masked
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import localise
 from jaxhf.shade import lighting, radiance
-from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, skyline, world as trace_world
+from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, skirt, skyline, world as trace_world
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
@@ -127,6 +127,7 @@ TILTED = np.array([[1, 0, 0, 0.1], [0, 1, 0.2, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 SMOOTH = jaxhf.Settings(shading="smooth", shadows=False)
 DEPTH = Case(scene(), aovs=("depth",))
 POINTS = jaxhf.Settings(shading="flat", shadows=False, edge_samples=64)
+EDGES = Case(scene(), POINTS, differentiated=True)
 
 # feature: the baseline without it, the same with it, and the changes that make its code fail
 FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
@@ -145,6 +146,11 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
         "plain",
         Case(scene(jaxhf.Object(jaxhf.Cylinder()))),
         [fails_everywhere(cylinder.make_tube), fails_everywhere(cylinder.tube_distance), recognised(intersect, "Tube")],
+    ),
+    "skirt": (
+        "edges",
+        Case(scene(jaxhf.Object(jaxhf.Skirt.of(FIELD, -1))), POINTS, differentiated=True),
+        [fails_everywhere(function) for function in (skirt.make_walls, skirt.hit_on_side, outline.faces_of, fold._with_walls)],
     ),
     "second heightfield": (
         "smooth",
@@ -184,7 +190,7 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
     ),
     "edge samples": (
         "differentiated",
-        Case(scene(), POINTS, differentiated=True),
+        EDGES,
         [fails_everywhere(sample.draw), fails_everywhere(guiding.initial_weights), fails_everywhere(autodiff.with_tangent)],
     ),
     "AOVs": ("plain", DEPTH, [fails_everywhere(rendering_aovs.observe)]),
@@ -212,6 +218,7 @@ BASELINES = {
     "smooth": Case(scene(), SMOOTH),
     "depth": DEPTH,
     "differentiated": Case(scene(), differentiated=True),
+    "edges": EDGES,
 }
 
 
