@@ -98,7 +98,9 @@ def test_a_surface_that_is_not_lamberts_is_a_suspect():
     with jax.enable_x64(False):
         for scene in scenes(heights, 3):
             _, found = jaxhf.render(scene, jaxhf.Settings(samples=16), aovs=("normal",))
-            towards = np.asarray(scene.lights[0].towards)
+            (sun,) = scene.lights
+            assert isinstance(sun, jaxhf.Directional)
+            towards = np.asarray(sun.towards)
             normal = np.asarray(found["normal"])
             incident, emitted = np.maximum(normal @ towards, 0) / np.linalg.norm(towards), np.maximum(normal[..., 2], 1e-6)
             image = 0.3 / np.pi * 2 * incident / (incident + emitted)
