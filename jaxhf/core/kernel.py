@@ -139,7 +139,7 @@ def _lower_as_kernel(context: Any, *leaves: Any, jaxpr: ClosedJaxpr) -> Any:
         return _lower(context, *leaves, jaxpr=jaxpr)
     results = mlir.lower_fun(_called_between_barriers, multiple_results=True)(context, *leaves, jaxpr=jaxpr)
     call = results[0].owner.operands[0].owner  # before the barrier
-    if _fits(call, context.module_context.symbol_table, set()):
+    if call.operation.name == "func.call" and _fits(call, context.module_context.symbol_table, set()):
         names = {"inlineable": "false", "xla_cpu_small_call": "true"}
         attributes: dict[str, Any] = {name: ir.StringAttr.get(value) for name, value in names.items()}
         call.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get(attributes)
