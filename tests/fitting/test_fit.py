@@ -77,7 +77,7 @@ def test_heights_come_back_from_a_flat_start(targets):
     assert found.heights.dtype == np.float64
     assert found.seen.all()
     assert found.std is None
-    assert lines == list(found.history)
+    assert [line._replace(to_come=None) for line in lines] == list(found.history)
     assert found.stats["steps"] == len(lines) == lines[-1].step
     assert lines[-1].loss == found.stats["loss"] < 1e-6 * lines[0].loss
     for image, residual, target in zip(found.images, found.residuals, targets, strict=True):
@@ -300,7 +300,7 @@ def test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption(targets
     with pytest.raises(KeyboardInterrupt):
         jaxhf.fit(scenes(), targets, checkpoint=tmp_path / "kept", progress=interrupt, **OPTIONS)
     resumed = jaxhf.fit(scenes(), targets, checkpoint=tmp_path / "kept", resume=True, **OPTIONS)
-    assert [step[:-1] for step in resumed.history] == [step[:-1] for step in whole.history]
+    assert [step[:-2] for step in resumed.history] == [step[:-2] for step in whole.history]  # but for their time
     np.testing.assert_array_equal(resumed.heights, whole.heights)
 
 

@@ -143,7 +143,7 @@ def brightness(scene: jaxhf.Scene, edge_samples: int = 0) -> jax.Array:
     return jnp.sum(image * jnp.asarray(weights(), image.dtype)) / 100
 
 
-@pytest.mark.parametrize("kind", CAMERAS)
+@pytest.mark.parametrize("kind", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
 def test_pictures(kind):
     for name, change in PICTURES.items():
         print(kind, name)

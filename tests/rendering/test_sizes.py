@@ -12,8 +12,9 @@ import pytest
 import jaxhf
 from jaxhf.cli.main import main
 
-THIN = [(2, 2), (2, 2050), (2050, 2), (1025, 3)]
-LARGE = [(1023, 1023), (1024, 1024), (1201, 1201), (700, 1800), (2049, 2049)]
+THIN = (2, 2050)
+OTHERS = [(2, 2), (2050, 2), (1025, 3), (1023, 1023), (1024, 1024), (1201, 1201), (700, 1800), (2049, 2049)]
+SIZES = [THIN, *(pytest.param(shape, marks=pytest.mark.slow) for shape in OTHERS)]
 
 
 def heights(ny: int, nx: int) -> np.ndarray:
@@ -34,7 +35,7 @@ def block(z: np.ndarray) -> jaxhf.Scene:
     return jaxhf.Scene(objects, camera, [jaxhf.Directional.from_angles(225, 35)])
 
 
-@pytest.mark.parametrize("shape", [(2, 2), (2, 2050), *(pytest.param(shape, marks=pytest.mark.slow) for shape in LARGE)])
+@pytest.mark.parametrize("shape", SIZES)
 def test_pictures_and_gradients(shape):
     """Those of one's own program are those of `render`, and of its derivative; all have a finite one."""
     scene = block(heights(*shape))
@@ -54,7 +55,7 @@ def test_pictures_and_gradients(shape):
     assert np.abs(gradient[known]).max() > 0
 
 
-@pytest.mark.parametrize("shape", [*THIN, *(pytest.param(shape, marks=pytest.mark.slow) for shape in LARGE)])
+@pytest.mark.parametrize("shape", SIZES)
 def test_rays_and_maps(shape):
     z = heights(*shape)
     ny, nx = shape
@@ -82,7 +83,7 @@ def test_rays_and_maps(shape):
     np.testing.assert_array_equal(np.isnan(maps[4]), np.isnan(z))
 
 
-@pytest.mark.parametrize("shape", [(2, 2), (2, 2050), *(pytest.param(shape, marks=pytest.mark.slow) for shape in LARGE)])
+@pytest.mark.parametrize("shape", SIZES)
 def test_commands(shape, tmp_path, monkeypatch):
     """`view` of 1024 x 1024 heights and more ended in a traceback, for a sum of XLA's library within a kernel."""
     monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)  # JAX is set up already

@@ -50,7 +50,7 @@ def test_hits_are_where_rays_in_double_precision_meet_the_ground(kind, away):
     np.testing.assert_allclose(found.t, expected.t, rtol=3e-7)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [KINDS[0], pytest.param(KINDS[1], marks=pytest.mark.slow)])
 def test_depth_and_its_derivative_where_heights_are_traced(kind):
     def depths(made):
         _, aovs = jaxhf.render(made, aovs=("depth",))
@@ -65,7 +65,7 @@ def test_depth_and_its_derivative_where_heights_are_traced(kind):
     assert np.abs(slopes[1]).sum() > 500  # each of the hits moves by about 1
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [KINDS[0], pytest.param(KINDS[1], marks=pytest.mark.slow)])
 @pytest.mark.parametrize("tall", [30.0, 1e5, 3e6])
 def test_nothing_is_lost_in_front_of_the_ground(kind, tall):
     """Peaks that reach towards the camera, and beyond it; walls; a second terrain on the way, which is turned and larger."""
