@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +60,26 @@ def prepared(heights: np.ndarray, camera: str) -> Callable[[], object]:
     """Without the normals and bounds of the heights, as Mitsuba's frame."""
     ready = jaxhf.prepare(scene(heights, camera))
     return lambda: jax.block_until_ready(jaxhf.render(ready))
+
+
+def inside(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]:
+    """Pictures of given heights within programs of one's own."""
+    base, one = scene(heights, camera), jnp.asarray(heights)
+    four = jnp.stack([one] * 4)
+
+    def picture(heights: jax.Array) -> jax.Array:
+        return jaxhf.render(base.with_heights(heights))
+
+    def timed(fun: Callable[[jax.Array], jax.Array], argument: jax.Array, **options: Any) -> Callable[[], object]:
+        compiled = jax.jit(fun, **options)
+        return lambda: jax.block_until_ready(compiled(argument))
+
+    return {
+        "in jit": timed(picture, one),
+        "in jit, with compiler_options": timed(picture, one, compiler_options=jaxhf.compiler_options()),
+        "four in scan": timed(lambda four: jax.lax.map(picture, four), four),
+        "four in vmap": timed(jax.vmap(picture), four),
+    }
 
 
 def shadow_rays(heights: np.ndarray, camera: str) -> tuple[float, float]:
@@ -117,6 +138,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="cores that share the work")
     parser.add_argument("--fixed", action="store_true", help="without early exit, also with a budget of 64 steps")
+    parser.add_argument("--inside", action="store_true", help="also within jit, scan and vmap")
     parser.add_argument("--mitsuba", action="store_true")
     parser.add_argument("--embree", action="store_true", help="with embreex, and shading in NumPy")
     parser.add_argument("--povray", action="store_true", help="what povray says of itself, after the others")
@@ -135,6 +157,8 @@ def main() -> None:
                 variants["64 steps"] = ours(heights, camera, jaxhf.Settings(max_steps=64))
                 variants["no early exit, 64 steps"] = ours(heights, camera, jaxhf.Settings(early_exit=False, max_steps=64))
                 variants["no early exit"] = ours(heights, camera, jaxhf.Settings(early_exit=False))
+            if options.inside:
+                variants |= inside(heights, camera)
             if options.mitsuba:
                 variants |= mitsuba(heights, camera)
             if options.embree:
