@@ -52,7 +52,7 @@ def in_turn(fun: _Function, *args: Any, derivative_of: _Function | None = None) 
       args: pytrees of arrays.
       derivative_of: a function of the same values, up to rounding, which stands for `fun` wherever that is differentiated.
     """
-    return _bound(_in_turn, fun, args, derivative_of=derivative_of)
+    return _bound(_in_turn, fun, args, derivative_of)
 
 
 def traced_once(fun: _Function) -> _Function:
@@ -63,18 +63,18 @@ def traced_once(fun: _Function) -> _Function:
 _kernel, _in_turn = Primitive("kernel"), Primitive("in_turn")
 
 
-def _bound(primitive: Primitive, fun: _Function, args: Any, **params: Any) -> Any:
+def _bound(primitive: Primitive, fun: _Function, args: Any, derivative_of: _Function | None = None) -> Any:
     leaves, structure = jax.tree.flatten(args)
 
     def flat(fun: _Function) -> _Function:
         return lambda *leaves: fun(*jax.tree.unflatten(structure, leaves))
 
-    params = {name: None if value is None else flat(value) for name, value in params.items()}
+    other = None if derivative_of is None else flat(derivative_of)
     jaxpr, shapes = jax.make_jaxpr(flat(fun), return_shape=True)(*leaves)
-    return jax.tree.unflatten(jax.tree.structure(shapes), primitive.bind(*leaves, jaxpr=jaxpr, **params))
+    return jax.tree.unflatten(jax.tree.structure(shapes), primitive.bind(*leaves, jaxpr=jaxpr, derivative_of=other))
 
 
-def _batched_together(leaves: Any, axes: Any, *, jaxpr: ClosedJaxpr) -> tuple[list[Any], list[int]]:
+def _batched_together(leaves: Any, axes: Any, *, jaxpr: ClosedJaxpr, **_: Any) -> tuple[list[Any], list[int]]:
     results = one_kernel(jax.vmap(jaxpr_as_fun(jaxpr), in_axes=tuple(axes)), *leaves)
     return results, [0] * len(results)
 
@@ -92,7 +92,7 @@ def _differentiated(
     tangents: Any,
     *,
     jaxpr: ClosedJaxpr,
-    derivative_of: _Function | None = None,
+    derivative_of: _Function | None,
 ) -> tuple[list[Any], list[Any]]:
     """The value and the tangent. What the linearised function stores of its arguments as they are does not leave the call."""
     moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
@@ -107,7 +107,7 @@ def _differentiated(
         forms.append((structure, places))
         return values, [value for value, place in zip(stored, places, strict=True) if place is None]
 
-    values, own = _bound(primitive, linearised, primals, **({} if primitive is _kernel else {"derivative_of": None}))
+    values, own = _bound(primitive, linearised, primals)
     structure, places = forms[-1]
     stored = iter(own)
     linear = jax.tree.unflatten(structure, [next(stored) if place is None else primals[place] for place in places])
@@ -134,7 +134,7 @@ def _called_between_barriers(*leaves: Any, jaxpr: ClosedJaxpr) -> list[Any]:
     return lax.optimization_barrier(jax.jit(with_uses)(*lax.optimization_barrier(leaves)))[0]
 
 
-def _lower_as_kernel(context: Any, *leaves: Any, jaxpr: ClosedJaxpr) -> Any:
+def _lower_as_kernel(context: Any, *leaves: Any, jaxpr: ClosedJaxpr, **_: Any) -> Any:
     if not all(math.prod(aval.shape) for aval in jaxpr.in_avals):
         return _lower(context, *leaves, jaxpr=jaxpr)
     results = mlir.lower_fun(_called_between_barriers, multiple_results=True)(context, *leaves, jaxpr=jaxpr)
