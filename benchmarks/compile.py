@@ -87,10 +87,10 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
         state = solvers.init_state(solver, unknowns, known)
         return arrays_only(solvers._advance, solver, unknowns, state, known)
     if name == "frame":
-        from jaxhf.core.devices import local_mesh, on_every_device
         from jaxhf.rendering import render
         from jaxhf.scene.localise import localise
         from jaxhf.trace.world import resolve_settings
+        from jaxhf.xla.devices import local_mesh, on_every_device
 
         scene, mesh = make_scene(heights, 512), local_mesh(1)
         resolved, local = resolve_settings(jaxhf.Settings(), scene), on_every_device(localise(scene), mesh)

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxhf.core.machine import available_bytes, peak_mb
 from jaxhf.study.worker import Answers, MeasurementError, Worker, timed
+from jaxhf.xla.machine import available_bytes, peak_mb
 
 BASE = {"heights": 1024, "pixels": 512, "samples": 1, "images": 1}
 UNITS = {"heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores"}

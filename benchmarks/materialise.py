@@ -9,11 +9,11 @@ import jax
 from forward import report, scene, terrain
 
 import jaxhf
-from jaxhf.core.devices import local_mesh
-from jaxhf.core.materialise import materialise
 from jaxhf.rendering import render as rendering
 from jaxhf.scene.localise import localise
 from jaxhf.trace.world import resolve_settings
+from jaxhf.xla.devices import local_mesh
+from jaxhf.xla.materialise import materialise
 
 FORMS: dict[str, Callable] = {
     "materialise": materialise,

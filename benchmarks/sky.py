@@ -20,7 +20,7 @@ import numpy as np
 from scipy.ndimage import zoom
 
 import jaxhf
-from jaxhf.core.machine import default_devices
+from jaxhf.xla.machine import default_devices
 
 AZIMUTHS = 32
 PEER = """

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from seeds import SCENES
 
-from jaxhf.core.machine import peak_mb
 from jaxhf.study.worker import Answers, Worker, timed
+from jaxhf.xla.machine import peak_mb
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "pyramid, triangles on demand, normals of six, smooth": {},

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from PIL import Image, ImageSequence
 
-from jaxhf.core.machine import available_bytes
+from jaxhf.xla.machine import available_bytes
 
 DOCS = Path(__file__).resolve().parent
 MOST = 250_000  # bytes of one picture

@@ -1,5 +1,4 @@
 from . import mujoco as mujoco
-from .core.compilation import compiler_options as compiler_options
 from .core.errors import ArgumentError as ArgumentError
 from .core.settings import Settings as Settings
 from .core.version import __version__ as __version__
@@ -36,3 +35,4 @@ from .scene.texture import ImageTexture as ImageTexture
 from .trace.hit import Hit as Hit
 from .trace.normals import vertex_normals as vertex_normals
 from .trace.status import Status as Status
+from .xla.compilation import compiler_options as compiler_options

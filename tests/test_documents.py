@@ -22,8 +22,8 @@ from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 
 import jaxhf
 from jaxhf.cli.main import main
-from jaxhf.core.machine import available_bytes
 from jaxhf.io.toml.fit import load_case
+from jaxhf.xla.machine import available_bytes
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, largest_component, unit
@@ -19,6 +18,7 @@ from ..trace.intersect import intersect
 from ..trace.skirt import Walls
 from ..trace.status import Status
 from ..trace.world import World, nearest_hit, no_hit
+from ..xla.materialise import materialise
 from .outline import UPWARDS, along_edge, column_of, faces_of, is_alone, outwards
 from .sample import BoundarySample, between_ends, on_edge
 from .silhouette import whole_cells

@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..core.masked import only_where
-from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
 from ..core.vector import dot
@@ -22,6 +20,8 @@ from ..trace.intersect import hit_on_triangle
 from ..trace.skirt import hit_on_side
 from ..trace.status import Status
 from ..trace.world import World, no_hit
+from ..xla.masked import only_where
+from ..xla.materialise import materialise
 from .fold import Fold, Probe, fold_at, meet, probe, probe_beyond, probe_source, skirts, towards
 from .sample import BoundarySample, picture_point
 

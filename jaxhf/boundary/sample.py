@@ -20,7 +20,6 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from ..core.affine import affine
-from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
@@ -32,6 +31,7 @@ from ..trace.grid import Grid
 from ..trace.skirt import Walls, wall_distance
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
 from ..trace.world import World
+from ..xla.materialise import materialise
 from .guiding import GuidingDistribution, edge_sets
 from .outline import along_edge
 from .silhouette import STEPS, framed_part

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float
 
-from ..core.materialise import materialise
 from ..core.types import Vector
 from ..scene.camera import Camera
 from ..trace.grid import Grid
+from ..xla.materialise import materialise
 
 # From an edge's first vertex to its second.
 STEPS = ((1, 0), (0, 1), (1, 1))

@@ -16,13 +16,13 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
-from ..core.devices import map_over
-from ..core.kernel import one_kernel, traced_once
-from ..core.materialise import materialise
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..trace.search import PART
 from ..trace.world import World
+from ..xla.devices import map_over
+from ..xla.kernel import one_kernel, traced_once
+from ..xla.materialise import materialise
 from .guiding import GuidingDistribution, initial_weights, make_distribution, refined_weights
 from .jump import boundary_segment, pass_edge, radiance_jump
 from .sample import BoundarySample, draw, picture_point

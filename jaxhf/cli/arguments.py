@@ -111,7 +111,7 @@ def set_up_jax(options: argparse.Namespace) -> None:
     """Configures JAX by the options of `add_machine`, which can only be done before its first use."""
     import jax
 
-    from ..core.machine import default_devices
+    from ..xla.machine import default_devices
     from .cache import keep_programs
     from .limits import require_devices
 

@@ -26,7 +26,7 @@ def keep_programs(wanted: bool) -> None:
     """
     import jax
 
-    from ..core.kept import keep_in
+    from ..xla.kept import keep_in
 
     if not wanted:
         jax.config.update("jax_enable_compilation_cache", False)

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from ..core.errors import UserError, counted
-from ..core.machine import available_bytes, default_devices, usable_cores
+from ..xla.machine import available_bytes, default_devices, usable_cores
 
 if TYPE_CHECKING:
     from ..scene.scene import Scene

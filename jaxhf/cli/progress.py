@@ -122,7 +122,7 @@ class CompileTime:
     def __init__(self) -> None:
         import jax
 
-        from ..core.kept import LOADED
+        from ..xla.kept import LOADED
 
         self.seconds, self.events = 0.0, ("/jax/core/compile/", LOADED)
         jax.monitoring.register_event_duration_secs_listener(self._add)

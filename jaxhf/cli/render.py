@@ -77,9 +77,9 @@ def _timed_render(
     import jax
     import numpy as np
 
-    from ..core.devices import local_mesh
     from ..rendering.render import render
     from ..trace.world import resolve_settings
+    from ..xla.devices import local_mesh
     from .limits import require_memory, worthwhile_devices
     from .progress import CompileTime, compiled_bar
 

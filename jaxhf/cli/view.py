@@ -223,8 +223,8 @@ class _Stage:
         return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(self.terrain, self.options.ramp)]
 
     def _scene(self, field: "Heightfield", camera: "Perspective", look: "Look") -> "Scene":
-        from ..core.devices import local_mesh
         from ..rendering.view import block
+        from ..xla.devices import local_mesh
         from .limits import require_memory
 
         scene = block(field, self.colours, camera, look, self.base)

@@ -1,1 +1,1 @@
-"""What every stage needs: types, settings, vectors, frames, devices, and how programs are kept small."""
+"""What every stage needs: types, settings, vectors, frames; plain arithmetic."""

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 import equinox as eqx
 
 from ..boundary.guiding import boundary_length
-from ..core.compilation import compiled
 from ..core.settings import Settings
 from ..core.types import Scalar
 from ..scene.scene import Scene
 from ..trace.world import make_world, resolve_settings
+from ..xla.compilation import compiled
 from .linearise import can_be_linearised
 
 _SAMPLES = 4  # a pixel, at least

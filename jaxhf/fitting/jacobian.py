@@ -22,13 +22,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..boundary.term import resampled_side
-from ..core.compilation import compiled
-from ..core.devices import on_every_device
 from ..rendering.samples import PictureSamples
 from ..rendering.tiles import Tiling
 from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
 from ..trace.world import make_world
+from ..xla.compilation import compiled
+from ..xla.devices import on_every_device
 from .basis import Unknowns
 from .groups import Group
 from .linearise import Linearised, vertex_values

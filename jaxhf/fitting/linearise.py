@@ -22,9 +22,6 @@ from ..boundary.guiding import edge_sets
 from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
 from ..boundary.term import Packed, draw_boundaries
 from ..core.autodiff import with_tangent
-from ..core.devices import map_over, on_every_device
-from ..core.kernel import one_kernel
-from ..core.materialise import materialise
 from ..core.settings import Settings
 from ..core.types import Flag
 from ..rendering.samples import PictureSamples
@@ -36,6 +33,9 @@ from ..trace.grid import Grid
 from ..trace.hit import Hit
 from ..trace.triangle import Corners, triangle_vertices
 from ..trace.world import World, make_world
+from ..xla.devices import map_over, on_every_device
+from ..xla.kernel import one_kernel
+from ..xla.materialise import materialise
 from .view import KNOWN, View, motion, moved
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.

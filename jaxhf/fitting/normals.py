@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.compilation import compiled
 from ..core.types import AnyArray
 from ..scene.heightfield import Heightfield
 from ..trace.normals import vertex_normals
+from ..xla.compilation import compiled
 from .jacobian import group_by_vertices, in_rows
 from .problem import Problem
 

@@ -12,7 +12,6 @@ import numpy as np
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
-from ..core.devices import local_mesh
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..core.types import Flag
@@ -20,6 +19,7 @@ from ..scene.light import Sky
 from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
+from ..xla.devices import local_mesh
 from .basis import Basis, Unknowns, make_basis, make_heights, pad
 from .defaults import choose_edge_samples, choose_samples
 from .groups import Group, make_groups, require_scenes

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from ..core.compilation import compiled
-from ..core.devices import on_every_device
 from ..rendering.render import render_each
 from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
+from ..xla.compilation import compiled
+from ..xla.devices import on_every_device
 from .basis import Basis, Unknowns
 from .groups import Group
 from .linearise import Linearised, linearise_each, picture_each

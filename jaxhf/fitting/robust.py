@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..core.compilation import compiled
 from ..core.types import AnyArray
+from ..xla.compilation import compiled
 
 
 def soften(residual: Array, loss: str, scale: Float[Array, ""] | None) -> Array:

@@ -12,8 +12,8 @@ import optax
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from ..core.devices import on_every_device
 from ..core.types import Flag, Scalar
+from ..xla.devices import on_every_device
 from .basis import Unknowns
 from .options import FitOptions
 from .problem import Problem

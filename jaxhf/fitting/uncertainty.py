@@ -16,8 +16,8 @@ import scipy.optimize
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from ..core.devices import on_every_device
 from ..core.errors import ArgumentError
+from ..xla.devices import on_every_device
 from .basis import Unknowns
 from .history import Draws
 from .jacobian import in_rows

@@ -12,8 +12,6 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..core.compilation import compiled
-from ..core.devices import chosen_mesh, on_every_device
 from ..core.errors import ArgumentError, require_progress
 from ..io.terrain import Terrain
 from ..scene.heightfield import Heightfield
@@ -29,6 +27,8 @@ from ..trace.horizon import (
     tile_count,
 )
 from ..trace.normals import vertex_normals
+from ..xla.compilation import compiled
+from ..xla.devices import chosen_mesh, on_every_device
 from .surface import both_spacings, spacing
 
 

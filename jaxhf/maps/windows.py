@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float32
 
-from ..core.machine import usable_cores
+from ..xla.machine import usable_cores
 
 Job = TypeVar("Job")
 # Nine views of the same shape: north-west, north, north-east, west, centre, east, south-west, south, south-east.

@@ -12,9 +12,7 @@ from jaxtyping import Float
 
 from ..core.affine import Affine
 from ..core.autodiff import stored
-from ..core.compilation import compiled
 from ..core.errors import ArgumentError, require_kind
-from ..core.materialise import apart, materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import finite, quotient, unit
@@ -25,6 +23,8 @@ from ..trace.search import first_triangle
 from ..trace.status import Status
 from ..trace.triangle import plane_through, triangle_corners
 from ..trace.walk import WalkResult
+from ..xla.compilation import compiled
+from ..xla.materialise import apart, materialise
 from .hfield import HField, as_numbers, search_grid
 from .pose import pose
 from .solid import Ground, Side, base_faces, column, ground, walls

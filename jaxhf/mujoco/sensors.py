@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.compilation import compiled
 from ..core.errors import ArgumentError, require_kind, whole_number
 from ..scene.camera import require_size
+from ..xla.compilation import compiled
 from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import rotation
 from .ray import first_met

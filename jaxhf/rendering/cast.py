@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.compilation import compiled
 from ..core.errors import ArgumentError, UserError, require_kind
 from ..core.ray import Ray
 from ..core.settings import Settings
@@ -23,6 +22,7 @@ from ..trace.grid import Grid, joined
 from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
 from ..trace.world import World, first_hit, make_world, resolve_settings
+from ..xla.compilation import compiled
 from .chunks import trace_batch, trace_chunks
 from .render import Prepared, PreparedHeightfield, heightfield_grid
 

@@ -18,11 +18,7 @@ from jaxtyping import Float
 from ..boundary.guiding import edge_sets
 from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
-from ..core.compilation import compiled, is_traced
-from ..core.devices import chosen_mesh, map_over, on_every_device
 from ..core.errors import UserError, require_kind, require_progress
-from ..core.kernel import in_turn, one_kernel
-from ..core.materialise import unfolded
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
@@ -31,6 +27,10 @@ from ..scene.localise import localise, localise_camera
 from ..scene.scene import Scene
 from ..trace.grid import Grid
 from ..trace.world import World, make_ceilings, make_surface, make_world, resolve_settings
+from ..xla.compilation import compiled, is_traced
+from ..xla.devices import chosen_mesh, map_over, on_every_device
+from ..xla.kernel import in_turn, one_kernel
+from ..xla.materialise import unfolded
 from .aovs import known_aovs
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, trace_tiles

@@ -10,14 +10,14 @@ from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from ..core.autodiff import recomputed
-from ..core.devices import map_over
-from ..core.kernel import one_kernel
-from ..core.materialise import materialise
 from ..core.sampling import sample_offset
 from ..core.settings import Settings
 from ..scene.camera import Camera
 from ..shade.radiance import radiance
 from ..trace.world import World
+from ..xla.devices import map_over
+from ..xla.kernel import one_kernel
+from ..xla.materialise import materialise
 from .aovs import observe
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from jax import lax
 
 from ..core.affine import affine, translate
-from ..core.compilation import compiled
+from ..xla.compilation import compiled
 from .camera import Camera
 from .heightfield import Heightfield
 from .light import Light, Point

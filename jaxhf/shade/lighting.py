@@ -8,7 +8,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float
 
-from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
@@ -22,6 +21,7 @@ from ..trace.skyline import skyline_slope
 from ..trace.triangle import triangle_corners
 from ..trace.walk_start import place_on_grid
 from ..trace.world import World, unblocked
+from ..xla.materialise import materialise
 
 # A cosine below this is rounded off; 0.6 degrees from the horizon of the shading normal.
 GRAZING = 0.01

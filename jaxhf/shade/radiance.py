@@ -6,7 +6,6 @@ from collections.abc import Iterable
 import jax.numpy as jnp
 from jax import lax
 
-from ..core.masked import only_where
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import Flag, Index, Vector
@@ -17,6 +16,7 @@ from ..scene.texture import ImageTexture
 from ..trace.hit import Hit
 from ..trace.status import Status
 from ..trace.world import World, first_hit, no_hit
+from ..xla.masked import only_where
 from .lighting import GRAZING, irradiance, unshadowed_irradiance
 
 

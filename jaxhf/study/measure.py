@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.compilation import compiled
-from ..core.machine import peak_mb
 from ..core.settings import Settings
 from ..fitting.fit import fit
 from ..io.files import reading, replacing
@@ -23,6 +21,8 @@ from ..scene.light import Directional
 from ..scene.material import Matte
 from ..scene.scene import Object, Scene
 from ..scene.views import from_above, resized, shrunk
+from ..xla.compilation import compiled
+from ..xla.machine import peak_mb
 from .plan import Configuration, Sweep
 from .worker import Answers, timed
 

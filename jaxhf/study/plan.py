@@ -13,7 +13,6 @@ import jax
 import numpy as np
 
 from ..core.errors import ArgumentError
-from ..core.machine import default_devices
 from ..core.settings import Settings
 from ..io.errors import FileError
 from ..io.files import PathLike, reading, save_text
@@ -23,6 +22,7 @@ from ..scene.material import Mirror
 from ..scene.scene import Scene
 from ..scene.views import resized
 from ..trace.world import resolve_settings
+from ..xla.machine import default_devices
 
 FINEST = 256  # samples a pixel of the picture's reference
 PIXELS = 480  # of a picture's longer side, at most, unless a width is given

@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator
 
 import numpy as np
 
-from ..core.machine import available_bytes
+from ..xla.machine import available_bytes
 from .measure import LEAST_SECONDS, prepare
 from .plan import Configuration, Sweep, changes
 from .worker import MeasurementError, Worker

@@ -19,8 +19,8 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
-from ..core.devices import local_mesh, map_over
 from ..core.types import Index, Scalar
+from ..xla.devices import local_mesh, map_over
 from .grid import Grid
 
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..core.autodiff import stored
-from ..core.masked import only_where
-from ..core.materialise import materialise
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Scalar, Vector
 from ..core.vector import dot, finite, largest_component, quotient, unit
+from ..xla.masked import only_where
+from ..xla.materialise import materialise
 from .cylinder import Tube, cylinder_hit, tube_distance
 from .grid import Grid, triangle_plane
 from .hit import Hit, orthogonal_tangents

@@ -13,9 +13,9 @@ from jax import lax
 from jaxtyping import Int, UInt32
 
 from ..core.errors import UserError
-from ..core.kernel import one_kernel
 from ..core.ray import Ray
 from ..core.types import MOST_PLACES, Flag, Index, Scalar
+from ..xla.kernel import one_kernel
 from .grid import Grid
 from .hit import Hit
 from .walk import Walk, WalkResult, walking

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..core.autodiff import stored
-from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import greater, lesser, quotient
+from ..xla.materialise import materialise
 from .grid import Grid, triangle_plane
 from .hit import Hit
 from .search import SKIPS, enough_steps

@@ -19,9 +19,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Bool, Float, UInt32
 
-from ..core.materialise import materialise
 from ..core.types import Flag, Index, Scalar
 from ..core.vector import FAR, greater, lesser
+from ..xla.materialise import materialise
 from .pyramid import Pyramid
 from .status import Status
 from .triangle import corners

@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
 from ..core.vector import FAR, finite, lesser
+from ..xla.materialise import materialise
 from .grid import Grid, triangle_plane
 from .hit import Hit
 from .walk import LEAVING, MISS, WALKING, Walk, reciprocal

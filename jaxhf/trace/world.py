@@ -11,8 +11,6 @@ from jaxtyping import Float
 
 from ..core.affine import affine
 from ..core.errors import require_kind
-from ..core.masked import only_where
-from ..core.materialise import materialise
 from ..core.ray import Ray
 from ..core.sampling import grid_side
 from ..core.settings import Settings
@@ -23,6 +21,8 @@ from ..scene.light import Directional, Light, Sun
 from ..scene.material import Material
 from ..scene.scene import Scene, Shape
 from ..scene.skirt import Skirt
+from ..xla.masked import only_where
+from ..xla.materialise import materialise
 from .ceiling import Ceiling, clears, make_ceiling
 from .cylinder import make_tube
 from .grid import Grid, make_grid

@@ -79,7 +79,7 @@ def configured(monkeypatch, tmp_path):
     """JAX's configuration as the command line would leave it; this run's own stays as it is."""
     values = {}
     monkeypatch.setattr("jax.config.update", values.__setitem__)
-    monkeypatch.setattr("jaxhf.core.kept.keep_in", lambda folder: values.update(kept=folder))
+    monkeypatch.setattr("jaxhf.xla.kept.keep_in", lambda folder: values.update(kept=folder))
     monkeypatch.setattr("warnings.showwarning", print)
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv("JAXHF_CACHE", str(tmp_path / "kept"))

@@ -18,7 +18,6 @@ import scipy.special
 
 import jaxhf
 from jaxhf.core.affine import rotate
-from jaxhf.core.devices import local_mesh
 from jaxhf.fitting import fit as _fit, loop as _loop, normal_equations as _normal_equations
 from jaxhf.fitting.basis import Unknowns, balanced_units, make_basis, resample
 from jaxhf.fitting.loop import FitLoop
@@ -31,6 +30,7 @@ from jaxhf.fitting.solvers import Outcome
 from jaxhf.fitting.view import differences
 from jaxhf.io.procedural import fractal
 from jaxhf.scene.localise import localise
+from jaxhf.xla.devices import local_mesh
 
 pytestmark = pytest.mark.unoptimised
 

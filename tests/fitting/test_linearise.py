@@ -11,7 +11,6 @@ import pytest
 
 import jaxhf
 from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
-from jaxhf.core.devices import local_mesh
 from jaxhf.fitting import linearise as _linearise
 from jaxhf.fitting.jacobian import picture_by_vertices, vertex_slopes, vertices_by_heights
 from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each, vertex_values
@@ -20,6 +19,7 @@ from jaxhf.rendering.samples import PictureSamples
 from jaxhf.scene.localise import localise
 from jaxhf.trace.grid import Grid
 from jaxhf.trace.world import make_world
+from jaxhf.xla.devices import local_mesh
 
 pytestmark = pytest.mark.unoptimised
 

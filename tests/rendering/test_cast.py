@@ -10,8 +10,8 @@ from compare import COUNT, DOWN, DTYPES, ROUGH, SLACK, assert_none, compare_with
 
 import jaxhf
 from jaxhf.core.affine import translate
-from jaxhf.core.compilation import compiler_options
 from jaxhf.rendering.cast import cast_camera
+from jaxhf.xla.compilation import compiler_options
 
 SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.core.compilation import compiler_options
+from jaxhf.xla.compilation import compiler_options
 
 Y, X = np.mgrid[0:9, 0:12].astype(float)
 RIDGES = 2 * np.abs(np.sin(0.9 * X + 0.3 * Y)) + 0.1 * Y  # walls of up to 60 degrees

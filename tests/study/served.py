@@ -5,7 +5,7 @@ import signal
 
 import jax
 
-from jaxhf.core.machine import peak_mb
+from jaxhf.xla.machine import peak_mb
 
 
 def prepare(job):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.core.kernel import in_turn, one_kernel
+from jaxhf.xla.kernel import in_turn, one_kernel
 
 SMALL_CALL = 'xla_cpu_small_call = "true"'
 

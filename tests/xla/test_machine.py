@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from jaxhf.core import machine
+from jaxhf.xla import machine
 
 GB = 10**9
 

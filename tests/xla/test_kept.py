@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxhf.core.compilation import compiled
-from jaxhf.core.kept import LOADED, Kept, keep_in
+from jaxhf.xla.compilation import compiled
+from jaxhf.xla.kept import LOADED, Kept, keep_in
 
 traced = []
 
@@ -59,7 +59,7 @@ def test_another_source_or_configuration_is_traced_again(folder, monkeypatch):
     call(np.arange(3.0))
     with jax.default_matmul_precision("float32"):
         call(np.arange(3.0))
-    monkeypatch.setattr("jaxhf.core.kept._source", lambda: b"another")
+    monkeypatch.setattr("jaxhf.xla.kept._source", lambda: b"another")
     call(np.arange(3.0))
     assert traced == [2, 2, 2]
 
@@ -70,7 +70,7 @@ def test_what_jax_has_kept_is_not_kept_again(folder, monkeypatch):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     try:
         for source in (b"old", b"new", b"new"):
-            monkeypatch.setattr("jaxhf.core.kept._source", lambda source=source: source)
+            monkeypatch.setattr("jaxhf.xla.kept._source", lambda source=source: source)
             call(np.arange(5.0))
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", before)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhf.core.materialise import materialise, unfolded
+from jaxhf.xla.materialise import materialise, unfolded
 
 
 def chain(x: jax.Array, keep=materialise) -> jax.Array:

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from ..core.types import Flag
 from .materialise import materialise
-from .types import Flag
 
 
 def only_where(needed: Flag, fun: Callable[..., Any], *args: Any, skips: bool = True) -> Any:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxhf.core.masked import only_where
+from jaxhf.xla.masked import only_where
 
 X = np.linspace(-1, 2, 7)
 

@@ -12,7 +12,7 @@ from jax import lax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 
-from .errors import require_kind
+from ..core.errors import require_kind
 
 
 @functools.cache

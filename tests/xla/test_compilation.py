@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxhf.core import compilation
-from jaxhf.core.compilation import compiled, compiler_options
+from jaxhf.xla import compilation
+from jaxhf.xla.compilation import compiled, compiler_options
 
 
 def test_options_are_used_at_the_top_level_alone():
@@ -60,7 +60,7 @@ def test_the_first_use_may_be_within_a_trace():
         "    return jaxhf.render(scene)\n"
         "z = np.zeros((3, 3), np.float32)\n"
         "inside = jax.jit(top)(z)\n"
-        "from jaxhf.core import compilation\n"
+        "from jaxhf.xla import compilation\n"
         "made = []\n"
         "options = compilation.compiler_options\n"
         "compilation.compiler_options = lambda newer: made.append(1) or options(newer)\n"

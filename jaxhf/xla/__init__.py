@@ -1,0 +1,1 @@
+"""How programs stay small and fast: what is done to JAX and XLA, and what the machine has."""
