@@ -19,7 +19,7 @@ _MOST = 500_000_000  # bytes; a picture's programs take 0.3 million
 def keep_programs(wanted: bool) -> None:
     """Lets JAX keep compiled programs in `programs_folder()`, unless the user has named a folder to JAX itself.
 
-    Where they cannot be kept a warning says so, no more.
+    Where they cannot be kept a warning says so, no more. In plain mode none are.
 
     Args:
       wanted: whether to keep any; if not, a folder that the user has named to JAX is not used either.
@@ -27,7 +27,10 @@ def keep_programs(wanted: bool) -> None:
     import jax
 
     from ..xla.kept import keep_in
+    from ..xla.plain import is_asked_for
 
+    if is_asked_for():
+        return
     if not wanted:
         jax.config.update("jax_enable_compilation_cache", False)
     asked_otherwise = not jax.config.values["jax_enable_compilation_cache"] or "JAX_COMPILATION_CACHE_DIR" in os.environ

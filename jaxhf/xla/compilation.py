@@ -4,14 +4,13 @@ import contextlib
 import functools
 import gc
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jaxlib.version
-from jax.extend.core import get_opaque_trace_state
 
 from .kept import Kept
+from .plain import insides
 
 _OPTIONS = {
     # XLA's older emitters of fused loops for the CPU. The newer ones go through MLIR: frames then compile for 1.7 times as
@@ -26,18 +25,10 @@ _OPTIONS = {
 }
 
 
-def _untraced(fun: Callable[[], Any]) -> Any:
-    """`fun()`, outside of whatever is being traced or transformed: that is the business of one thread."""
-    with ThreadPoolExecutor(1) as other:
-        return other.submit(fun).result()
-
-
-_TOP_LEVEL = _untraced(get_opaque_trace_state)  # this module may be imported in the midst of a user's `jax.jit`
-
-
 def is_traced() -> bool:
-    """Whether JAX is tracing or transforming what calls this."""
-    return get_opaque_trace_state() != _TOP_LEVEL
+    """Whether JAX is tracing or transforming what calls this; True in plain mode, which does not ask."""
+    module = insides()
+    return module is None or module.is_traced()
 
 
 @contextlib.contextmanager
@@ -57,15 +48,19 @@ def compiler_options(newer: bool = False) -> dict[str, Any] | None:
     """What `jax.jit` takes as `compiler_options`, so that a program of jaxhf's compiles and runs in less time.
 
     `newer` is for programs without rays, see `compiled`. Options that this version of XLA does not know are left out; None
-    where no other is left.
+    where no other is left, and in plain mode.
     """
+    if insides() is None:
+        return None
     options = {"xla_cpu_use_fusion_emitters": True} if newer else _OPTIONS
     return {name: value for name, value in options.items() if _is_known({name: value}) and _is_right(name)} or None
 
 
 def _is_known(option: dict[str, Any]) -> bool:
+    module = insides()
+    assert module is not None
     try:
-        _untraced(jax.jit(lambda: (), compiler_options=option))
+        module.untraced(jax.jit(lambda: (), compiler_options=option))
     except jax.errors.JaxRuntimeError:
         return False
     return True

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from jax.experimental.compilation_cache import compilation_cache
-from jax.experimental.serialize_executable import deserialize_and_load, serialize
+
+from .plain import insides
 
 LOADED = "/jaxhf/program_loaded"
 """JAX's monitoring is told under this name how long it took to load a program, in seconds."""
@@ -66,7 +66,9 @@ class Kept:
 
     def _program(self, form: Any, leaves: list[Any]) -> tuple[Callable[..., Any], Any]:
         """From the folder, or compiled and put there; with the structure of what it returns."""
+        module = insides()
         assert _folder is not None
+        assert module is not None
         name = f"{self.fun.__module__}.{self.fun.__qualname__}"
         known = repr((name, form, sorted(jax.config.values.items()), os.environ.get("XLA_FLAGS"), jax.devices()))
         path = _folder / f"{name}-{hashlib.sha256(known.encode() + _source()).hexdigest()[:32]}"
@@ -74,7 +76,7 @@ class Kept:
         try:
             stored, in_tree, out_tree, out, ids = pickle.loads(zlib.decompress(path.read_bytes()))  # with a checksum of zlib's
             devices = {device.id: device for device in jax.devices()}
-            program = deserialize_and_load(stored, in_tree, out_tree, execution_devices=[devices[k] for k in ids])
+            program = module.deserialize_and_load(stored, in_tree, out_tree, execution_devices=[devices[k] for k in ids])
             path.touch()  # the folder's owner may remove what was used longest ago
             jax.monitoring.record_event_duration_secs(LOADED, time.perf_counter() - begin)
             return program, jax.tree.structure(out)
@@ -91,13 +93,13 @@ class Kept:
             return returned
 
         flat.__name__ = self.fun.__name__
-        with _without_jax_cache():
+        with _without_jax_cache(module.compilation_cache.reset_cache):
             program = self.jit(flat).lower(*leaves).compile()
         out = jax.tree.unflatten(trees[0], range(trees[0].num_leaves))  # a structure with modules in it cannot be pickled
         part = path.with_suffix(f".{os.getpid()}")
         try:
             ids = [device.id for device in program.runtime_executable().local_devices()]
-            part.write_bytes(zlib.compress(pickle.dumps((*serialize(program), out, ids))))
+            part.write_bytes(zlib.compress(pickle.dumps((*module.serialize(program), out, ids))))
             part.replace(path)
         except Exception as error:  # no space, or a backend whose programs cannot be stored
             part.unlink(missing_ok=True)
@@ -113,16 +115,16 @@ class Kept:
 
 
 @contextmanager
-def _without_jax_cache() -> Iterator[None]:
+def _without_jax_cache(reset: Callable[[], None]) -> Iterator[None]:
     """A program out of JAX's cache could not be stored again: XLA leaves its kernels out, without an error."""
     before = jax.config.values["jax_enable_compilation_cache"]
     jax.config.update("jax_enable_compilation_cache", False)
-    compilation_cache.reset_cache()
+    reset()
     try:
         yield
     finally:
         jax.config.update("jax_enable_compilation_cache", before)
-        compilation_cache.reset_cache()
+        reset()
 
 
 @cache

@@ -7,10 +7,8 @@ import jax
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jax.extend.core import Primitive
-from jax.extend.mlir import ir
-from jax.extend.mlir.dialects import func
-from jax.interpreters import ad, batching, mlir
+
+from .plain import insides
 
 
 def materialise(tree: Any) -> Any:
@@ -22,7 +20,8 @@ def materialise(tree: Any) -> Any:
     of the stages a scene with three objects takes between a quarter and a ninth of the time
     (docs/measurements/experiments.md).
     """
-    return jax.tree.map(_in_memory.bind, tree)
+    module = insides()
+    return tree if module is None else jax.tree.map(module.in_memory.bind, tree)
 
 
 def apart(fun: Callable[..., Any], *args: Any) -> Any:
@@ -44,27 +43,3 @@ def unfolded(tree: Any) -> Any:
         return lax.optimization_barrier(leaf) if constant and leaf.size > large else leaf
 
     return jax.tree.map(hidden, tree)
-
-
-_in_memory = Primitive("in_memory")
-_in_memory.def_impl(lambda array: array)
-_in_memory.def_abstract_eval(lambda array: array)
-batching.defvectorized(_in_memory)
-ad.deflinear2(_in_memory, lambda cotangent, _: [_in_memory.bind(cotangent)])
-
-
-def _lower(context: Any, array: Any) -> Any:
-    """A call of a function that returns its argument; one function a type in each program."""
-    module, name = context.module_context, f"in_memory_{array.type}"
-    with ir.InsertionPoint(module.module.body):
-        identity = func.FuncOp(name, ([array.type], [array.type]), visibility="private")
-        module.symbol_table.insert(identity)
-        with ir.InsertionPoint(identity.add_entry_block()):
-            func.ReturnOp(identity.arguments)
-    call = func.CallOp([array.type], ir.FlatSymbolRefAttr.get(ir.StringAttr(identity.name).value), [array])
-    call.operation.attributes["mhlo.frontend_attributes"] = ir.DictAttr.get({"inlineable": ir.StringAttr.get("false")})
-    return call.results
-
-
-mlir.register_lowering(_in_memory, lambda context, array: [array])
-mlir.register_lowering(_in_memory, _lower, platform="cpu")
