@@ -88,7 +88,8 @@ def reader(request, tmp_path, monkeypatch) -> Iterator[None]:
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)  # this process is set up
     shutil.copytree(ROOT / "scenes", "scenes")
-    jax.config.update("jax_disable_most_optimizations", request.node.get_closest_marker("slow") is None)
+    long = any(request.node.get_closest_marker(name) for name in ("slow", "unoptimised"))
+    jax.config.update("jax_disable_most_optimizations", not long)
     with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
     jax.config.update("jax_disable_most_optimizations", False)
@@ -104,6 +105,14 @@ def test_blocks_run(name, reader):
             example.evaluate()
         except SkipTest as reason:
             print(f"{name}:{example.line}: skipped, {reason}")
+
+
+@pytest.mark.unoptimised(False)  # nearly all of the time goes into steps
+@pytest.mark.parametrize("name", sorted(name for name in LONG if "/tutorials/" in name))
+def test_first_command_of_a_long_tutorial_runs(name, reader):
+    """So that each run of the tests sees what a reader meets first; of other pages all blocks are run."""
+    next(example for example in SYBIL.parse(ROOT / name).examples() if example.region.evaluator is shell).evaluate()
+    assert Path("heights.npz").exists()
 
 
 def test_docstrings_have_examples_that_run(reader):
