@@ -15,11 +15,12 @@ import pytest
 
 import jaxhf
 from jaxhf.boundary import fold, guiding, outline, sample
-from jaxhf.core import affine, autodiff, masked
+from jaxhf.core import affine, autodiff
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import localise
 from jaxhf.shade import lighting, radiance
 from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, skirt, skyline, world as trace_world
+from jaxhf.xla import masked
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
 FIELD = jaxhf.Heightfield(np.random.default_rng(0).uniform(size=(5, 5)))
