@@ -161,7 +161,7 @@ def embree_frame(
         corners = faces[hits["primID"][met]]
         u, v = hits["u"][met, None], hits["v"][met, None]
         ns = normals[corners[:, 0]] * (1 - u - v) + normals[corners[:, 1]] * u + normals[corners[:, 2]] * v
-        cosine = np.abs(ns @ wi) / np.linalg.norm(ns, axis=1)
+        cosine = np.maximum(ns @ wi, 0) / np.linalg.norm(ns, axis=1)
         p = o[met] + (hits["tfar"][met, None] - 1e-5) * d[met]
         lit = (scene.run(p, sun[: len(met)], query="OCCLUDED") < 0) & (hits["Ng"][met] @ wi > 0)
         image = np.zeros(len(d), np.float32)

@@ -182,7 +182,7 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
     "smooth normals": (
         "plain",
         Case(scene(), SMOOTH),
-        [fails_everywhere(normals.vertex_normals), fails_everywhere(lighting.rounded_abs)],
+        [fails_everywhere(normals.vertex_normals), fails_everywhere(lighting.rounded_clamp)],
     ),
     "transform": (  # None is the identity, and nothing is inverted for it
         "plain",

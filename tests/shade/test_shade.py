@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.shade.lighting import rounded_abs
+from jaxhf.shade.lighting import rounded_clamp
 from jaxhf.shade.radiance import _reflect
 
 ROUNDING = 1e-12
@@ -293,40 +293,59 @@ def test_mirror_shows_a_wall():
     np.testing.assert_allclose(image, expected, rtol=ROUNDING)
 
 
-def test_no_black_holes():
-    """Where the triangle faces the light there is light, although some interpolated normals face away from it."""
+def test_a_shading_normal_has_a_dark_side():
+    """By hand at every pixel, with a light at the eye: also where the triangle faces it, its normals do not."""
     heights = np.random.default_rng(4).normal(0, 1.5, (5, 5))
     eye = np.array([-1.0, -2.0, 4.0])
     camera, d = perspective(eye, (2, 2, 0), fov=50, size=32)
     scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights, dx=1.0), jaxhf.Matte(1.0))], camera, [jaxhf.Point(eye, 20.0)])
-    image, aov = jaxhf.render(scene, aovs=("normal", "status"))
+    image, aov = jaxhf.render(scene, aovs=("normal", "status", "depth"))
     _, flat = jaxhf.render(scene, jaxhf.Settings(shading="flat", shadows=False), aovs=("normal",))
     met = np.asarray(aov["status"]) == jaxhf.Status.HIT
     n, ns = np.asarray(flat["normal"]), np.asarray(aov["normal"])
     side = -np.sign((n * d).sum(-1))
-    away = met & (side * (ns * -d).sum(-1) < 0)
-    assert away.sum() > 10
-    assert np.all(np.asarray(image)[met] > 0)  # the light is at the eye: what is seen faces it
+    cosine = side * (ns * -d).sum(-1)
+    rounded = np.where(abs(cosine) < 0.01, 25 * (cosine + 0.01) ** 2, np.maximum(cosine, 0))
+    with np.errstate(divide="ignore"):
+        expected = np.where(met, 20 / np.pi / np.asarray(aov["depth"]) ** 2 * rounded, 0)
+    np.testing.assert_allclose(np.asarray(image), np.broadcast_to(expected[..., None], image.shape), rtol=1e-9, atol=1e-15)
+    assert (met & (cosine < -0.01)).sum() > 10
+    assert (side[met] < 0).sum() > 10
     tangent = np.random.default_rng(5).normal(size=heights.shape)
     _, change = jax.jvp(lambda heights: jaxhf.render(scene.with_heights(heights)), (scene.heights,), (jnp.asarray(tangent),))
     assert np.isfinite(change).all()
-    assert np.all(np.abs(np.asarray(change)[away]).max(-1) > 0)
 
 
-def test_rounded_abs():
-    """|x| beyond 0.01; below, the parabola that continues it in value and in slope, 0.005 at zero."""
-    slope = jax.vmap(jax.grad(rounded_abs))
+@pytest.mark.parametrize(
+    ("side", "make"), [(1, jaxhf.Directional), (-1, jaxhf.Directional), (1, jaxhf.Sun)], ids=["above", "below", "sun"]
+)
+def test_coarse_cells_are_dark_beyond_the_terminator(side, make):
+    """Across a round hill radiance falls to zero, and stays there: triangles that still face the light are no bright rim."""
+    s = np.linspace(-0.5, 0.5, 33)
+    hill = side * 0.2 * np.exp(-(s**2 + s[:, None] ** 2) / 0.045)
+    camera = jaxhf.Orthographic.look_at((0.5, 0.5, 2 * side), (0.5, 0.5, 0), (0, 1, 0), 1 / 32, width=128, height=4)
+    light = make(jaxhf.Directional.from_angles(270, 8).towards * (1, 1, side), 1.0)
+    image = jaxhf.render(jaxhf.Scene([ground(hill, jaxhf.Matte(1.0), dx=1 / 32)], camera, [light]), jaxhf.Settings(samples=16))
+    row = np.asarray(image)[1, ::side, 0]
+    assert row[60] > 0.1
+    assert np.diff(row[64:]).max() < 1e-9
+    assert row[72] == 0
+
+
+def test_rounded_clamp():
+    """max(x, 0) but for |x| < 0.01; there the parabola that continues it in value and in slope, 0.0025 at zero."""
+    slope = jax.vmap(jax.grad(rounded_clamp))
     x = np.concatenate([np.linspace(-1, 1, 2000), np.linspace(-0.02, 0.02, 2001)])
-    value = np.asarray(jax.vmap(rounded_abs)(jnp.asarray(x)))
+    value = np.asarray(jax.vmap(rounded_clamp)(jnp.asarray(x)))
     beyond = np.abs(x) > 0.01
-    np.testing.assert_array_equal(value[beyond], np.abs(x)[beyond])
-    np.testing.assert_allclose(value[~beyond], (50 * x * x + 0.005)[~beyond], rtol=1e-13)
-    np.testing.assert_array_equal(slope(jnp.asarray(x[beyond])), np.sign(x[beyond]))
-    np.testing.assert_allclose(slope(jnp.asarray(x[~beyond])), 100 * x[~beyond], atol=1e-13)
-    for sign in (-1, 1):
-        near = jnp.asarray(sign * (0.01 + np.array([-1e-12, 0, 1e-12])))
-        np.testing.assert_allclose(jax.vmap(rounded_abs)(near), 0.01, atol=2e-12)
-        np.testing.assert_allclose(slope(near), sign, atol=2e-10)
+    np.testing.assert_array_equal(value[beyond], np.maximum(x, 0)[beyond])
+    np.testing.assert_allclose(value[~beyond], (25 * (x + 0.01) ** 2)[~beyond], rtol=1e-13, atol=1e-30)
+    np.testing.assert_array_equal(slope(jnp.asarray(x[beyond])), x[beyond] > 0)
+    np.testing.assert_allclose(slope(jnp.asarray(x[~beyond])), 50 * (x + 0.01)[~beyond], atol=1e-13)
+    for end, there in ((-0.01, 0.0), (0.01, 1.0)):
+        near = jnp.asarray(end + np.array([-1e-12, 0, 1e-12]))
+        np.testing.assert_allclose(jax.vmap(rounded_clamp)(near), there * 0.01, atol=2e-12)
+        np.testing.assert_allclose(slope(near), there, atol=2e-10)
 
 
 def test_mirrored_ray_never_enters_its_triangle():
