@@ -106,6 +106,7 @@ BAD = [
     (lambda: ANYTHING.ImageTexture(np.ones((2, 2))), "ImageTexture: texels must have shape (h, w, 3), theirs is (2, 2)"),
     (lambda: ANYTHING.ImageTexture(np.ones((2, 2, 4))), "ImageTexture: texels must have shape (h, w, 3), theirs is (2, 2, 4)"),
     (lambda: ANYTHING.ImageTexture(np.ones((0, 2, 3))), "ImageTexture: texels must have shape (h, w, 3), theirs is (0, 2, 3)"),
+    (lambda: ANYTHING.ImageTexture(np.ones((2, 2, 3)), wrap="black"), "ImageTexture: wrap must be one of repeat, clamp; it is"),
     (lambda: ANYTHING.ImageTexture(np.full((2, 2, 3), NAN)), "ImageTexture: texels must be finite"),
     (directional([0, 0, 0]), "Directional: towards must not be zero, it is [0, 0, 0]"),
     (directional([0, NAN, 1]), "Directional: towards must be finite, it is [ 0., nan,  1.]"),
