@@ -149,7 +149,7 @@ def _mapped(
     mesh: Mesh | None,
 ) -> jax.Array:
     require_progress(owner, progress)
-    dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh)
+    dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh, field)
     directions = _ROOM * cell_directions(azimuths, field.dx, field.dy, dtype)
     heights, directions = on_every_device((field.heights, directions), mesh)
     if progress is None:
