@@ -126,7 +126,7 @@ def render(
         the terrain; the rest is computed in the precision of the (first) heightfield's heights.
       settings: the knobs; None: `Settings()`, or those of a `Prepared` scene, which can be rendered with no others.
       aovs: names out of `AOVS`.
-      progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
+      progress: called with (pixels done, pixels in all) as the picture grows; not within `jit`, `grad`, `vmap` and the like.
       key: of JAX's random numbers, for what is sampled: the points on edges, if the settings ask for them. The same key
         gives the same derivative; None stands for a fixed one.
       mesh: the devices that share the work, whatever its axes; None: those of `jax.set_mesh`, or else all of this process.
@@ -141,7 +141,7 @@ def render(
         `jax.set_mesh`; a `shard_map` with check_vma=True.
     """
     _require_scene("render", scene, (Scene, Prepared))
-    require_progress("render", progress)
+    require_progress("render", progress, is_traced())
     aovs = known_aovs("render", aovs)
     if isinstance(scene, Prepared):
         here = prepared_mesh("render", scene.mesh, mesh, (scene, key))

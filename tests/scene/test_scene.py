@@ -482,3 +482,8 @@ def test_a_camera_above_sees_all_of_a_field(shape, size):
     assert np.isclose(half, middle).any()
     if None in size:  # less than half a pixel on either side is beside it
         assert (half - middle < half / pixels).all()
+
+
+@pytest.mark.parametrize("kind", [jaxhf.Perspective, jaxhf.Orthographic])
+def test_a_camera_takes_its_size_by_place(kind):
+    assert repr(kind(np.eye(4), 45.0, 8, 6)) == repr(kind(np.eye(4), 45.0, width=8, height=6))
