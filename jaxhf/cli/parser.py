@@ -2,7 +2,7 @@
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -39,6 +39,8 @@ class _Formatter(argparse.HelpFormatter):
 class _Parser(argparse.ArgumentParser):
     """Says in one line what is wrong with a command line, and which word may have been meant."""
 
+    commands: Mapping[str, argparse.ArgumentParser] = {}  # all of them, by their names
+
     def __init__(self, **options: Any):
         super().__init__(**{"formatter_class": _Formatter, **options})
 
@@ -65,8 +67,15 @@ class _Parser(argparse.ArgumentParser):
         import difflib
 
         word = word.partition("=")[0]
-        close = difflib.get_close_matches(word, re.findall(r"--[a-z][\w-]*", self.format_usage()), n=1, cutoff=0.5)
-        self.error(f"unknown option {word}" + "".join(f"; did you mean {meant}?" for meant in close))
+        close = difflib.get_close_matches(word[2:], _options(self), n=1)
+        others = [name for name, command in self.commands.items() if word[2:] in _options(command)]
+        tail = f"; jaxhf {others[0]} has it" if others else ""
+        self.error(f"unknown option {word}" + (f"; did you mean --{close[0]}?" if close else tail))
+
+
+def _options(command: argparse.ArgumentParser) -> list[str]:
+    """Their names without the dashes, which would make all of them alike."""
+    return re.findall(r"--([a-z][\w-]*)", command.format_usage())
 
 
 def _unknown_command(word: str, known: Sequence[str]) -> str:
@@ -100,5 +109,6 @@ def make_parser() -> argparse.ArgumentParser:
         for module in modules:
             module.add(group)
         lines += ["", *group.lines]
+    _Parser.commands = commands.choices
     parser.description, parser.epilog = "\n".join(lines), _EXAMPLES
     return parser

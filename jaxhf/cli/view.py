@@ -136,7 +136,7 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
 
 def run(options: argparse.Namespace) -> None:
     from ..io.films import FILMS, require_writable_film
-    from ..io.images import require_writable
+    from ..io.images import PICTURES, require_writable
     from ..io.load_terrain import jacksboro_file, load_heights
     from .overwriting import require_no_input
 
@@ -145,7 +145,8 @@ def run(options: argparse.Namespace) -> None:
     if options.demo:
         options.terrain = jacksboro_file()
     output = Path(options.output or Path(options.terrain).with_suffix(".png").name)
-    film = output.suffix.lower() in FILMS
+    ending, moves = output.suffix.lower(), not options.frames is options.sun_from is None
+    film = ending in FILMS or (moves and ending not in PICTURES)
     if (options.sun_from is None) != (options.sun_to is None):
         raise UserError("view: --sun-from and --sun-to belong together, one is missing")
     if options.sun_from is not None and not film:

@@ -41,10 +41,12 @@ def require_kind(owner: str, argument: str, value: Any, kind: type | tuple[type,
         raise ArgumentError(owner, argument, f"must be {wanted}, it is {kind_of(value)}{hint and '; '}{hint}")
 
 
-def require_progress(owner: str, progress: Any) -> None:
-    """ArgumentError where an argument of this name is neither None nor a function."""
+def require_progress(owner: str, progress: Any, traced: bool) -> None:
+    """ArgumentError where an argument of this name is neither None nor a function, or where there is none to be seen."""
     if progress is not None and not callable(progress):
         raise ArgumentError(owner, "progress", f"must be a function of (done, in all), it is {progress!r}")
+    if progress is not None and traced:
+        raise ArgumentError(owner, "progress", "must be None within jit, grad, vmap and the like, where nothing is done yet")
 
 
 def whole_number(value: Any) -> Any:

@@ -19,7 +19,7 @@ from ..scene.light import Sky
 from ..scene.material import Matte
 from ..scene.scene import Scene
 from ..scene.texture import ImageTexture
-from ..xla.devices import local_mesh
+from ..xla.devices import chosen_mesh
 from .basis import Basis, Unknowns, make_basis, make_heights, pad
 from .defaults import choose_edge_samples, choose_samples
 from .groups import Group, make_groups, require_scenes
@@ -158,7 +158,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], options: FitOp
         _brightness(targets),
         options.loss,
         settings,
-        local_mesh() if options.mesh is None else options.mesh,
+        chosen_mesh("fit", options.mesh),
         None,
         *_view_priors(scenes, options),
     )

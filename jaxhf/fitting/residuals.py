@@ -153,10 +153,10 @@ def _with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
     material = scene.objects[k].material
     assert isinstance(material, Matte)
     old = material.albedo
-    texels = jnp.asarray(old.texels) if isinstance(old, ImageTexture) else jnp.asarray(old).reshape(1, 1, 3)
-    shape = (*(max(pair) for pair in zip(texels.shape[:2], factor.shape[:2], strict=True)), 3)
-    new = jnp.broadcast_to(texels, shape) * jnp.broadcast_to(factor, shape)
-    albedo = new.reshape(3) if shape[:2] == (1, 1) and not isinstance(old, ImageTexture) else ImageTexture(new)
+    texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.asarray(old).reshape(1, 1, 3))
+    shape = (*(max(pair) for pair in zip(texture.texels.shape[:2], factor.shape[:2], strict=True)), 3)
+    new = jnp.broadcast_to(texture.texels, shape) * jnp.broadcast_to(factor, shape)
+    albedo = new.reshape(3) if shape[:2] == (1, 1) and texture is not old else dataclasses.replace(texture, texels=new)
     return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
 
 

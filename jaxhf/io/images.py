@@ -371,6 +371,7 @@ _WRITERS: dict[str, Callable[[Path, np.ndarray, Callable[[np.ndarray], np.ndarra
     ".pfm": _write_pfm,
     ".npy": _write_npy,
 }
+PICTURES = tuple(_WRITERS)  # the endings of what `save_image` writes
 # How values in 0..1 are encoded in whole numbers, and decoded.
 TRANSFERS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]] = {
     "srgb": (srgb_from_linear, linear_from_srgb),

@@ -27,7 +27,7 @@ from ..trace.horizon import (
     tile_count,
 )
 from ..trace.normals import vertex_normals
-from ..xla.compilation import compiled
+from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, on_every_device
 from .surface import both_spacings, spacing
 
@@ -54,7 +54,7 @@ def horizon(
       dx, dy: cell size, in the unit of the heights. An array must have one, which counts for both; None: a terrain's own.
       lowest: the angle where nothing stands higher, degrees: 0, the horizontal; -90 shows terrain that falls away, and
         stays where there is none.
-      progress: called with (vertices done, vertices in all) as the map grows; not under a transformation.
+      progress: called with (vertices done, vertices in all) as the map grows; not within `jit`, `grad`, `vmap` and the like.
       mesh: the devices that share the work, see `render`.
 
     Returns:
@@ -148,8 +148,8 @@ def _mapped(
     progress: Callable[[int, int], None] | None,
     mesh: Mesh | None,
 ) -> jax.Array:
-    require_progress(owner, progress)
-    dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh)
+    require_progress(owner, progress, is_traced())
+    dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh, field)
     directions = _ROOM * cell_directions(azimuths, field.dx, field.dy, dtype)
     heights, directions = on_every_device((field.heights, directions), mesh)
     if progress is None:

@@ -23,6 +23,7 @@ from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
 from ..trace.world import World, first_hit, make_world, resolve_settings
 from ..xla.compilation import compiled
+from ..xla.devices import prepared_mesh, where_called
 from .chunks import trace_batch, trace_chunks
 from .render import Prepared, PreparedHeightfield, heightfield_grid
 
@@ -81,6 +82,9 @@ def cast(
       ValueError: `o` or `d` does not end in an axis of length 3, or not exactly one of `o` and `leaving` is None, or the
         axes do not begin with those of a batch; `leaving` or other settings with a scene that is prepared.
     """
+    if isinstance(surface, Prepared):
+        prepared_mesh("cast", surface.mesh, None, ())
+    surface, o, d, leaving = where_called("cast", (surface, o, d, leaving))
     scene = surface.scene if isinstance(surface, Prepared) else surface if isinstance(surface, Scene) else None
     ready = isinstance(surface, Prepared | PreparedHeightfield)
     field: Any = None if scene is not None else surface.field if isinstance(surface, PreparedHeightfield) else surface

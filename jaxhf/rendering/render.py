@@ -28,7 +28,7 @@ from ..scene.scene import Scene
 from ..trace.grid import Grid
 from ..trace.world import World, make_ceilings, make_surface, make_world, resolve_settings
 from ..xla.compilation import compiled, is_traced
-from ..xla.devices import chosen_mesh, map_over, on_every_device
+from ..xla.devices import chosen_mesh, map_over, on_every_device, prepared_mesh, where_called
 from ..xla.kernel import in_turn, one_kernel
 from ..xla.materialise import unfolded
 from .aovs import known_aovs
@@ -62,7 +62,7 @@ class Prepared(eqx.Module):
         scene = self.scene.with_lights(lights)
         if scene.sky_occlusion != self.scene.sky_occlusion:
             return prepare(scene, self.settings, mesh=self.mesh)
-        local = on_every_device(localise(scene).lights, self.mesh)
+        local = on_every_device(localise(scene).lights, prepared_mesh("with_lights", self.mesh, None, scene))
         ceilings = _make_ceilings(self._world.surfaces, local, self.settings)
         return dataclasses.replace(self, scene=scene, _world=dataclasses.replace(self._world, lights=local, ceilings=ceilings))
 
@@ -97,11 +97,11 @@ def prepare(
         if mesh is not None:
             raise UserError("prepare: a heightfield alone goes to no mesh, as cast uses one device")
         require_kind("prepare", "settings", settings or Settings(), Settings, "a jaxhf.Settings")
-        heights, settings = jnp.asarray(scene.heights), settings or Settings()
+        heights, settings = jnp.asarray(where_called("prepare", scene.heights)), settings or Settings()
         grid = heightfield_grids(heights.reshape(-1, *heights.shape[-2:]), scene.dx, scene.dy, settings)
         return PreparedHeightfield(scene, settings, grid if heights.ndim > 2 else jax.tree.map(lambda leaf: leaf[0], grid))
     _require_scene("prepare", scene, Scene)
-    settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("prepare", mesh)
+    settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("prepare", mesh, scene)
     make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
     return Prepared(scene, mesh, make(on_every_device(localise(scene), mesh), settings=settings))
 
@@ -126,40 +126,43 @@ def render(
         the terrain; the rest is computed in the precision of the (first) heightfield's heights.
       settings: the knobs; None: `Settings()`, or those of a `Prepared` scene, which can be rendered with no others.
       aovs: names out of `AOVS`.
-      progress: called with (pixels done, pixels in all) as the picture grows; not under a transformation.
+      progress: called with (pixels done, pixels in all) as the picture grows; not within `jit`, `grad`, `vmap` and the like.
       key: of JAX's random numbers, for what is sampled: the points on edges, if the settings ask for them. The same key
         gives the same derivative; None stands for a fixed one.
-      mesh: the devices that share the work, whatever its axes; None: all of this process. Where it spans several processes
-        (`jax.distributed`), each must call with the same values, and gets the whole picture.
+      mesh: the devices that share the work, whatever its axes; None: those of `jax.set_mesh`, or else all of this process.
+        Where it spans several processes (`jax.distributed`), each must call with the same values, and gets the whole picture.
+        Within a `pmap`, or a `shard_map` with check_vma=False, it must be None: each device renders a picture of its own.
 
     Returns:
       Linear radiance, shape (h, w, 3), top row first; with `aovs` that and a dict of them.
 
     Raises:
-      ValueError: an unknown AOV, or settings or a mesh for a scene that was prepared with others.
+      ValueError: an unknown AOV, or settings or a mesh for a scene that was prepared with others; another mesh than that of
+        `jax.set_mesh`; a `shard_map` with check_vma=True.
     """
     _require_scene("render", scene, (Scene, Prepared))
-    require_progress("render", progress)
-    chosen_mesh("render", mesh)
+    require_progress("render", progress, is_traced())
     aovs = known_aovs("render", aovs)
-    if not isinstance(scene, Prepared) and (progress is not None or scene.sky_occlusion is not None):
-        scene, settings = prepare(scene, settings, mesh=mesh), None
     if isinstance(scene, Prepared):
-        if mesh is not None and mesh != scene.mesh:
-            raise UserError(f"render: the scene was prepared on {scene.mesh}, it cannot be rendered on {mesh}")
+        here = prepared_mesh("render", scene.mesh, mesh, (scene, key))
+    else:
+        here = chosen_mesh("render", mesh, (scene, key))
+        if progress is not None or scene.sky_occlusion is not None:
+            scene, settings = prepare(scene, settings, mesh=mesh), None
+    if isinstance(scene, Prepared):
         if settings is not None and resolve_settings(settings, scene.scene) != scene.settings:
             raise UserError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
-        world, mesh = scene._world, scene.mesh
-        camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), mesh)
+        world = scene._world
+        camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), here)
         if progress is None:
-            outputs = _trace_prepared(world, camera, aovs, mesh, _key(key, world.settings, mesh))
+            outputs = _trace_prepared(world, camera, aovs, here, _key(key, world.settings, here))
         else:
-            outputs = _trace_in_parts(world, camera, aovs, mesh, progress)
+            outputs = _trace_in_parts(world, camera, aovs, here, progress)
     else:
-        settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("render", mesh)
-        local = on_every_device(localise(scene), mesh)
+        settings = resolve_settings(settings or Settings(), scene)
+        local = on_every_device(localise(scene), here)
         local = unfolded(local) if is_traced() else local
-        outputs = _trace_all(local, settings, aovs, mesh, _key(key, settings, mesh))
+        outputs = _trace_all(local, settings, aovs, here, _key(key, settings, here))
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 

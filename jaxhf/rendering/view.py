@@ -98,7 +98,7 @@ def block(field: Heightfield, colours: Any, camera: Perspective, look: Look, bas
     """
     at_vertices = np.shape(colours)[:-1] == field.heights.shape
     colours = jnp.asarray(colours, field.heights.dtype)
-    albedo = ImageTexture(colours, at_vertices=at_vertices) if colours.ndim == 3 else colours
+    albedo = ImageTexture(colours, at_vertices=at_vertices, wrap="clamp") if colours.ndim == 3 else colours
     objects = [Object(field, Matte(albedo))]
     if base is not None:
         objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))

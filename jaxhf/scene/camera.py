@@ -56,8 +56,8 @@ class Perspective(eqx.Module):
 
     world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf)
     fov: ScalarLeaf = eqx.field(converter=float_leaf, default=45.0)
-    width: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
-    height: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
+    width: int = eqx.field(converter=whole_number, static=True, default=512)
+    height: int = eqx.field(converter=whole_number, static=True, default=512)
     _ahead: ScalarLeaf | None = eqx.field(default=None, kw_only=True)  # see `localise_camera`
 
     def __check_init__(self):
@@ -198,8 +198,8 @@ class Orthographic(eqx.Module):
 
     world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf)
     extent: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
-    width: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
-    height: int = eqx.field(converter=whole_number, static=True, default=512, kw_only=True)
+    width: int = eqx.field(converter=whole_number, static=True, default=512)
+    height: int = eqx.field(converter=whole_number, static=True, default=512)
     _ahead: ScalarLeaf | None = eqx.field(default=None, kw_only=True)  # see `localise_camera`
 
     def __check_init__(self):

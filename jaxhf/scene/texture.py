@@ -1,6 +1,6 @@
 """Textures: images spread over a surface."""
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -12,6 +12,8 @@ from ..core.errors import ArgumentError
 from ..core.types import AnyArray, Point2, Vector, float_leaf
 from ..core.vector import within
 
+Wrap = Literal["repeat", "clamp"]
+
 
 def _texels(value: Any) -> Any:
     if isinstance(value, np.ndarray | jax.Array) and value.dtype.kind in "bu":
@@ -21,18 +23,23 @@ def _texels(value: Any) -> Any:
 
 
 class ImageTexture(eqx.Module):
-    """An image spread over (u, v) in 0..1 and repeated outside, looked up bilinearly.
+    """An image spread over (u, v) in 0..1, looked up bilinearly.
 
     Attributes:
       texels: linear colours, shape (h, w, 3): row 0 is v = 0, u runs along a row, texel centres lie at half steps.
       at_vertices: whether the outermost texel centres lie on 0 and 1 instead: an image of (ny, nx) texels then gives each
-        vertex of a heightfield of that shape its colour.
+        vertex of a heightfield of that shape its colour, and a point outside that of the border.
+      wrap: what lies beyond the outermost texel centres, half a texel inside the border: "repeat", the opposite border, as in
+        pbrt; "clamp", the colour of the nearest texel.
     """
 
     texels: Float[AnyArray, "h w 3"] = eqx.field(converter=_texels)
     at_vertices: bool = eqx.field(static=True, default=False, kw_only=True)
+    wrap: Wrap = eqx.field(static=True, default="repeat", kw_only=True)
 
     def __check_init__(self):
+        if self.wrap not in get_args(Wrap):
+            raise ArgumentError("ImageTexture", "wrap", f"must be one of {', '.join(get_args(Wrap))}; it is {self.wrap!r}")
         if len(self.texels.shape) != 3 or self.texels.shape[2] != 3 or 0 in self.texels.shape:
             raise ArgumentError("ImageTexture", "texels", f"must have shape (h, w, 3), theirs is {self.texels.shape}")
         if isinstance(self.texels, np.ndarray) and not np.isfinite(self.texels).all():
@@ -48,6 +55,8 @@ class ImageTexture(eqx.Module):
             x, y = within(uv[0], 0.0, 1.0) * (w - 1), within(uv[1], 0.0, 1.0) * (h - 1)
         else:
             x, y = uv[0] * w - 0.5, uv[1] * h - 0.5
+            if self.wrap == "clamp":
+                x, y = within(x, 0.0, w - 1.0), within(y, 0.0, h - 1.0)
         column, row = jnp.floor(x), jnp.floor(y)
         fx, fy = x - column, y - row
         ix, iy = column.astype(jnp.int32), row.astype(jnp.int32)

@@ -12,7 +12,8 @@ from jax import lax
 from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 
-from ..core.errors import require_kind
+from ..core.errors import ArgumentError, UserError, require_kind
+from .compilation import is_traced
 
 
 @functools.cache
@@ -22,12 +23,44 @@ def local_mesh(most: int | None = None) -> Mesh:
     return jax.make_mesh((len(devices),), ("devices",), axis_types=(AxisType.Auto,), devices=devices)
 
 
-def chosen_mesh(owner: str, mesh: Mesh | None) -> Mesh:
-    """The mesh that an argument gives, by default all devices of this process; ArgumentError where it is none."""
-    if mesh is None:
-        return local_mesh()
-    require_kind(owner, "mesh", mesh, Mesh, "a jax.sharding.Mesh", "jax.make_mesh makes one")
-    return mesh
+def chosen_mesh(owner: str, mesh: Mesh | None, tree: Any = ()) -> Mesh:
+    """The mesh that an argument gives, by default that of `jax.set_mesh`, or else all devices of this process.
+
+    Within a `shard_map` or a `pmap` that is the device itself. Where no mesh has been set, axes of any type become those that
+    XLA deals with.
+
+    Raises:
+      ArgumentError: it is no mesh, or another than that in which JAX is; or `tree`, the values to be computed with, is under
+        the check of `shard_map` that `check_vma=False` leaves out.
+    """
+    if mesh is not None:
+        require_kind(owner, "mesh", mesh, Mesh, "a jax.sharding.Mesh", "jax.make_mesh makes one")
+    around = jax.sharding.get_abstract_mesh()
+    if around.empty:
+        return local_mesh() if mesh is None else Mesh(mesh.devices, mesh.axis_names)
+    if around.manual_axes:
+        if mesh is not None:
+            raise ArgumentError(owner, "mesh", "must be None within a shard_map or pmap, where each device works for itself")
+        if any(jax.typeof(leaf).mat.varying for leaf in jax.tree.leaves(tree)):
+            raise UserError(f"{owner}: the shard_map around it needs check_vma=False")
+        return local_mesh(1)
+    if mesh is not None and mesh.abstract_mesh != around:
+        raise ArgumentError(owner, "mesh", f"must be None or that of jax.set_mesh, {around}, it is {mesh}")
+    if mesh is None and is_traced():  # when JAX tells no more than the mesh's form, which is all that counts then
+        return Mesh(np.array(jax.devices()[: around.size]).reshape(around.axis_sizes), around.axis_names, around.axis_types)
+    return mesh or jax.sharding.get_mesh()
+
+
+def prepared_mesh(owner: str, prepared: Mesh, mesh: Mesh | None, tree: Any) -> Mesh:
+    """As `chosen_mesh`, for what was prepared on a mesh, which is the default; UserError where that is another than JAX's."""
+    here, around = chosen_mesh(owner, mesh, tree), jax.sharding.get_abstract_mesh()
+    if around.manual_axes:
+        return here
+    if mesh is None and around.empty:
+        here = Mesh(prepared.devices, prepared.axis_names)
+    if here != prepared if around.empty else prepared.abstract_mesh != around:
+        raise UserError(f"{owner}: the scene was prepared on {prepared}, it cannot be used on {here}")
+    return prepared
 
 
 def on_every_device(tree: Any, mesh: Mesh) -> Any:
@@ -36,20 +69,30 @@ def on_every_device(tree: Any, mesh: Mesh) -> Any:
     What is still NumPy is left to the compiled program, which copies it by itself. Over several processes each must have the
     same values.
     """
-    here = mesh.devices.ravel()
-    if len(here) == 1 and here[0] == jax.devices()[0]:
+    here, around = mesh.devices.ravel(), jax.sharding.get_abstract_mesh()
+    if around.manual_axes or (around.empty and len(here) == 1 and here[0] == jax.devices()[0]):
         return tree
 
     def placed(leaf: Any) -> Any:
         if not isinstance(leaf, jax.Array):
             return leaf
         if not mesh.is_multi_process:
-            return jax.device_put(leaf, NamedSharding(mesh, P()))
+            return jax.device_put(leaf, NamedSharding(mesh, P())) if around.empty else jax.reshard(leaf, P())
         # What belongs to one process can only be sent to another by way of the host, from which all start with the same.
         at_home = isinstance(leaf, Tracer) or jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return leaf if at_home or leaf.sharding.device_set == set(here) else np.asarray(leaf)
 
     return jax.tree.map(placed, tree)
+
+
+def where_called(owner: str, tree: Any) -> Any:
+    """For what uses one device: within `jax.set_mesh` a copy of its arrays on each device, else the arrays where they are.
+
+    Raises:
+      UserError: see `chosen_mesh`.
+    """
+    mesh = chosen_mesh(owner, None, tree)
+    return tree if jax.sharding.get_abstract_mesh().empty else on_every_device(tree, mesh)
 
 
 def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any) -> Any:
@@ -69,11 +112,16 @@ def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any
     devices, n = mesh.devices.size, jax.tree.leaves(items)[0].shape[0]
     if devices == 1:
         return one_after_the_other(shared, items)
+    around = jax.sharding.get_abstract_mesh()
+    if AxisType.Explicit in around.axis_types:
+        dealt_out: Any = jax.sharding.auto_axes(functools.partial(map_over, mesh, fun), out_sharding=P())
+        return dealt_out(shared, items)
+    given = mesh if around.empty else around
     count = math.ceil(n / devices)
     turns = np.minimum(np.arange(count * devices), n - 1).reshape(count, devices).T
     over = jax.shard_map(
         lambda shared, items: one_after_the_other(shared, jax.tree.map(lambda leaf: leaf[0], items)),
-        mesh=mesh,
+        mesh=given,
         in_specs=(P(), P(mesh.axis_names)),
         out_specs=P(mesh.axis_names),
         check_vma=False,
@@ -81,7 +129,7 @@ def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any
 
     def in_order(values: jax.Array) -> jax.Array:
         # Gathered before anything is made of it, or XLA would take sums in parts, in another order than on one device.
-        values = lax.with_sharding_constraint(values, NamedSharding(mesh, P()))
+        values = lax.with_sharding_constraint(values, NamedSharding(given, P()))
         tail = values.shape[1:]
         return values.reshape(devices, count, *tail).swapaxes(0, 1).reshape(devices * count, *tail)[:n]
 

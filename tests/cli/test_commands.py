@@ -55,6 +55,7 @@ def test_every_command_has_examples_that_it_takes(command, capsys):
         ("terrain.tif", "'terrain.tif' is no command; one stands before its files, as in 'jaxhf info terrain.tif'"),
         ("slope a.tif -o b.tif --percnt", "unknown option --percnt; did you mean --percent?"),
         ("render a.toml -o b.png --widht=5", "unknown option --widht; did you mean --width?"),
+        ("render a.toml -o b.png --preset exact", r"unknown option --preset; jaxhf view has it \(see"),
         ("render a.toml -o b.png --xyz", r"unknown option --xyz \(see jaxhf render --help\)"),
         ("info a.tif b.tif", "unexpected argument 'b.tif'"),
         ("hillshade a.tif -o b.tif --variant igo", "--variant must be one of regular, combined, .*; it is 'igo'"),
@@ -116,6 +117,7 @@ IGNORED = [
     ("relief hills.npy -o a.png --variant igor --altitude 9", "--altitude would change nothing: --variant igor has lights of"),
     ("hillshade hills.npy -o a.png --variant multidirectional --azimuth 9", "--azimuth would change nothing: --variant multi"),
     ("horizon hills.npy -o a.npy --azimuth 90 --azimuths 8", "--azimuths would change nothing: --azimuth asks for one"),
+    ("view hills.npy -o a.webm --frames 3", "a.webm: cannot write a film with the ending '.webm'; known: .gif, .mp4"),
     ("view hills.npy -o a.png --frames 24", "--frames would change nothing: a.png is one picture, a film is .gif or .mp4"),
     (
         "view hills.npy -o a.gif --sun-from 90,9 --sun-to 99,9 --altitude 8",

@@ -24,7 +24,7 @@ from jaxhf.fitting.loop import FitLoop
 from jaxhf.fitting.options import FitOptions, make_stages
 from jaxhf.fitting.prior import Prior, make_prior
 from jaxhf.fitting.problem import Problem, make_problem
-from jaxhf.fitting.residuals import prior_residuals
+from jaxhf.fitting.residuals import _with_albedo, prior_residuals
 from jaxhf.fitting.robust import robust_weight, soften
 from jaxhf.fitting.solvers import Outcome
 from jaxhf.fitting.view import differences
@@ -223,6 +223,13 @@ def test_a_map_of_the_albedo_comes_back():
     inner = np.s_[1:-1, 1:-1]  # of the border the pictures show little
     np.testing.assert_allclose(np.asarray(found.albedo)[..., 0][inner], factor[inner], rtol=0.02)
     assert rms(np.asarray(found.heights) - np.mean(found.heights) - TRUTH + TRUTH.mean()) < 0.02 * np.ptp(TRUTH)
+
+
+@pytest.mark.parametrize("lies", [{"at_vertices": True}, {"wrap": "clamp"}], ids=str)
+def test_a_sought_albedo_lies_as_its_texture(lies):
+    texels = np.random.default_rng(0).uniform(0.2, 0.9, (4, 5, 3))
+    given, expected = (scenes(albedo=jaxhf.ImageTexture(factor * texels, **lies))[0] for factor in (1, 2))
+    assert eqx.tree_equal(_with_albedo(given, jnp.full((4, 5, 1), 2.0)).objects, expected.objects, typematch=False)
 
 
 def test_exposures_and_offsets_come_back_apart():

@@ -248,6 +248,9 @@ def test_an_image_lies_with_its_top_in_the_north(tmp_path):
     assert isinstance(material.albedo, ImageTexture)
     grey = ((100 / 255 + 0.055) / 1.055) ** 2.4
     np.testing.assert_allclose(material.albedo.texels[:, :, 1], [[grey, 0], [1, 1]], rtol=1e-6)
+    assert material.albedo.wrap == "repeat"
+    (clamped,) = read(tmp_path, f'{CAMERA}[textures.m]\nimage = "maps/x.png"\nwrap = "clamp"\n{FIELD}albedo = "m"').objects
+    assert clamped.material.albedo.wrap == "clamp"
 
 
 def test_terrain_files_keep_their_place_and_their_holes(tmp_path):
@@ -466,6 +469,7 @@ MISTAKES = [
     (texture('image = "../x.png"'), 11, "'../x.png' lies outside the scene's folder"),
     (texture('image = "text.png"'), 11, "text.png: it is not a PNG"),
     (texture('image = "text.npy"'), 11, "text.npy: "),
+    (texture('image = "text.npy"\nwrap = "black"'), 12, "textures.t.wrap must be one of repeat, clamp; it is 'black'"),
 ]
 
 

@@ -17,7 +17,7 @@ import jaxhf
 from jaxhf.boundary import fold, guiding, outline, sample
 from jaxhf.core import affine, autodiff
 from jaxhf.rendering import aovs as rendering_aovs, tiles
-from jaxhf.scene import localise
+from jaxhf.scene import localise, texture
 from jaxhf.shade import lighting, radiance
 from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, skirt, skyline, world as trace_world
 from jaxhf.xla import masked
@@ -124,6 +124,7 @@ def second_call_fails(function: Callable[..., Any]) -> Change:
 
 PLAIN = Case(scene())
 TEXTURE = jaxhf.Matte(jaxhf.ImageTexture(np.ones((2, 2, 3))))
+CLAMPED = jaxhf.Matte(jaxhf.ImageTexture(np.ones((2, 2, 3)), wrap="clamp"))
 TILTED = np.array([[1, 0, 0, 0.1], [0, 1, 0.2, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 SMOOTH = jaxhf.Settings(shading="smooth", shadows=False)
 DEPTH = Case(scene(), aovs=("depth",))
@@ -138,6 +139,7 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
         [fails_everywhere(intersect.blocked), fails_everywhere(ceiling.make_ceiling), fails_everywhere(ceiling.clears)],
     ),
     "image texture": ("plain", Case(scene(material=TEXTURE)), [fails_in(jaxhf.ImageTexture, "__call__")]),
+    "clamped texture": ("repeated", Case(scene(material=CLAMPED)), [fails_in(texture, "within")]),
     "mirror": (
         "plain",
         Case(scene(jaxhf.Object(FIELD, jaxhf.Mirror()))),
@@ -217,6 +219,7 @@ FEATURES: dict[str, tuple[str, Case, list[Change]]] = {
 BASELINES = {
     "plain": PLAIN,
     "smooth": Case(scene(), SMOOTH),
+    "repeated": Case(scene(material=TEXTURE)),
     "depth": DEPTH,
     "differentiated": Case(scene(), differentiated=True),
     "edges": EDGES,

@@ -176,6 +176,18 @@ def test_single_precision_agrees_with_double():
 
 
 @pytest.mark.unoptimised(False)  # two programs, whose bits are the same as users compile them
+@pytest.mark.parametrize("transformation", [jax.jit, jax.jacfwd, jax.vmap])
+def test_there_is_no_progress_within_a_transformation(transformation):
+    heights = jnp.zeros((1, 3, 3) if transformation is jax.vmap else (3, 3))
+    camera = jaxhf.Perspective.look_at((0, -1, 1), (0, 0, 0), width=4, height=4)
+    for owner, fun in (
+        ("render", lambda z, **how: jaxhf.render(jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(z))], camera, ()), **how)),
+        ("horizon", lambda z, **how: jaxhf.horizon(z, 4, dx=1.0, **how)),
+    ):
+        with pytest.raises(ValueError, match=f"^{owner}: progress must be None within jit, grad, vmap and the like, where"):
+            transformation(lambda z, fun=fun: fun(z, progress=lambda done, total: None))(heights)
+
+
 def test_progress_gives_the_same_bits():
     camera = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=70, height=67)
     settings = jaxhf.Settings(chunk=64)  # 9 x 9 tiles, the last of each row and column partly outside

@@ -55,6 +55,14 @@ def test_a_camera_looks_past_the_centres_of_its_pixels():
             np.testing.assert_allclose(past.ray(*jnp.array([x, y])).d, camera.ray(*jnp.array([x + dx, y + dy])).d, atol=1e-6)
 
 
+def test_a_picture_laid_over_a_terrain_has_no_rim_of_the_opposite_border():
+    field = jaxhf.Heightfield(np.zeros((17, 17), np.float32), 1.0)
+    camera = jaxhf.Perspective.look_at((8, 8, 100), (8, 8, 0), up=(0, 1, 0), fov=9.1, width=32, height=32)
+    ramp = np.repeat(np.linspace(1, 0, 8)[None, :, None], 8, axis=0) * np.ones(3)
+    picture = np.asarray(jaxhf.render(block(field, ramp, camera, Look(), None)))
+    assert (np.diff(picture[..., 0], axis=1) <= 1e-6).all()
+
+
 @pytest.mark.parametrize(("samples", "side", "occlusion"), [(9, 17, 16), (1, 17, None), (9, 1500, None)])
 def test_mountains_hide_the_sky_but_in_drafts_and_large_terrains(samples: int, side: int, occlusion: int | None):
     field = jaxhf.Heightfield(np.zeros((side, side), np.float32), 1.0)

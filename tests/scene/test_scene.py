@@ -106,6 +106,7 @@ BAD = [
     (lambda: ANYTHING.ImageTexture(np.ones((2, 2))), "ImageTexture: texels must have shape (h, w, 3), theirs is (2, 2)"),
     (lambda: ANYTHING.ImageTexture(np.ones((2, 2, 4))), "ImageTexture: texels must have shape (h, w, 3), theirs is (2, 2, 4)"),
     (lambda: ANYTHING.ImageTexture(np.ones((0, 2, 3))), "ImageTexture: texels must have shape (h, w, 3), theirs is (0, 2, 3)"),
+    (lambda: ANYTHING.ImageTexture(np.ones((2, 2, 3)), wrap="black"), "ImageTexture: wrap must be one of repeat, clamp; it is"),
     (lambda: ANYTHING.ImageTexture(np.full((2, 2, 3), NAN)), "ImageTexture: texels must be finite"),
     (directional([0, 0, 0]), "Directional: towards must not be zero, it is [0, 0, 0]"),
     (directional([0, NAN, 1]), "Directional: towards must be finite, it is [ 0., nan,  1.]"),
@@ -481,3 +482,8 @@ def test_a_camera_above_sees_all_of_a_field(shape, size):
     assert np.isclose(half, middle).any()
     if None in size:  # less than half a pixel on either side is beside it
         assert (half - middle < half / pixels).all()
+
+
+@pytest.mark.parametrize("kind", [jaxhf.Perspective, jaxhf.Orthographic])
+def test_a_camera_takes_its_size_by_place(kind):
+    assert repr(kind(np.eye(4), 45.0, 8, 6)) == repr(kind(np.eye(4), 45.0, width=8, height=6))

@@ -187,11 +187,14 @@ def test_one_heightfield_shadows_another():
     assert in_shadow.sum() == on_tile.sum() == 8 * 4
 
 
-def texture_by_hand(texels, u, v):
-    """Periodic bilinear interpolation as a sum over all texels, each with a tent of width 1 about its centre."""
+def texture_by_hand(texels, u, v, wrap="repeat"):
+    """Bilinear interpolation as a sum over all texels, each with a tent of width 1 about its centre."""
 
     def tents(position, count):
-        apart = np.abs(position[..., None] * count - 0.5 - np.arange(count)) % count
+        place = position[..., None] * count - 0.5
+        if wrap == "clamp":
+            return np.maximum(0, 1 - np.abs(np.clip(place, 0, count - 1) - np.arange(count)))
+        apart = np.abs(place - np.arange(count)) % count
         return np.maximum(0, 1 - np.minimum(apart, count - apart))
 
     return np.einsum("...i,...j,ijc->...c", tents(v, texels.shape[0]), tents(u, texels.shape[1]), texels)
@@ -210,15 +213,25 @@ def test_texture_lookup():
     np.testing.assert_allclose(lookup(jnp.asarray(uv)), texture_by_hand(texels, uv[:, 0], uv[:, 1]), rtol=ROUNDING)
 
 
-def test_texture_lies_on_the_ground():
+@pytest.mark.parametrize("shape", [(3, 4, 3), (1, 1, 3), (1, 5, 3)])
+def test_a_clamped_texture_ends_with_its_outermost_texels(shape):
+    texels = np.random.default_rng(0).uniform(size=shape)
+    uv = np.random.default_rng(1).uniform(-1, 2, (200, 2))
+    uv[:100] = uv[:100].clip(0, 1)  # many of them on the border, and in its corners
+    lookup = jax.vmap(jaxhf.ImageTexture(texels, wrap="clamp"))
+    np.testing.assert_allclose(lookup(jnp.asarray(uv)), texture_by_hand(texels, *uv.T, "clamp"), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("wrap", ["repeat", "clamp"])
+def test_texture_lies_on_the_ground(wrap):
     texels = np.random.default_rng(2).uniform(size=(4, 6, 3))
     scene = jaxhf.Scene(
-        [ground(FLAT, jaxhf.Matte(jaxhf.ImageTexture(texels)))],
+        [ground(FLAT, jaxhf.Matte(jaxhf.ImageTexture(texels, wrap=wrap)))],
         vertical(4, 2, 4, width=32),
         [jaxhf.Directional((0, 0, 1), np.pi)],
     )
     x, y = places(4, 2, 4, width=32)
-    np.testing.assert_allclose(jaxhf.render(scene), texture_by_hand(texels, x / 8, y / 4), rtol=ROUNDING)
+    np.testing.assert_allclose(jaxhf.render(scene), texture_by_hand(texels, x / 8, y / 4, wrap), rtol=ROUNDING)
 
 
 def test_inside_a_textured_cylinder():

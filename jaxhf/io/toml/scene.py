@@ -8,7 +8,7 @@ import re
 import tomllib
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -21,7 +21,7 @@ from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
 from ...scene.light import Directional, Light
 from ...scene.scene import Object, Scene
-from ...scene.texture import ImageTexture
+from ...scene.texture import ImageTexture, Wrap
 from .. import procedural
 from ..errors import SceneError, nearest, resolve_inside
 from ..images import TRANSFERS, load_image
@@ -115,9 +115,11 @@ def _variant(part: Part, key: str, variants: Any) -> Any:
 def _texture(part: Part) -> ImageTexture:
     if part.one_of(("image", "source"), {key for _, keys in TEXTURES.values() for key in keys}) == "source":
         return ImageTexture(_variant(part, "source", TEXTURES))
-    name, transfer = part.read({"image": Key(word), "transfer": Key(word, None)})["image"], transfer_of(part)
+    name = part.read({"image": Key(word), "transfer": Key(word, None), "wrap": Key(word, None)})["image"]
+    transfer, wrap = transfer_of(part), part.choice("wrap", get_args(Wrap), "repeat")
     # An image starts at its top, a texture at v = 0: so it lies on a map with the north up.
-    return part.at("image").made(lambda: ImageTexture(load_image(named_file(part, name), transfer=transfer)[::-1]))
+    image = part.at("image").made(lambda: load_image(named_file(part, name), transfer=transfer)[::-1])
+    return part.at("image").made(ImageTexture, image, wrap=wrap)
 
 
 def transfer_of(part: Part) -> str | None:
