@@ -92,9 +92,9 @@ def require_transfer(owner: str, transfer: Any) -> None:
 def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapping[str, Any] | None = None) -> None:
     """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
 
-    Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8 bits of the values clipped to 0..1;
-    nan becomes 0. .exr and .pfm: float32. .npy: in the precision of `image`. The last three keep nan and inf. The file
-    appears whole or not at all: what was there before stays until its successor is complete.
+    Values are radiance in floats, 1 being white; bytes of 0..255 are not. What is masked is nan. .png: 8 bits of the values
+    clipped to 0..1; nan becomes 0. .exr and .pfm: float32. .npy: in the precision of `image`. The last three keep nan and inf.
+    The file appears whole or not at all: what was there before stays until its successor is complete.
 
     Args:
       path: the file.
@@ -116,6 +116,7 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         pixels = pixels.astype(np.float32)
     if pixels.dtype.kind != "f":
         raise FileError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
+    pixels = np.ma.filled(image, np.nan) if np.ma.is_masked(image) else pixels
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
         raise FileError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
     if aovs and path.suffix.lower() != ".exr":

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, UserError, require_kind
+from ..core.precision import numbers
 from ..core.ray import Ray
 from ..core.settings import Settings
-from ..core.types import float_leaf
+from ..core.types import array_leaf, float_leaf
 from ..scene.heightfield import Heightfield
 from ..scene.localise import anchor, localise
 from ..scene.scene import Scene
@@ -115,8 +116,8 @@ def cast(
         o = float_leaf(o)
         start, axes = jnp.asarray(o - jnp.broadcast_to(jnp.asarray(corner, o.dtype), o.shape), dtype), o.ndim - 1
     else:
-        start, axes = jnp.asarray(np.asarray(o, np.float64) - corner, dtype), np.ndim(o) - 1
-    d = jnp.asarray(d, dtype)
+        start, axes = array_leaf(numbers(o).astype(np.float64) - corner, dtype), np.ndim(o) - 1
+    d = array_leaf(d, dtype)
     starting = jax.tree.leaves(start)[0].shape[:axes]
     try:
         many = np.broadcast_shapes(starting, d.shape[:-1])
