@@ -17,7 +17,7 @@ from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import array_leaf, float_leaf
 from ..scene.heightfield import Heightfield
-from ..scene.localise import anchor, localise
+from ..scene.localise import anchor, localise, precision
 from ..scene.scene import Scene
 from ..trace.grid import Grid, joined
 from ..trace.hit import Hit
@@ -82,7 +82,7 @@ def cast(
       ValueError: `o` or `d` does not end in an axis of length 3, or not exactly one of `o` and `leaving` is None, or the
         axes do not begin with those of a batch; `leaving` or other settings with a scene that is prepared.
     """
-    scene = surface.scene if isinstance(surface, Prepared) else surface if isinstance(surface, Scene) else None
+    scene = surface._form if isinstance(surface, Prepared) else surface if isinstance(surface, Scene) else None
     ready = isinstance(surface, Prepared | PreparedHeightfield)
     field: Any = None if scene is not None else surface.field if isinstance(surface, PreparedHeightfield) else surface
     if scene is None and not all(hasattr(field, name) for name in ("heights", "dx", "dy", "x0", "y0")):
@@ -99,8 +99,8 @@ def cast(
         raise UserError(f"cast: the {what} was prepared with {surface.settings}, it cannot be cast into with {settings}")
     settings = surface.settings if ready else settings or Settings()
     if scene is not None:
-        dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
-        corner, batch = anchor(scene), ()
+        corner = np.array(surface._origin) if isinstance(surface, Prepared) else anchor(scene)
+        dtype, batch = precision(scene), ()
     else:
         dtype, batch = field.heights.dtype, field.heights.shape[:-2]
         corner = np.array([field.x0, field.y0, 0.0])
