@@ -15,6 +15,7 @@ from ..core.errors import ArgumentError, UserError, require_kind
 from ..core.precision import numbers
 from ..core.ray import Ray
 from ..core.settings import Settings
+from ..core.transfers import takes_numbers
 from ..core.types import array_leaf, float_leaf
 from ..scene.heightfield import Heightfield
 from ..scene.localise import anchor, localise, precision
@@ -52,6 +53,7 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
     return jax.vmap(one)(x, y)
 
 
+@takes_numbers
 def cast(
     surface: Heightfield | Scene | Prepared | PreparedHeightfield,
     o: Any,

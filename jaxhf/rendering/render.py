@@ -18,8 +18,9 @@ from jaxtyping import Float
 from ..boundary.guiding import edge_sets
 from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
-from ..core.errors import UserError, require_kind, require_progress
+from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
+from ..core.transfers import takes_numbers
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light
@@ -49,8 +50,9 @@ jax.tree_util.register_pytree_node(_Given, lambda given: ((), None), lambda _, _
 class Prepared(eqx.Module):
     """A scene with all that its pictures need and that does not depend on the camera; `prepare` makes it, `render` takes it.
 
-    As a pytree, of which `jax.tree.map` and the arguments of `jax.jit` are made, it consists of the camera and of what was
-    prepared, by which pictures are differentiated. The scene is no part of it: a change of it would change no picture.
+    As a pytree, for `jax.tree.map` or as the argument of a compiled function, it consists of the camera and of what was
+    prepared. The scene is no part of it, as a change of that would change no picture: to differentiate by heights, lights or
+    materials, prepare within the function.
 
     Attributes:
       camera: that is to see it.
@@ -84,6 +86,7 @@ class Prepared(eqx.Module):
         (self._given.scene or self._form).with_camera(camera)  # which checks it
         return dataclasses.replace(self, camera=camera)
 
+    @takes_numbers
     def with_lights(self, lights: Iterable[Light]) -> "Prepared":
         """The same in another light; normals, bounds and what hides the sky are kept, see `Scene.with_lights`."""
         scene = (self._given.scene or self._form).with_lights(lights)
@@ -126,6 +129,7 @@ class PreparedHeightfield(eqx.Module):
 def prepare(scene: Scene, settings: Settings | None = None, *, mesh: Mesh | None = None) -> Prepared: ...
 @overload
 def prepare(scene: Heightfield, settings: Settings | None = None) -> PreparedHeightfield: ...
+@takes_numbers
 def prepare(
     scene: Scene | Heightfield, settings: Settings | None = None, *, mesh: Mesh | None = None
 ) -> Prepared | PreparedHeightfield:
@@ -150,6 +154,7 @@ def prepare(
     return Prepared(scene.camera, mesh, world, tuple(anchor(scene).tolist()), form, _Given(scene))
 
 
+@takes_numbers
 def render(
     scene: Scene | Prepared,
     settings: Settings | None = None,
@@ -184,6 +189,7 @@ def render(
     """
     _require_scene("render", scene, (Scene, Prepared))
     require_progress("render", progress)
+    require_key(key)
     chosen_mesh("render", mesh)
     aovs = known_aovs("render", aovs)
     if not isinstance(scene, Prepared) and (progress is not None or scene.sky_occlusion is not None):
@@ -222,6 +228,13 @@ def _require_scene(owner: str, scene: Any, kind: type | tuple[type, ...]) -> Non
     elif isinstance(scene, Prepared):
         hint = "whose .scene can be prepared anew"
     require_kind(owner, "scene", scene, kind, "a jaxhf.Scene", hint)
+
+
+def require_key(key: Any) -> None:
+    """Refuses what is neither a key of JAX's, nor its older form, two numbers."""
+    typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
+    if not (key is None or typed or (isinstance(key, jax.Array | np.ndarray) and key.dtype == np.uint32 and key.ndim == 1)):
+        raise ArgumentError("render", "key", f"must be one key of JAX's, as jax.random.key(0) makes it, it is {key!r}")
 
 
 def _key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:

@@ -5,6 +5,7 @@ from typing import Any, SupportsFloat
 
 import equinox as eqx
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_kind
@@ -52,6 +53,8 @@ class Heightfield(eqx.Module):
                 f"shape {shape} makes {padded[0]} x {padded[1]}",
             )
         for name, value in (("dx", dx), ("dy", dy), ("x0", x0), ("y0", y0)):
+            if isinstance(value, Tracer):
+                raise ArgumentError("Heightfield", name, "must be known when programs are compiled, it is traced by JAX")
             require_kind("Heightfield", name, 0.0 if value is None else value, SupportsFloat, "one number")
         square = dx if dy is None else dy  # one of the two alone counts for both
         self.dx = float(1 / (shape[1] - 1) if square is None else square if dx is None else dx)

@@ -38,6 +38,10 @@ def field(heights, **arguments):
     return lambda: ANYTHING.Heightfield(heights, **arguments)
 
 
+def field_of_size(dx):
+    return ANYTHING.Heightfield(GRID, dx=dx).heights
+
+
 def settings(**arguments):
     return lambda: ANYTHING.Settings(**arguments)
 
@@ -75,6 +79,7 @@ BAD = [
     (field([]), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (0,)"),
     (field(np.zeros((0, 3))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (0, 3)"),
     (field(np.zeros((2, 2, 2))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (2, 2, 2)"),
+    (lambda: jax.jit(field_of_size)(1.0), "Heightfield: dx must be known when programs are compiled, it is traced by JAX"),
     (field(GRID, dx=0.0), "Heightfield: dx must be positive and finite, it is 0.0"),
     (field(GRID, dx=-1.0), "Heightfield: dx must be positive and finite, it is -1.0"),
     (field(GRID, dx=1.0, dy=INF), "Heightfield: dy must be positive and finite, it is inf"),
@@ -482,3 +487,11 @@ def test_a_camera_above_sees_all_of_a_field(shape, size):
     assert np.isclose(half, middle).any()
     if None in size:  # less than half a pixel on either side is beside it
         assert (half - middle < half / pixels).all()
+
+
+def test_a_traced_up_looks_like_a_known_one():
+    """In single precision, any warning being an error: NumPy's numbers beside it are in double precision."""
+    eye, target, up = (0.5, -1.0, 1.0), (0.5, 0.5, 0.0), (0.1, 0.0, 1.0)
+    with jax.enable_x64(False):
+        looking = jax.jit(lambda up: jaxhf.Perspective.look_at(eye, target, up).world_from_camera)(jnp.asarray(up))
+    np.testing.assert_allclose(looking, jaxhf.Perspective.look_at(eye, target, up).world_from_camera, atol=1e-6)
