@@ -22,7 +22,7 @@ def add(commands: Any) -> None:
     command = commands.add_parser("render", help="render a scene to a picture", description=about, epilog=examples)
     command.add_argument("scene", metavar="SCENE", help="a .toml or .pbrt scene")
     command.add_argument(
-        "-o", "--output", required=True, metavar="OUT", help="the picture: .png (sRGB), .exr, .npy or .pfm (linear)"
+        "-o", "--output", required=True, metavar="OUT", help="the picture: .png, .jpg (sRGB), .exr, .npy or .pfm (linear)"
     )
     command.add_argument(
         "--aovs", type=lambda names: tuple(name.strip() for name in names.split(",")), default=(), metavar="NAMES",

@@ -36,7 +36,7 @@ def add(commands: Any) -> None:
     )
     command.add_argument("terrain", metavar="IN", nargs="?", help=f"heights: {arguments.TERRAIN}")
     command.add_argument("--demo", action="store_true", help="in place of IN the Jacksboro fault, which matplotlib ships")
-    command.add_argument("-o", "--output", metavar="OUT", help=".png, .exr, .npy, .pfm; a film: .gif, .mp4 [IN's name, .png]")
+    command.add_argument("-o", "--output", metavar="OUT", help=".png, .jpg, .exr, .npy; a film: .gif, .mp4 [IN's name, .png]")
     size = command.add_argument_group("picture")
     size.add_argument("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]")
     size.add_argument(

@@ -1,7 +1,8 @@
-"""Heights of a caller's or of a file in the precision of what is made of them."""
+"""Numbers of a caller's or of a file in NumPy's own kinds, and heights in the precision of what is made of them."""
 
 import math
 import warnings
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -11,8 +12,33 @@ from .errors import ArgumentError
 WORTH_A_WARNING = 1e-3  # of the relief
 
 
+def numbers(value: Any) -> np.ndarray:
+    """An array of a caller's with nan where it is masked, in this machine's byte order; it may share the caller's memory.
+
+    float16 and bfloat16 become float32, longdouble becomes float64. Whole numbers stay, but where some are masked; so does what
+    is no number, for the caller to refuse.
+    """
+    masked = isinstance(value, np.ma.MaskedArray)
+    given = np.ma.getdata(value) if masked else np.asarray(value)
+    kind = given.dtype.kind
+    if given.dtype.name not in ("float32", "float64") or not given.dtype.isnative:
+        if kind in "fV" and np.can_cast(given.dtype, np.float32):  # V: bfloat16 and its like
+            given = given.astype(np.float32)
+        elif kind == "f":
+            given = given.astype(np.float64)
+    if masked and np.ma.is_masked(value) and given.dtype.kind in "fiu":
+        return np.where(np.ma.getmaskarray(value), np.float32(np.nan), given)
+    return given
+
+
 def fitted(heights: np.ndarray, dtype: DTypeLike, owner: str = "") -> np.ndarray:
-    """The heights in another precision, with a warning where one moves by more than a thousandth of their relief.
+    """A copy of the heights in another precision, see `require_fit`."""
+    require_fit(heights, dtype, owner)
+    return heights.astype(dtype)
+
+
+def require_fit(heights: np.ndarray, dtype: DTypeLike, owner: str = "") -> None:
+    """Warns where a height moves by more than a thousandth of their relief in another precision.
 
     Args:
       heights: of any shape; what is not finite is a hole.
@@ -28,9 +54,8 @@ def fitted(heights: np.ndarray, dtype: DTypeLike, owner: str = "") -> np.ndarray
         warnings.warn(
             f"{place} are rounded to {np.dtype(dtype)}, which moves one by {100 * moved:.3g} % of the relief: subtract a "
             "constant from them, such as the lowest",
-            stacklevel=2,
+            stacklevel=3,
         )
-    return heights.astype(dtype)
 
 
 def rounding(heights: np.ndarray, dtype: DTypeLike) -> float:

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .errors import ArgumentError, UserError
-from .precision import fitted
+from .errors import ArgumentError, UserError, kind_of
+from .precision import numbers, require_fit
 
 # What a leaf of a scene may be: float64 NumPy until the scene is rendered, or whatever JAX array or tracer the caller put
 # there. A type checker takes it for the latter, which it is wherever rays are traced.
@@ -19,6 +19,7 @@ else:
 
 MOST = 1e30  # of a number in a scene: beyond, products overflow in single precision
 MOST_PLACES = 2**31 - 1  # of numbers in an array that several heightfields share: places in it are 32-bit integers
+_ALIGNED = 64  # bytes
 
 Scalar = Float[jax.Array, ""]
 Flag = Bool[jax.Array, ""]
@@ -32,31 +33,55 @@ MatrixLeaf = Float[AnyArray, "4 4"]
 
 
 def float_leaf(value: Any) -> Any:
-    """Keeps a JAX array or tracer of floats as it is; turns anything else into a float64 NumPy array.
+    """Keeps a JAX array or tracer of floats as it is; turns anything else into a float64 NumPy array of its own.
 
     Positions therefore keep double precision until `localise` has moved the origin next to the terrain, even where JAX
     itself runs in single precision. Whole numbers in JAX become floats, as what is computed in their type loses its
-    fractions.
+    fractions. What is masked is nan.
     """
     if isinstance(value, jax.Array):
         return value if jnp.issubdtype(value.dtype, jnp.inexact) else value.astype(jnp.result_type(float))
     try:
-        return np.asarray(value, dtype=np.float64)
+        return np.array(numbers(value), dtype=np.float64)
     except (TypeError, ValueError) as error:
         shown = repr(value)
         raise UserError(f"{shown if len(shown) <= 60 else type(value).__name__} stands where numbers must") from error
 
 
-def height_leaf(owner: str, value: Any, dtype: Any = None) -> jax.Array:
-    """Heights as an array of JAX, in `dtype` or as they are given, where whole numbers become float32; see `fitted`."""
+def height_leaf(owner: str, name: str, value: Any, dtype: Any = None) -> jax.Array:
+    """Heights as an array of JAX, in `dtype`, or in float32 or float64 as they are given; see `numbers` and `require_fit`.
+
+    Whole numbers become float32. ArgumentError where they are no real numbers.
+    """
+    try:
+        given = value if isinstance(value, jax.Array) else numbers(value)
+    except (TypeError, ValueError) as error:  # lists of several lengths
+        raise ArgumentError(owner, name, f"must be an array of real numbers, they are {kind_of(value)}") from error
+    if not (jnp.issubdtype(given.dtype, jnp.floating) or jnp.issubdtype(given.dtype, jnp.integer)):
+        found = given.dtype if isinstance(value, jax.Array | np.ndarray) else kind_of(value)
+        hint = ": take its .heightfield()" if hasattr(value, "heightfield") else ""
+        raise ArgumentError(owner, name, f"must be an array of real numbers, they are {found}{hint}")
+    exact = given.dtype in (jnp.float32, jnp.float64)
+    dtype = dtype or (jax.dtypes.canonicalize_dtype(given.dtype) if exact else jnp.dtype(jnp.float32))
+    if isinstance(given, jax.Array):
+        return given.astype(dtype)
+    require_fit(given, dtype, owner)
+    return array_leaf(given, dtype)
+
+
+def array_leaf(value: Any, dtype: Any) -> jax.Array:
+    """An array of JAX's, which what is done to NumPy's afterwards does not change. What is masked is nan.
+
+    JAX on a CPU shares the memory of NumPy's arrays that lie aligned, as the copy made here does: so there is no second one.
+    """
     if isinstance(value, jax.Array):
-        whole = jnp.issubdtype(value.dtype, jnp.integer)
-        return value.astype(dtype or (jnp.float32 if whole else value.dtype))
-    given = np.asarray(value)
-    if given.dtype.kind in "fiu":
-        dtype = dtype or (np.float32 if given.dtype.kind in "iu" else jax.dtypes.canonicalize_dtype(given.dtype))
-        given = given if given.dtype == dtype else fitted(given, dtype, owner)
-    return jnp.asarray(given, dtype)
+        return jnp.asarray(value, dtype)
+    given, dtype = numbers(value), np.dtype(dtype)
+    room = np.empty(given.size * dtype.itemsize + _ALIGNED, np.uint8)
+    start = -room.ctypes.data % _ALIGNED
+    copy = room[start : start + given.size * dtype.itemsize].view(dtype).reshape(given.shape)
+    copy[...] = given
+    return jnp.asarray(copy, dtype)
 
 
 def rgb_leaf(value: Any) -> Any:

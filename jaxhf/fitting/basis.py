@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..core.errors import ArgumentError
-from ..core.precision import fitted
+from ..core.precision import numbers, require_fit
 from ..scene.heightfield import Heightfield
 from .view import KNOWN, View
 
@@ -172,7 +172,7 @@ def dct_matrix(n: int) -> Float[np.ndarray, "n n"]:
 def make_heights(name: str, value: Any, field: Heightfield) -> Float[np.ndarray, "ny nx"]:
     """Heights at the vertices of `field` from a number (flat), or from a grid of any size over the same footprint."""
     shape = field.heights.shape
-    heights = np.asarray(value, np.float64)
+    heights = np.array(numbers(value), np.float64)
     if heights.shape == ():
         heights = np.full(shape, heights)
     if heights.ndim != 2 or min(heights.shape) < 2:
@@ -180,7 +180,7 @@ def make_heights(name: str, value: Any, field: Heightfield) -> Float[np.ndarray,
     if not np.isfinite(heights).all():
         iy, ix = np.argwhere(~np.isfinite(heights))[0]
         raise ArgumentError("fit", name, f"must be finite, row {iy} column {ix} is {heights[iy, ix]}")
-    fitted(heights, field.heights.dtype, f"fit, {name}")  # for its warning
+    require_fit(heights, field.heights.dtype, f"fit, {name}")
     return heights if heights.shape == shape else resample(heights, shape)
 
 

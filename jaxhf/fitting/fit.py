@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 
 from ..core.errors import ArgumentError, kind_of
 from ..core.settings import Settings
+from ..core.transfers import takes_numbers
 from ..core.types import AnyArray
 from ..io.checkpoint import load_facts
 from ..io.errors import FileError
@@ -91,6 +92,7 @@ class Fit:
     history: tuple[Step, ...]
 
 
+@takes_numbers
 def fit(
     scenes: Sequence[Scene],
     targets: Sequence[Any],

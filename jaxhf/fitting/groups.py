@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.errors import ArgumentError
+from ..core.precision import numbers
 from ..core.settings import Settings
 from ..scene.localise import localise
 from ..scene.scene import Scene
@@ -153,18 +154,18 @@ def _checked_picture(
     size = (scene.camera.height, scene.camera.width)
     if isinstance(target, str | os.PathLike):
         raise ArgumentError("fit", f"targets[{k}]", f"must be an image, it is a name: jaxhf.load_image({os.fspath(target)!r})")
-    target = np.asarray(target)
-    if target.dtype.kind not in "fV":  # the latter are bfloat16 and its like
-        rule = f"must hold linear radiance in floats, 1 being white; it holds {target.dtype} (load_image decodes a picture)"
+    given = np.asarray(target).dtype
+    if given.kind not in "fV":  # the latter are bfloat16 and its like
+        rule = f"must hold linear radiance in floats, 1 being white; it holds {given} (load_image decodes a picture)"
         raise ArgumentError("fit", f"targets[{k}]", rule)
-    target = target.astype(np.float64)
+    target = numbers(target).astype(np.float64)
     if target.shape not in (size, (*size, 1), (*size, 3)):
         raise ArgumentError(
             "fit", f"targets[{k}]", f"must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}"
         )
     target = target.reshape(*size, -1)
-    weight = np.ones(size) if weights is None or weights[k] is None else np.asarray(weights[k])
-    if weight.dtype.kind not in "biufV":
+    weight = np.ones(size) if weights is None or weights[k] is None else numbers(weights[k])
+    if weight.dtype.kind not in "biuf":
         raise ArgumentError("fit", f"weights[{k}]", f"must hold numbers, it holds {weight.dtype}")
     weight = weight.astype(np.float64)
     if weight.shape not in (size, target.shape):

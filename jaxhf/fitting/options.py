@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from ..core.errors import ArgumentError, kind_of, require_kind, whole_number
+from ..core.precision import numbers
 from ..core.settings import Settings
 from .history import Draws, Step
 
@@ -129,10 +130,10 @@ class FitOptions:
 def _real(value: Any) -> np.ndarray | None:
     """An array of real numbers; None where the value is something else."""
     try:
-        found = np.asarray(value)
+        found = numbers(value)
     except (TypeError, ValueError):  # lists of several lengths
         return None
-    return found if found.dtype.kind in "iufV" else None  # V: bfloat16 and its like
+    return found if found.dtype.kind in "iuf" else None
 
 
 def _is_positive(value: Any) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..core.errors import ArgumentError
+from ..core.precision import numbers
 from ..scene.heightfield import Heightfield
 from .basis import dct_matrix, make_heights, pad
 
@@ -38,7 +39,7 @@ def make_prior(field: Heightfield, prior: Any, std: Any, length: float | int | N
         return None
     if std is None:
         raise ArgumentError("fit", "prior", "must stand with prior_std, how far it may be off")
-    std = np.asarray(std, np.float64)
+    std = np.asarray(numbers(std), np.float64)
     if std.shape not in ((), shape):
         raise ArgumentError(
             "fit", "prior_std", f"must be a number or of shape {shape}, as the heights; its shape is {std.shape}"

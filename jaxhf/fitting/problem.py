@@ -13,6 +13,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from ..core.errors import ArgumentError
+from ..core.precision import numbers
 from ..core.settings import Settings
 from ..core.types import Flag
 from ..scene.light import Sky
@@ -227,7 +228,7 @@ def _noise(given: Any, targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]
     """The standard deviation of each picture's values; where none is given, one from which an estimate begins."""
     if given is None:
         return _FIRST_NOISE * _brightness(targets)
-    noise = np.asarray(given, np.float64)
+    noise = np.asarray(numbers(given), np.float64)
     if noise.shape not in ((), (len(targets),)) or not (np.isfinite(noise) & (noise > 0)).all():
         raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {given!r}")
     return np.broadcast_to(noise, (len(targets),)).copy()

@@ -92,14 +92,15 @@ def require_transfer(owner: str, transfer: Any) -> None:
 def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapping[str, Any] | None = None) -> None:
     """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
 
-    Values are radiance in floats, 1 being white; bytes of 0..255 are not. .png: 8 bits of the values clipped to 0..1;
-    nan becomes 0. .exr and .pfm: float32. .npy: in the precision of `image`. The last three keep nan and inf. The file
-    appears whole or not at all: what was there before stays until its successor is complete.
+    Values are radiance in floats, 1 being white; bytes of 0..255 are not. What is masked is nan. .png, .jpg: 8 bits of the
+    values clipped to 0..1, nan becomes 0; a .jpg has Pillow's quality 95. .exr and .pfm: float32. .npy: in the precision of
+    `image`. The last three keep nan and inf. The file appears whole or not at all: what was there before stays until its
+    successor is complete.
 
     Args:
       path: the file.
       image: the radiance.
-      transfer: the bytes of a .png: "srgb", which viewers and `load_image` expect; "linear", 255 times the value, as in
+      transfer: the bytes of a .png or .jpg: "srgb", which viewers and `load_image` expect; "linear", 255 times the value, as in
         GDAL's shaded maps. The other formats always hold the values as they are.
       aovs: what `render` gives beside the image, by name, each (h, w) or (h, w, c): layers of an .exr, in float32. Their
         channels are those of compositing programs: depth.Z, normal.X, normal.Y, normal.Z, uv.U, uv.V, else name.V, or
@@ -116,6 +117,7 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         pixels = pixels.astype(np.float32)
     if pixels.dtype.kind != "f":
         raise FileError(f"{path}: an image must hold linear radiance in floats, 1 being white; this one holds {pixels.dtype}")
+    pixels = np.ma.filled(image, np.nan) if np.ma.is_masked(image) else pixels
     if pixels.ndim not in (2, 3) or pixels.shape[2:] not in ((), (3,)) or 0 in pixels.shape:
         raise FileError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
     if aovs and path.suffix.lower() != ".exr":
@@ -306,12 +308,25 @@ def _read_tiff(path: Path) -> np.ma.MaskedArray:
     return np.ma.array(image, mask=np.broadcast_to(~there if image.ndim == 2 else ~there[..., None], image.shape))
 
 
-# One writer a format; the last argument maps linear values in 0..1 to those that a .png holds.
+_MOST_OF_JPEG = 65500  # of libjpeg
+
+# One writer a format; the last argument maps linear values in 0..1 to those that a .png or .jpg holds.
 
 
 def _write_png(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> None:
+    write_png(path, _in_bytes(pixels, encode))
+
+
+def _write_jpeg(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> None:
+    if max(pixels.shape[:2]) > _MOST_OF_JPEG:
+        raise FileError(f"a JPEG has at most {_MOST_OF_JPEG} pixels a side, this has {pixels.shape[1]} x {pixels.shape[0]}")
+    with path.open("wb") as file:
+        imageio.imwrite(file, _in_bytes(pixels, encode), plugin="pillow", extension=".jpg", quality=95, subsampling=0)
+
+
+def _in_bytes(pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> UInt8[np.ndarray, "..."]:
     clipped = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
-    write_png(path, (encode(clipped) * 255 + 0.5).astype(np.uint8))
+    return (encode(clipped) * 255 + 0.5).astype(np.uint8)
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
@@ -367,6 +382,8 @@ _READERS: dict[str, Callable[[Path], np.ndarray]] = {
 }
 _WRITERS: dict[str, Callable[[Path, np.ndarray, Callable[[np.ndarray], np.ndarray]], None]] = {
     ".png": _write_png,
+    ".jpg": _write_jpeg,
+    ".jpeg": _write_jpeg,
     ".exr": _write_exr,
     ".pfm": _write_pfm,
     ".npy": _write_npy,

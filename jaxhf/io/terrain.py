@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import DTypeLike
 
 from ..core.errors import ArgumentError
-from ..core.precision import WORTH_A_WARNING, fitted, rounding
+from ..core.precision import WORTH_A_WARNING, fitted, numbers, rounding
 from .errors import FileError
 from .georeference import (
     WGS84,
@@ -29,10 +29,11 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Terrain:
-    """Heights on a regular grid, in NumPy.
+    """Heights on a regular grid, in NumPy; the caller's own array, not a copy, where it is of one of these kinds.
 
     Attributes:
-      heights: shape (ny, nx), float32 or float64, row 0 in the south, column 0 in the west; nan where there is no data.
+      heights: shape (ny, nx), float32 or float64, row 0 in the south, column 0 in the west; nan where there is no data,
+        and where they are masked.
       dx, dy: cell size, in the unit of x and y.
       x0, y0: where vertex (0, 0), the one in the south-west, stands.
       crs: the reference system of x and y; None: the four numbers above are not known, but assumed.
@@ -49,6 +50,7 @@ class Terrain:
     georeference: Georeference | None = None
 
     def __post_init__(self):
+        object.__setattr__(self, "heights", numbers(self.heights))
         if self.heights.ndim != 2 or min(self.heights.shape) < 2:
             raise ArgumentError("", "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {self.heights.shape}")
         for name in ("dx", "dy", "x0", "y0"):
@@ -135,12 +137,10 @@ class Terrain:
         Raises:
           ValueError: heights do not fit into `dtype`, or there are more than a `Heightfield` holds.
         """
-        import jax  # which converting a file does without
+        from ..scene.heightfield import Heightfield  # with JAX, which converting a file does without
 
-        from ..scene.heightfield import Heightfield
-
-        wanted = np.dtype(jax.dtypes.canonicalize_dtype(self.heights.dtype) if dtype is None else dtype)
-        return Heightfield(fitted(self.heights, wanted), self.dx, self.dy, self.x0, self.y0)
+        heights = self.heights if dtype is None else fitted(self.heights, dtype)
+        return Heightfield(heights, self.dx, self.dy, self.x0, self.y0)
 
     def in_metres(self, **given: float) -> "Terrain":
         """The terrain with degrees turned into metres from vertex (0, 0), and then with `given` for its dx, dy, x0 and y0."""

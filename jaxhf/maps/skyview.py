@@ -13,6 +13,7 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_progress
+from ..core.transfers import takes_numbers
 from ..io.terrain import Terrain
 from ..scene.heightfield import Heightfield
 from ..trace.horizon import (
@@ -32,6 +33,7 @@ from ..xla.devices import chosen_mesh, on_every_device
 from .surface import both_spacings, spacing
 
 
+@takes_numbers
 def horizon(
     terrain: Any,
     azimuths: Any = 32,
@@ -76,6 +78,7 @@ def horizon(
     )
 
 
+@takes_numbers
 def sky_view(
     terrain: Any,
     azimuths: int = 32,

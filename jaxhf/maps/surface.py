@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from ..core.errors import ArgumentError
-from ..core.precision import fitted
+from ..core.precision import fitted, numbers
 from ..io.terrain import Terrain
 
 Heights = ArrayLike | Terrain
@@ -82,7 +82,7 @@ def both_spacings(owner: str, heights: Any, given: dict[str, float]) -> tuple[fl
 
 
 def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:
-    values = np.asarray(heights)
+    values = numbers(heights)
     if values.dtype.kind not in "fiu":
         given = f"of {values.dtype}" if isinstance(heights, np.ndarray) else f"a {type(heights).__name__}"
         raise ArgumentError(owner, "heights", f"must be an array of real numbers or a Terrain, they are {given}")

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError, UserError, kind_of
 from ..core.settings import Settings
-from ..core.types import AnyArray, float_leaf, height_leaf, require_finite
+from ..core.types import AnyArray, array_leaf, float_leaf, height_leaf, require_finite
 from ..rendering.render import heightfield_grids
 from ..scene.heightfield import Heightfield
 from ..trace.grid import Grid, make_grid
@@ -49,11 +49,7 @@ class HField(eqx.Module):
     _grid: Grid | None = eqx.field(init=False)
 
     def __init__(self, data: Any, size: Any, pos: Any = (0, 0, 0), quat: Any = (1, 0, 0, 0)):
-        try:
-            data = height_leaf("HField", data)
-        except TypeError as error:
-            raise ArgumentError("HField", "data", f"must be numbers, it is {kind_of(data)}") from error
-        self.data = data if data.dtype in (jnp.float32, jnp.float64) else data.astype(jnp.float32)
+        self.data = data = height_leaf("HField", "data", data)
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
             rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"
             raise ArgumentError("HField", "data", rule)
@@ -134,7 +130,7 @@ class HField(eqx.Module):
 def as_numbers(owner: str, name: str, value: Any, dtype: Any) -> jax.Array:
     """An array of JAX's; ArgumentError where an argument is something else, as the `mjx.Data` whose `qpos` was meant."""
     try:
-        return jnp.asarray(value, dtype)
+        return array_leaf(value, dtype)
     except (TypeError, ValueError) as error:
         raise ArgumentError(owner, name, f"must be numbers, it is {kind_of(value)}") from error
 

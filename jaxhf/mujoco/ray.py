@@ -14,6 +14,7 @@ from ..core.affine import Affine
 from ..core.autodiff import stored
 from ..core.errors import ArgumentError, require_kind
 from ..core.ray import Ray
+from ..core.transfers import takes_numbers
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import finite, quotient, unit
 from ..rendering.chunks import trace_batch
@@ -48,6 +49,7 @@ class Met(eqx.Module):
     valid: Flag
 
 
+@takes_numbers
 def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], Float[jax.Array, "*rays 3"]]:
     """The distances at which rays pnt + x vec, x >= 0, first meet a height field, in units of |vec|, and the normals there.
 

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float
 from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, require_kind
 from ..core.ray import Ray
+from ..core.transfers import takes_numbers
 from ..core.types import Point2, Scalar, Vector, require_number
 from ..trace.status import Status
 from ..trace.triangle import plane_through
@@ -68,6 +69,7 @@ def grid_pattern(size: tuple[float, float] = (1.6, 1.0), resolution: float = 0.1
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
 
 
+@takes_numbers
 def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, offset: Any = 20.0, align: str = "yaw") -> Scan:
     """What rays meet that start above each place of a pattern, which moves and turns with a robot, and go down.
 

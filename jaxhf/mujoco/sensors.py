@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_kind, whole_number
+from ..core.transfers import takes_numbers
 from ..scene.camera import require_size
 from ..xla.compilation import compiled
 from .hfield import HField, as_numbers, known_numbers, number_pair
@@ -54,6 +55,7 @@ def lidar_pattern(
     return np.stack([x, y, z], -1).reshape(-1, 3)
 
 
+@takes_numbers
 def lidar(hfields: HField, pos: Any, quat: Any, pattern: Any = None) -> Scan:
     """What rays from a sensor meet, in directions that turn with it; `dist` is in units of a direction's length.
 
@@ -77,6 +79,7 @@ def lidar(hfields: HField, pos: Any, quat: Any, pattern: Any = None) -> Scan:
     return Scan(met.p, met.n, met.t, met.valid)
 
 
+@takes_numbers
 def depth_image(
     hfields: HField, pos: Any, quat: Any, width: int, height: int, *, fovy: float = 45.0, intrinsics: Any = None
 ) -> tuple[Float[jax.Array, "*cameras h w"], Float[jax.Array, "*cameras h w"]]:

@@ -12,11 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, UserError, require_kind
+from ..core.precision import numbers
 from ..core.ray import Ray
 from ..core.settings import Settings
-from ..core.types import float_leaf
+from ..core.transfers import takes_numbers
+from ..core.types import array_leaf, float_leaf
 from ..scene.heightfield import Heightfield
-from ..scene.localise import anchor, localise
+from ..scene.localise import anchor, localise, precision
 from ..scene.scene import Scene
 from ..trace.grid import Grid, joined
 from ..trace.hit import Hit
@@ -52,6 +54,7 @@ def _cast_camera(scene: Scene, x: jax.Array, y: jax.Array, settings: Settings) -
     return jax.vmap(one)(x, y)
 
 
+@takes_numbers
 def cast(
     surface: Heightfield | Scene | Prepared | PreparedHeightfield,
     o: Any,
@@ -85,7 +88,7 @@ def cast(
     if isinstance(surface, Prepared):
         prepared_mesh("cast", surface.mesh, None, ())
     surface, o, d, leaving = where_called("cast", (surface, o, d, leaving))
-    scene = surface.scene if isinstance(surface, Prepared) else surface if isinstance(surface, Scene) else None
+    scene = surface._form if isinstance(surface, Prepared) else surface if isinstance(surface, Scene) else None
     ready = isinstance(surface, Prepared | PreparedHeightfield)
     field: Any = None if scene is not None else surface.field if isinstance(surface, PreparedHeightfield) else surface
     if scene is None and not all(hasattr(field, name) for name in ("heights", "dx", "dy", "x0", "y0")):
@@ -102,8 +105,8 @@ def cast(
         raise UserError(f"cast: the {what} was prepared with {surface.settings}, it cannot be cast into with {settings}")
     settings = surface.settings if ready else settings or Settings()
     if scene is not None:
-        dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
-        corner, batch = anchor(scene), ()
+        corner = np.array(surface._origin) if isinstance(surface, Prepared) else anchor(scene)
+        dtype, batch = precision(scene), ()
     else:
         dtype, batch = field.heights.dtype, field.heights.shape[:-2]
         corner = np.array([field.x0, field.y0, 0.0])
@@ -119,8 +122,8 @@ def cast(
         o = float_leaf(o)
         start, axes = jnp.asarray(o - jnp.broadcast_to(jnp.asarray(corner, o.dtype), o.shape), dtype), o.ndim - 1
     else:
-        start, axes = jnp.asarray(np.asarray(o, np.float64) - corner, dtype), np.ndim(o) - 1
-    d = jnp.asarray(d, dtype)
+        start, axes = array_leaf(numbers(o).astype(np.float64) - corner, dtype), np.ndim(o) - 1
+    d = array_leaf(d, dtype)
     starting = jax.tree.leaves(start)[0].shape[:axes]
     try:
         many = np.broadcast_shapes(starting, d.shape[:-1])

@@ -18,12 +18,13 @@ from jaxtyping import Float
 from ..boundary.guiding import edge_sets
 from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
-from ..core.errors import UserError, require_kind, require_progress
+from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
+from ..core.transfers import takes_numbers
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light
-from ..scene.localise import localise, localise_camera
+from ..scene.localise import anchor, localise, localise_camera, localise_lights, precision
 from ..scene.scene import Scene
 from ..trace.grid import Grid
 from ..trace.world import World, make_ceilings, make_surface, make_world, resolve_settings
@@ -36,18 +37,45 @@ from .samples import PictureSamples
 from .tiles import Tiling, light_along, trace_tiles
 
 
+class _Given:
+    """A scene that is no part of a pytree: what JAX has taken apart and put together again has it no longer."""
+
+    def __init__(self, scene: Scene | None):
+        self.scene = scene
+
+
+jax.tree_util.register_pytree_node(_Given, lambda given: ((), None), lambda _, __: _Given(None))
+
+
 class Prepared(eqx.Module):
     """A scene with all that its pictures need and that does not depend on the camera; `prepare` makes it, `render` takes it.
 
+    As a pytree, for `jax.tree.map` or as the argument of a compiled function, it consists of the camera and of what was
+    prepared. The scene is no part of it, as a change of that would change no picture: to differentiate by heights, lights or
+    materials, prepare within the function.
+
     Attributes:
-      scene: as it was given, with the camera that is to see it.
+      camera: that is to see it.
+      scene: as it was given, with that camera; ValueError of what JAX has taken apart and put together again.
       settings: those for which it was prepared.
-      mesh: the devices on which it lies.
+      mesh: the devices on which it lies. What is read from a pickle lies on those of the same numbers, or on all of a process
+        that has no such devices.
     """
 
-    scene: Scene
+    camera: Camera
     mesh: Mesh = eqx.field(static=True)
     _world: World
+    _origin: tuple[float, ...] = eqx.field(static=True)  # of `_world`, in the scene's frame
+    _form: Scene = eqx.field(static=True)  # the scene, with shapes and dtypes in place of arrays
+    _given: _Given
+
+    @property
+    def scene(self) -> Scene:
+        if self._given.scene is None:
+            raise UserError(
+                "Prepared: scene is no part of its pytree: change the scene, or differentiate by it, and prepare it"
+            )
+        return self._given.scene.with_camera(self.camera)
 
     @property
     def settings(self) -> Settings:
@@ -55,16 +83,33 @@ class Prepared(eqx.Module):
 
     def with_camera(self, camera: Camera) -> "Prepared":
         """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
-        return dataclasses.replace(self, scene=self.scene.with_camera(camera))
+        (self._given.scene or self._form).with_camera(camera)  # which checks it
+        return dataclasses.replace(self, camera=camera)
 
+    @takes_numbers
     def with_lights(self, lights: Iterable[Light]) -> "Prepared":
         """The same in another light; normals, bounds and what hides the sky are kept, see `Scene.with_lights`."""
-        scene = self.scene.with_lights(lights)
-        if scene.sky_occlusion != self.scene.sky_occlusion:
-            return prepare(scene, self.settings, mesh=self.mesh)
-        local = on_every_device(localise(scene).lights, prepared_mesh("with_lights", self.mesh, None, scene))
+        scene = (self._given.scene or self._form).with_lights(lights)
+        if scene.sky_occlusion != self._form.sky_occlusion:
+            return prepare(self.scene.with_lights(scene.lights), self.settings, mesh=self.mesh)
+        local = localise_lights(scene.lights, np.array(self._origin), precision(self._form))
+        local = on_every_device(local, prepared_mesh("with_lights", self.mesh, None, local))
         ceilings = _make_ceilings(self._world.surfaces, local, self.settings)
-        return dataclasses.replace(self, scene=scene, _world=dataclasses.replace(self._world, lights=local, ceilings=ceilings))
+        world = dataclasses.replace(self._world, lights=local, ceilings=ceilings)
+        return dataclasses.replace(self, _world=world, _given=_Given(self._given.scene and scene))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Devices cannot be pickled, nor copied: their numbers stand for them."""
+        numbers = np.vectorize(lambda device: device.id, otypes=[int])(self.mesh.devices)
+        return {**vars(self), "mesh": (numbers, self.mesh.axis_names, self.mesh.axis_types)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        numbers, names, kinds = state["mesh"]
+        here = {device.id: device for device in jax.devices()}
+        found = [here[number] for number in numbers.ravel().tolist() if number in here]
+        same = len(found) == numbers.size
+        mesh = Mesh(np.array(found).reshape(numbers.shape), names, axis_types=kinds) if same else chosen_mesh("prepare", None)
+        vars(self).update(state | {"mesh": mesh})
 
 
 class PreparedHeightfield(eqx.Module):
@@ -84,6 +129,7 @@ class PreparedHeightfield(eqx.Module):
 def prepare(scene: Scene, settings: Settings | None = None, *, mesh: Mesh | None = None) -> Prepared: ...
 @overload
 def prepare(scene: Heightfield, settings: Settings | None = None) -> PreparedHeightfield: ...
+@takes_numbers
 def prepare(
     scene: Scene | Heightfield, settings: Settings | None = None, *, mesh: Mesh | None = None
 ) -> Prepared | PreparedHeightfield:
@@ -103,9 +149,12 @@ def prepare(
     _require_scene("prepare", scene, Scene)
     settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("prepare", mesh, scene)
     make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
-    return Prepared(scene, mesh, make(on_every_device(localise(scene), mesh), settings=settings))
+    world = make(on_every_device(localise(scene), mesh), settings=settings)
+    form = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), scene)
+    return Prepared(scene.camera, mesh, world, tuple(anchor(scene).tolist()), form, _Given(scene))
 
 
+@takes_numbers
 def render(
     scene: Scene | Prepared,
     settings: Settings | None = None,
@@ -142,6 +191,7 @@ def render(
     """
     _require_scene("render", scene, (Scene, Prepared))
     require_progress("render", progress, is_traced())
+    require_key(key)
     aovs = known_aovs("render", aovs)
     if isinstance(scene, Prepared):
         here = prepared_mesh("render", scene.mesh, mesh, (scene, key))
@@ -150,10 +200,10 @@ def render(
         if progress is not None or scene.sky_occlusion is not None:
             scene, settings = prepare(scene, settings, mesh=mesh), None
     if isinstance(scene, Prepared):
-        if settings is not None and resolve_settings(settings, scene.scene) != scene.settings:
+        if settings is not None and resolve_settings(settings, scene._form) != scene.settings:
             raise UserError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
-        world = scene._world
-        camera = on_every_device(localise_camera(scene.scene.camera, scene.scene), here)
+        world, place = scene._world, (np.array(scene._origin), precision(scene._form))
+        camera = on_every_device(localise_camera(scene.camera, scene._given.scene, *place), here)
         if progress is None:
             outputs = _trace_prepared(world, camera, aovs, here, _key(key, world.settings, here))
         else:
@@ -180,6 +230,13 @@ def _require_scene(owner: str, scene: Any, kind: type | tuple[type, ...]) -> Non
     elif isinstance(scene, Prepared):
         hint = "whose .scene can be prepared anew"
     require_kind(owner, "scene", scene, kind, "a jaxhf.Scene", hint)
+
+
+def require_key(key: Any) -> None:
+    """Refuses what is neither a key of JAX's, nor its older form, two numbers."""
+    typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
+    if not (key is None or typed or (isinstance(key, jax.Array | np.ndarray) and key.dtype == np.uint32 and key.ndim == 1)):
+        raise ArgumentError("render", "key", f"must be one key of JAX's, as jax.random.key(0) makes it, it is {key!r}")
 
 
 def _key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:

@@ -288,7 +288,7 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
     xp = np if host else jnp
 
     def direction(v):
-        return v / np.sqrt((v * v).sum()) if host else unit(v)
+        return v / np.sqrt((v * v).sum()) if host else unit(jnp.asarray(v))
 
     if host and not (target - eye).any():
         raise ArgumentError("look_at", "target", f"must differ from eye, both are {eye.tolist()}")

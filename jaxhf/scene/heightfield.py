@@ -4,9 +4,8 @@ import math
 from typing import Any, SupportsFloat
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_kind
@@ -19,28 +18,16 @@ MOST_CELLS = 2**28
 _FARTHEST = 1e18  # whose square and inverse square are numbers in single precision
 
 
-def _heights(value: Any) -> jax.Array:
-    try:
-        heights = height_leaf("Heightfield", value)
-    except TypeError as error:
-        whole = ": take its .heightfield()" if hasattr(value, "heightfield") else ""
-        raise ArgumentError(
-            "Heightfield", "heights", f"must be an array of numbers, they are a {type(value).__name__}{whole}"
-        ) from error
-    if heights.dtype not in (jnp.float32, jnp.float64):
-        raise ArgumentError("Heightfield", "heights", f"must be float32, float64 or whole numbers, they are {heights.dtype}")
-    return heights
-
-
 class Heightfield(eqx.Module):
     """A surface z = heights over a regular grid, two triangles to a cell, split along (ix, iy)-(ix+1, iy+1).
 
     Attributes:
       heights: shape (ny, nx), at least 2x2, object units; vertex (ix, iy) stands at x = x0 + ix dx, y = y0 + iy dy. A
-        vertex that is nan or infinite is a hole: the cells around it are not there. Their dtype, float32 or float64, is
-        the precision of everything that is rendered from them; whole numbers become float32, as does float64 without
-        JAX's x64 mode, with a warning where that moves a height by more than a thousandth of the relief. There are at
-        most 2^28 cells, where the cells along each side count as the next power of two.
+        vertex that is nan, infinite or masked is a hole: the cells around it are not there. Their dtype, float32 or
+        float64, is the precision of everything that is rendered from them. Of other real numbers longdouble becomes
+        float64, all else float32; float64 becomes float32 without JAX's x64 mode, with a warning where that moves a
+        height by more than a thousandth of the relief. NumPy's arrays are copied. There are at most 2^28 cells, where
+        the cells along each side count as the next power of two.
       dx, dy: cell size, object units; one alone counts for both. With neither given the grid spans pbrt's unit square.
       x0, y0: where vertex (0, 0) stands. They are metadata in double precision and never enter single-precision
         arithmetic: an offset of 5e6 costs no accuracy.
@@ -53,7 +40,7 @@ class Heightfield(eqx.Module):
     y0: float = eqx.field(static=True)
 
     def __init__(self, heights: Any, dx: float | None = None, dy: float | None = None, x0: float = 0.0, y0: float = 0.0):
-        self.heights = _heights(heights)
+        self.heights = height_leaf("Heightfield", "heights", heights)
         shape = self.heights.shape
         if len(shape) != 2 or min(shape) < 2:
             raise ArgumentError("Heightfield", "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {shape}")
@@ -66,6 +53,8 @@ class Heightfield(eqx.Module):
                 f"shape {shape} makes {padded[0]} x {padded[1]}",
             )
         for name, value in (("dx", dx), ("dy", dy), ("x0", x0), ("y0", y0)):
+            if isinstance(value, Tracer):
+                raise ArgumentError("Heightfield", name, "must be known when programs are compiled, it is traced by JAX")
             require_kind("Heightfield", name, 0.0 if value is None else value, SupportsFloat, "one number")
         square = dx if dy is None else dy  # one of the two alone counts for both
         self.dx = float(1 / (shape[1] - 1) if square is None else square if dx is None else dx)

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -26,7 +27,7 @@ def localise(scene: Scene) -> Scene:
     Where positions are still NumPy numbers the move happens in double precision, so that a terrain in UTM coordinates
     (northings of 5e6, where single precision has steps of 0.5) renders to the same bits as one at the origin.
     """
-    origin = anchor(scene)
+    origin, dtype = anchor(scene), precision(scene)
 
     def moved_object(obj: Object) -> Object:
         shape, corner = obj.shape, _grid_corner(obj.shape)
@@ -40,32 +41,40 @@ def localise(scene: Scene) -> Scene:
             return Object(shape, obj.material)
         return Object(shape, obj.material, _shifted(world, shift))
 
-    def moved_light(light: Light) -> Light:
-        return Point(light.p - _like(light.p, origin), light.intensity) if isinstance(light, Point) else light
-
     moved = Scene(
         objects=tuple(moved_object(obj) for obj in scene.objects),
         camera=scene.camera,
-        lights=tuple(moved_light(light) for light in scene.lights),
+        lights=localise_lights(scene.lights, origin, dtype),
         samples=scene.samples,
     )
-    dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
     moved = jax.tree.map(lambda leaf: _in_precision(leaf, dtype), moved)
-    return eqx.tree_at(lambda moved: moved.camera, moved, localise_camera(scene.camera, scene))
+    return eqx.tree_at(lambda moved: moved.camera, moved, localise_camera(scene.camera, scene, origin, dtype))
 
 
-def localise_camera(camera: Camera, scene: Scene) -> Camera:
-    """A camera for `localise(scene)`.
+def precision(scene: Scene) -> Any:
+    """The dtype in which a scene is rendered: that of its first heights."""
+    return scene.heightfields[0].heights.dtype if scene.heightfields else jnp.result_type(float)
+
+
+def localise_lights(lights: Iterable[Light], origin: np.ndarray, dtype: Any) -> tuple[Light, ...]:
+    """Lights for a `localise`d scene whose origin that is."""
+    moved = tuple(
+        Point(light.p - _like(light.p, origin), light.intensity) if isinstance(light, Point) else light for light in lights
+    )
+    return jax.tree.map(lambda leaf: _in_precision(leaf, dtype), moved)
+
+
+def localise_camera(camera: Camera, scene: Scene | None, origin: np.ndarray, dtype: Any) -> Camera:
+    """A camera for `localise(scene)`, whose origin and precision these are.
 
     From 700 km single precision tells places apart to 0.06. So of a camera that is far from all that it sees, and whose pose
     is still NumPy's, rays begin on a plane in front of that: the matrix is moved there in double precision, and `_ahead` says
-    by how much, in units of its third column.
+    by how much, in units of its third column. Not where the scene is not known.
     """
-    dtype = scene.heights.dtype if scene.heightfields else jnp.result_type(float)
     matrix: Any = camera.world_from_camera
-    moved = _shifted(matrix, -_like(matrix, anchor(scene)))
-    far = _far(matrix, scene)
-    if far is not None:
+    moved = _shifted(matrix, -_like(matrix, origin))
+    far = None if scene is None else _far(matrix, scene)
+    if scene is not None and far is not None:
         distance, size, shares = far
         moved[:3, 3] += distance * moved[:3, 2]
         shapes = tuple(obj.shape for obj in scene.objects)

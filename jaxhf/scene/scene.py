@@ -129,7 +129,7 @@ class Scene(eqx.Module):
     def with_heights(self, heights: Any) -> "Scene":
         """The same scene over other heights of the same shape and precision; nothing is compiled again."""
         old = self.heights
-        new = height_leaf("with_heights", heights, old.dtype)
+        new = height_leaf("with_heights", "heights", heights, old.dtype)
         if new.shape != old.shape:
             raise ArgumentError("with_heights", "heights", f"must keep their shape {old.shape}, theirs is {new.shape}")
         return eqx.tree_at(lambda scene: scene.heightfields[0].heights, self, new)

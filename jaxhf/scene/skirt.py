@@ -1,17 +1,21 @@
 """Walls and a floor with which terrain looks solid."""
 
+import functools
 import math
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
-from ..core.types import AnyArray, ScalarLeaf, float_leaf, require_finite, require_number
+from ..core.types import AnyArray, ScalarLeaf, float_leaf, height_leaf, require_finite, require_number
 from .heightfield import Heightfield
 from .show import number, numbers
+
+_border = functools.partial(height_leaf, "Skirt", "border")
 
 
 class Skirt(eqx.Module):
@@ -27,10 +31,10 @@ class Skirt(eqx.Module):
       dx, dy, x0, y0: those of the heightfield.
     """
 
-    south: Float[AnyArray, " nx"]
-    north: Float[AnyArray, " nx"]
-    west: Float[AnyArray, " ny"]
-    east: Float[AnyArray, " ny"]
+    south: Float[AnyArray, " nx"] = eqx.field(converter=_border)
+    north: Float[AnyArray, " nx"] = eqx.field(converter=_border)
+    west: Float[AnyArray, " ny"] = eqx.field(converter=_border)
+    east: Float[AnyArray, " ny"] = eqx.field(converter=_border)
     base: ScalarLeaf = eqx.field(converter=float_leaf)
     dx: float = eqx.field(static=True)
     dy: float = eqx.field(static=True)
@@ -49,8 +53,8 @@ class Skirt(eqx.Module):
         require_number("Skirt", "base", level)
         require_finite("Skirt", "base", level)
         if isinstance(level, np.ndarray) and not isinstance(z, Tracer):
-            known = np.asarray(z)
-            rim = np.concatenate([known[0], known[-1], known[:, 0], known[:, -1]])
+            z = jax.device_get(z)
+            rim = np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]])
             lowest = rim[np.isfinite(rim)].min(initial=math.inf)
             if level > lowest:
                 raise ArgumentError("Skirt", "base", f"must not lie above the border, whose lowest is {lowest}; it is {level}")

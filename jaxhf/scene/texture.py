@@ -19,14 +19,16 @@ def _texels(value: Any) -> Any:
     if isinstance(value, np.ndarray | jax.Array) and value.dtype.kind in "bu":
         rule = f"must hold linear colours in floats, 1 being white; theirs are {value.dtype} (load_image decodes a picture)"
         raise ArgumentError("ImageTexture", "texels", rule)
-    return float_leaf(value)
+    leaf = float_leaf(value)
+    return leaf[:, :, None].repeat(3, axis=2) if leaf.ndim == 2 else leaf
 
 
 class ImageTexture(eqx.Module):
     """An image spread over (u, v) in 0..1, looked up bilinearly.
 
     Attributes:
-      texels: linear colours, shape (h, w, 3): row 0 is v = 0, u runs along a row, texel centres lie at half steps.
+      texels: linear colours, shape (h, w, 3), or (h, w) of greys: row 0 is v = 0, u runs along a row, texel centres lie at half
+        steps.
       at_vertices: whether the outermost texel centres lie on 0 and 1 instead: an image of (ny, nx) texels then gives each
         vertex of a heightfield of that shape its colour, and a point outside that of the border.
       wrap: what lies beyond the outermost texel centres, half a texel inside the border: "repeat", the opposite border, as in
@@ -41,7 +43,7 @@ class ImageTexture(eqx.Module):
         if self.wrap not in get_args(Wrap):
             raise ArgumentError("ImageTexture", "wrap", f"must be one of {', '.join(get_args(Wrap))}; it is {self.wrap!r}")
         if len(self.texels.shape) != 3 or self.texels.shape[2] != 3 or 0 in self.texels.shape:
-            raise ArgumentError("ImageTexture", "texels", f"must have shape (h, w, 3), theirs is {self.texels.shape}")
+            raise ArgumentError("ImageTexture", "texels", f"must have shape (h, w, 3) or (h, w), theirs is {self.texels.shape}")
         if isinstance(self.texels, np.ndarray) and not np.isfinite(self.texels).all():
             iy, ix, _ = np.argwhere(~np.isfinite(self.texels))[0]
             raise ArgumentError(

@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import jaxlib.version
+from jax.core import Tracer
 
 from .kept import Kept
 from .plain import insides
@@ -26,9 +28,9 @@ _OPTIONS = {
 
 
 def is_traced() -> bool:
-    """Whether JAX is tracing or transforming what calls this; True in plain mode, which does not ask."""
+    """Whether JAX is tracing or transforming what calls this; plain mode does not know of `grad` and `vmap` alone."""
     module = insides()
-    return module is None or module.is_traced()
+    return isinstance(jnp.zeros(()), Tracer) if module is None else module.is_traced()
 
 
 @contextlib.contextmanager
@@ -102,7 +104,7 @@ def compiled(
     @functools.wraps(fun)
     def call(*args: Any, **kwargs: Any) -> Any:
         with _garbage_left():
-            if is_traced():
+            if insides() is None or is_traced():
                 return inside(*args, **kwargs)
             return (kept() if jit is jax.jit and Kept.serves(fun) else alone())(*args, **kwargs)
 

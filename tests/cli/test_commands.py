@@ -74,7 +74,7 @@ def test_a_slip_gets_the_word_that_was_meant(capsys, line, answer):
     [
         ("render hills.npz -o a.png", "known: .pbrt, .toml; this is a terrain, for jaxhf view, hillshade, relief or convert\n"),
         ("hillshade scene.toml -o a.png", ".xyz; this is a scene, for jaxhf render\n"),
-        ("render scene.toml -o a.tif", "known: .exr, .npy, .pfm, .png\n"),  # and not the .pfm that is spelt alike
+        ("render scene.toml -o a.tif", "known: .exr, .jpeg, .jpg, .npy, .pfm, .png\n"),  # and not the .pfm that is spelt alike
         ("render scene.toml -o a.pgn", "did you mean '.png'?\n"),
         ("fit case.toml -o a.png", "known: .npy, .npz, .tif, .tiff\n"),
         ("fit scene.toml -o a.npz", "scene.toml: a fit must have 'pictures', those that were measured; this is a scene, "

@@ -364,7 +364,7 @@ def test_what_cannot_be_an_image_is_not_written(tmp_path, image, message):
 @pytest.mark.parametrize(
     ("name", "kind", "message"),
     [
-        ("x.jpg", ValueError, "cannot write an image with the ending '.jpg'"),
+        ("x.gif", ValueError, "cannot write an image with the ending '.gif'"),
         ("x.pngg", ValueError, "did you mean '.png'"),
         ("x", ValueError, "without an ending"),
         ("none/x.png", FileNotFoundError, "there is no folder"),
@@ -411,3 +411,24 @@ def test_a_link_stays_a_link_and_the_mode_is_the_usual_one(tmp_path, image):
     assert (tmp_path / "link.npy").is_symlink()
     (tmp_path / "plain").touch()
     assert (tmp_path / "real.npy").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+@pytest.mark.parametrize("shape", [(16, 24, 3), (16, 24)])
+@pytest.mark.parametrize("transfer", ["srgb", "linear"])
+def test_a_jpeg_holds_what_a_png_holds(tmp_path, shape, transfer):
+    """To the error of its compression, of a smooth picture."""
+    y, x = np.meshgrid(np.linspace(0, 1, 16), np.linspace(-0.2, 1.2, 24), indexing="ij")
+    image = (np.stack([x, y, 1 - x], axis=-1) if len(shape) == 3 else x * y).astype(np.float32)
+    for ending in ("png", "jpg", "JPEG"):
+        save_image(tmp_path / f"a.{ending}", image, transfer=transfer)
+    png = load_image(tmp_path / "a.png", transfer="linear")
+    for ending in ("jpg", "JPEG"):
+        np.testing.assert_allclose(load_image(tmp_path / f"a.{ending}", transfer="linear"), png, atol=0.03)
+    with Image.open(tmp_path / "a.jpg") as stored:
+        assert (stored.format, stored.size, stored.mode) == ("JPEG", (24, 16), "RGB" if len(shape) == 3 else "L")
+
+
+def test_a_jpeg_of_too_many_pixels_a_side_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="a JPEG has at most 65500 pixels a side, this has 65501 x 1"):
+        save_image(tmp_path / "a.jpg", np.zeros((1, 65501)))
+    assert not list(tmp_path.iterdir())

@@ -250,6 +250,8 @@ def test_an_image_lies_with_its_top_in_the_north(tmp_path):
     np.testing.assert_allclose(material.albedo.texels[:, :, 1], [[grey, 0], [1, 1]], rtol=1e-6)
     assert material.albedo.wrap == "repeat"
     (clamped,) = read(tmp_path, f'{CAMERA}[textures.m]\nimage = "maps/x.png"\nwrap = "clamp"\n{FIELD}albedo = "m"').objects
+    assert isinstance(clamped.material, Matte)
+    assert isinstance(clamped.material.albedo, ImageTexture)
     assert clamped.material.albedo.wrap == "clamp"
 
 

@@ -1,11 +1,18 @@
 """A scene prepared once for many pictures."""
 
+import copy
+import pickle
+
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
 
 import jaxhf
+from jaxhf.core.affine import translate
 from jaxhf.io.procedural import fractal
 from jaxhf.rendering import render
+from jaxhf.xla.devices import local_mesh
 
 CORNER = (5e6, 4.5e6)  # far from the origin: the camera has to be moved in double precision
 SETTINGS = jaxhf.Settings(normals="four", chunk=256)
@@ -66,3 +73,65 @@ def test_settings_of_a_prepared_scene_stay():
         jaxhf.render(prepared, jaxhf.Settings(max_depth=2))
     with pytest.raises(ValueError, match=r"cannot be rendered with .*normals=None"):
         jaxhf.render(prepared, jaxhf.Settings())
+
+
+def placed(albedo=0.5, fov=40.0) -> jaxhf.Scene:
+    """A scene whose origin is an object's transform, which `jit` traces where it is an argument."""
+    heights = fractal([9, 9], seed=2, exponent=2.0, range=(0.0, 0.3)).astype(np.float32)
+    world = jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(albedo), translate(1000.0, 2000.0, 5.0))
+    eye = jaxhf.Perspective.look_at((1000.5, 1998.8, 6), (1000.5, 2000.5, 5), fov=fov, width=24, height=16)
+    return jaxhf.Scene([world], eye, [jaxhf.Directional((1, 0, 0.4)), jaxhf.Point((1000, 2000, 8), 3)])
+
+
+WAYS = {
+    "pickle": lambda ready: jaxhf.render(pickle.loads(pickle.dumps(ready))),
+    "deepcopy": lambda ready: jaxhf.render(copy.deepcopy(ready)),
+    "tree.map": lambda ready: jaxhf.render(jax.tree.map(lambda leaf: leaf, ready)),
+    "argument of jit": jax.jit(jaxhf.render),
+    "lights in jit": jax.jit(lambda ready: jaxhf.render(ready.with_lights(placed().lights))),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_prepared_scene_stays_the_same(way):
+    ready = jaxhf.prepare(placed())
+    expected = jaxhf.render(placed())
+    np.testing.assert_allclose(WAYS[way](ready), expected, atol=1e-5)
+    assert np.ptp(np.asarray(expected)) > 0.1
+
+
+def test_what_is_prepared_is_read_back():
+    ready = jaxhf.prepare(scene(), SETTINGS)
+    read = pickle.loads(pickle.dumps(ready))
+    assert (read.mesh, read.settings) == (ready.mesh, ready.settings)
+    np.testing.assert_array_equal(read.scene.heights, ready.scene.heights)
+    field = jaxhf.prepare(scene().heightfields[0])
+    rays = np.array([*CORNER, 9.0]) + 0.3, np.array([0, 0, -1.0])
+    np.testing.assert_array_equal(
+        jaxhf.cast(pickle.loads(pickle.dumps(field)), *rays).p, jaxhf.cast(scene().heightfields[0], *rays).p
+    )
+
+
+def test_a_mesh_that_another_process_lacks_becomes_its_own():
+    ready = jaxhf.prepare(placed())
+    state = ready.__getstate__()
+    numbers, *rest = state["mesh"]
+    read = object.__new__(jaxhf.Prepared)
+    read.__setstate__({**state, "mesh": (numbers + 1000, *rest)})
+    assert read.mesh == local_mesh()
+
+
+def test_a_change_that_no_picture_would_show_is_refused():
+    ready = jaxhf.prepare(placed())
+    with pytest.raises(ValueError, match=r"^Prepared: scene is no part of its pytree: change the scene"):
+        eqx.tree_at(lambda ready: ready.scene.objects[0].shape.heights, ready, ready.scene.heights * 0)
+    assert not any(leaf is ready.scene.heights for leaf in jax.tree.leaves(ready))
+
+
+def test_derivatives_by_what_is_prepared_are_those_by_the_scene():
+    found = eqx.filter_grad(lambda ready: jaxhf.render(ready).mean())(jaxhf.prepare(placed()))
+    of_albedo, of_fov = jax.grad(lambda *values: jaxhf.render(placed(*values)).mean(), (0, 1))(0.5, 40.0)
+    np.testing.assert_allclose(found._world.materials[0].albedo.sum(), of_albedo, rtol=1e-4)
+    np.testing.assert_allclose(found.camera.fov, of_fov, rtol=1e-3)
+    assert abs(of_albedo) > 0.01
+    assert abs(of_fov) > 1e-4

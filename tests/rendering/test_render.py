@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxhf
+from jaxhf.rendering.render import require_key
 
 pytestmark = pytest.mark.unoptimised
 
@@ -114,6 +115,13 @@ def test_a_view_of_nothing():
     np.testing.assert_array_equal(image, np.broadcast_to(SKY, image.shape))
     for name, (tail, _, nothing) in AOV_KINDS.items():
         np.testing.assert_array_equal(aovs[name], np.broadcast_to(nothing, (HEIGHT, WIDTH, *tail)), name)
+
+
+@pytest.mark.parametrize("key", [0, jnp.float32(0), np.zeros(2, int), jax.random.split(jax.random.key(0))])
+def test_what_is_no_key_is_refused(key):
+    """As `render` does, whose annotations are checked in tests."""
+    with pytest.raises(jaxhf.ArgumentError, match=r"^render: key must be one key of JAX's, as jax.random.key\(0\) makes it"):
+        require_key(key)
 
 
 def test_unknown_aov_is_an_error():

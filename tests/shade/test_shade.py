@@ -219,7 +219,7 @@ def test_a_clamped_texture_ends_with_its_outermost_texels(shape):
     uv = np.random.default_rng(1).uniform(-1, 2, (200, 2))
     uv[:100] = uv[:100].clip(0, 1)  # many of them on the border, and in its corners
     lookup = jax.vmap(jaxhf.ImageTexture(texels, wrap="clamp"))
-    np.testing.assert_allclose(lookup(jnp.asarray(uv)), texture_by_hand(texels, *uv.T, "clamp"), rtol=ROUNDING)
+    np.testing.assert_allclose(lookup(jnp.asarray(uv)), texture_by_hand(texels, uv[:, 0], uv[:, 1], "clamp"), rtol=ROUNDING)
 
 
 @pytest.mark.parametrize("wrap", ["repeat", "clamp"])

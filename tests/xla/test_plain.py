@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ def scene(heights) -> jaxhf.Scene:
     return jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera, [jaxhf.Directional((1, 0, 0.4))])
 
 
-def outcomes() -> dict[str, np.ndarray]:
+def outcomes() -> dict[str, Any]:
     """A picture, derivatives with points on edges both ways, rays, and a fit."""
     heights, up = jnp.asarray(HEIGHTS), np.array([0.1, 0.2, 1], np.float32)
 
