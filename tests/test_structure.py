@@ -84,4 +84,4 @@ def test_rays_are_batched_and_compiled_in_few_places():
         assert name in {"xla/compilation", "xla/insides", "xla/kernel", "xla/masked"} or "jax.jit" not in text, (
             f"{name} compiles"
         )
-        assert name == "xla/devices" or "shard_map" not in text, f"{name} deals out work"
+        assert name == "xla/devices" or "shard_map(" not in text, f"{name} deals out work"
