@@ -83,28 +83,43 @@ class Sun(Directional):
     """Light from a round disc infinitely far away, of even brightness: its shadows have penumbras.
 
     A point is lit by the part of the disc that stands above its horizon. The horizon is that of the triangles themselves, taken
-    in eight azimuths across the disc: a picture equals the mean of those under 1024 directional lights spread over the disc to
-    1 %, without noise. In a penumbra it has a derivative by itself, so shadow edges need no `edge_samples`.
+    in `chords` azimuths across the disc. Behind slopes a picture equals the mean of those under 1024 directional lights spread
+    over the disc to 1 %, without noise; behind upright walls penumbras have steps, which more chords make smaller. In a
+    penumbra a picture has a derivative by itself, so shadow edges need no `edge_samples`.
 
-    Heightfields must be upright. The ground below them counts as solid, and so as dark. Cylinders cast shadows without
-    penumbras.
+    Heightfields and skirts must be upright. Where one stands alone, with or without its skirt, the ground below it counts as
+    solid, and so as dark; several are sheets with two sides. Cylinders cast shadows without penumbras.
 
     Attributes:
-      towards: the vector from the scene towards the middle of the disc, world frame; its length does not matter.
+      towards: the vector from the scene towards the middle of the disc, world frame; its length does not matter. It must point
+        above the horizon, which is not asked of traced values.
       irradiance: that of all the disc, of a surface that faces it: a Directional of the same irradiance is as bright outside
         penumbras. One number or (r, g, b); None: pi.
       angular_diameter: of the disc, degrees, at most 10; the sun's is 0.53.
+      chords: in how many azimuths the disc is seen. The time grows with them, and steps in penumbras are as large as one of
+        them: 32 keep behind a tower to 1 % what 8 keep to 10 %.
     """
 
     angular_diameter: ScalarLeaf
+    chords: int = eqx.field(static=True)
 
-    def __init__(self, towards: Any, irradiance: Any = None, angular_diameter: Any = 0.53, *, radiance: Any = None):
+    def __init__(
+        self, towards: Any, irradiance: Any = None, angular_diameter: Any = 0.53, chords: Any = 8, *, radiance: Any = None
+    ):
         super().__init__(towards, irradiance, radiance=radiance)
-        self.angular_diameter = float_leaf(angular_diameter)
+        if isinstance(self.towards, np.ndarray) and not self.towards[2] > 0:
+            altitude = np.rad2deg(np.arctan2(self.towards[2], np.hypot(*self.towards[:2])))
+            raise ArgumentError("Sun", "towards", f"must point above the horizon, its altitude is {altitude:.2f} degrees")
+        self.angular_diameter, self.chords = float_leaf(angular_diameter), whole_number(chords)
+        if type(self.chords) is not int or self.chords < 1:
+            raise ArgumentError("Sun", "chords", f"must be a whole number from 1 on, it is {self.chords!r}")
         require_number("Sun", "angular_diameter", self.angular_diameter)
         if isinstance(self.angular_diameter, np.ndarray) and not 0 < self.angular_diameter <= 10:
             rule = f"must be above 0 and at most 10 degrees, it is {self.angular_diameter}"
             raise ArgumentError("Sun", "angular_diameter", rule)
+
+    def __repr__(self) -> str:
+        return fields(self).replace(", chords=8)", ")")
 
 
 class Point(eqx.Module):

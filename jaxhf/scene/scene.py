@@ -90,7 +90,7 @@ class Scene(eqx.Module):
         sun = any(isinstance(light, Sun) for light in self.lights)
         if sun or self.sky_occlusion is not None:
             for number, obj in enumerate(self.objects):
-                if isinstance(obj.shape, Heightfield) and not _upright(obj.world_from_object):
+                if isinstance(obj.shape, (Heightfield | Skirt) if sun else Heightfield) and not _upright(obj.world_from_object):
                     rule = f"must keep heights upright under a {'Sun' if sun else 'Sky with occlusion'}"
                     raise ArgumentError("Scene", f"objects[{number}].world_from_object", rule)
         if not isinstance(self.samples, int) or self.samples < 1:

@@ -17,7 +17,8 @@ from ..trace.cylinder import Tube
 from ..trace.grid import Grid
 from ..trace.hit import Hit
 from ..trace.intersect import blocked
-from ..trace.skyline import skyline_slope
+from ..trace.skirt import Walls, wall_slopes
+from ..trace.skyline import hidden_slopes, skyline_slope
 from ..trace.triangle import triangle_corners
 from ..trace.walk_start import place_on_grid
 from ..trace.world import World, unblocked
@@ -25,8 +26,6 @@ from ..xla.materialise import materialise
 
 # So near to zero a cosine is rounded off: 0.6 degrees round the horizon of the shading normal.
 GRAZING = 0.01
-# Vertical chords in which the sun's disc is seen.
-_CHORDS = 8
 # Altitude up to which slopes are told apart, radians.
 _STEEPEST = np.deg2rad(89.9)
 # So near to the zenith, radians, the sun has no azimuth: chords across x then do as well as any.
@@ -126,15 +125,16 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
     """What is seen of the sun from the side of the surface that the ray came from, and how many walks ran out of steps.
 
     The disc is cut into vertical chords, at the nodes of Gauss's and Chebyshev's quadrature of the second kind, whose weight is
-    the chords' length. In the plane of a chord all that is below the horizon is hidden: what is left of it, and its middle, are
-    known exactly. Angles there count from the chord's middle, and may go beyond the zenith.
+    the chords' length. In the plane of a chord each surface hides what lies between two slopes: what is left of the chord, and
+    the middles of its parts, are known exactly. Angles there count from the chord's middle, and may go beyond the zenith.
     """
     dtype = hit.p.dtype
     wi, radius = unit(sun.towards), jnp.deg2rad(sun.angular_diameter) / 2
     along = unit(jnp.where(largest_component(wi[:2]) < _NO_AZIMUTH, jnp.array([1, 0], dtype), wi[:2]))
     aside = jnp.stack([along[1], -along[0]])
     n = hit.n * hit.side.astype(dtype)
-    lit = active & _is_outside(world, hit)
+    ground = _solid_ground(world)
+    lit = active if ground is None else active & ((hit.side > 0) | (hit.object != ground[0]))
 
     def chord(total: tuple[_Seen, Index], node: tuple[Scalar, Scalar]) -> tuple[tuple[_Seen, Index], None]:
         seen, exhausted = total
@@ -144,21 +144,33 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
         centre = centre / jnp.sqrt(dot(centre, centre))  # about 1
         middle = jnp.arctan2(wi[2], dot(foot, level[:2]))
         lowest, mean, highest = (jnp.tan(within(middle + end, -_STEEPEST, _STEEPEST)) for end in (-half, 0, half))
-        slope = greater(_own_slope(n, level, mean), lowest)
-        for number, surface in enumerate(world.surfaces):
-            if world.settings.shadows and isinstance(surface, Grid):
-                slope, more = skyline_slope(surface, number, hit.p, level, hit, lit, (slope, highest), world.settings.max_steps)
-                exhausted = exhausted + more.astype(jnp.int32)
-        horizon = jnp.where(slope < jnp.inf, within(jnp.arctan(slope) - middle, -half, half), half)
-        horizon = jnp.where(slope > lowest, horizon, -half)
-        weight = 2 * node[1] * node[1] / (_CHORDS + 1) * quotient(half - horizon, 2 * half)
-        weight = jnp.where(lit, weight, 0)
-        higher = (horizon + half) / 2
-        upwards = jnp.stack([*(-centre[2] * level[:2]), dot(centre, level)])
-        direction = jnp.cos(higher) * centre + jnp.sin(higher) * upwards
-        return (_Seen(seen.share + weight, seen.mean + weight * direction), exhausted), None
+        own = _own_slopes(n, level, mean)
 
-    turns = np.arange(1, _CHORDS + 1) * (np.pi / (_CHORDS + 1))
+        def angle(slope: Scalar) -> Scalar:
+            above = jnp.where(slope < jnp.inf, within(jnp.arctan(slope) - middle, -half, half), half)
+            return jnp.where(slope > lowest, above, -half)
+
+        if ground is None:
+            hidden, more = _hidden(world, hit, lit, level, (lowest, highest))
+            ends = [(jnp.where(low < highest, angle(low), half), angle(high)) for low, high in (own, *hidden)]
+            parts, exhausted = _left_open(materialise(ends), half), exhausted + more
+        else:
+            slope = greater(own[1], lowest)
+            if world.settings.shadows:
+                number, grid = ground
+                slope, more = skyline_slope(grid, number, hit.p, level, hit, lit, (slope, highest), world.settings.max_steps)
+                exhausted = exhausted + more.astype(jnp.int32)
+            parts = [(angle(slope), half)]
+        upwards = jnp.stack([*(-centre[2] * level[:2]), dot(centre, level)])
+        for begin, end in parts:
+            weight = 2 * node[1] * node[1] / (sun.chords + 1) * quotient(end - begin, 2 * half)
+            weight = jnp.where(lit, weight, 0)
+            higher = (begin + end) / 2
+            direction = jnp.cos(higher) * centre + jnp.sin(higher) * upwards
+            seen = _Seen(seen.share + weight, seen.mean + weight * direction)
+        return (seen, exhausted), None
+
+    turns = np.arange(1, sun.chords + 1) * (np.pi / (sun.chords + 1))
     nodes = jnp.asarray(np.cos(turns), dtype), jnp.asarray(np.sin(turns), dtype)
     none = _Seen(jnp.zeros((), dtype), jnp.zeros(3, dtype)), jnp.zeros((), jnp.int32)
     (seen, exhausted), _ = lax.scan(chord, none, nodes)
@@ -170,21 +182,58 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
     return seen, exhausted
 
 
-def _is_outside(world: World, hit: Hit) -> Flag:
-    """Whether the hit is not on the lower side of a heightfield: the ground is solid."""
-    outside = hit.side > 0
-    for number, surface in enumerate(world.surfaces):
-        outside = outside if isinstance(surface, Grid) else outside | (hit.object == number)
-    return outside
+def _solid_ground(world: World) -> tuple[int, Grid] | None:
+    """The only heightfield, with its number, of a scene that has nothing else, but for its own skirt. It counts as solid ground
+    below its surface; where there is more, heightfields are sheets with two sides."""
+    grids = world.grids
+    if len(grids) != 1:
+        return None
+    number, grid, _ = grids[0]
+    others = (surface for k, surface in enumerate(world.surfaces) if k != number)
+    return (number, grid) if all(isinstance(other, Walls) and other.cells == grid.cells for other in others) else None
 
 
-def _own_slope(n: Vector, level: Vector, middle: Scalar) -> Scalar:
-    """Above which slope, in the plane of a level direction, light reaches the upper side of a surface; +-inf: none and any.
+def _hidden(
+    world: World, hit: Hit, active: Flag, level: Vector, between: tuple[Scalar, Scalar]
+) -> tuple[list[tuple[Scalar, Scalar]], Index]:
+    """The lowest and the highest slope that each heightfield and each skirt hides in the plane of a level direction, and how
+    many walks ran out of steps."""
+    hidden, exhausted = [], jnp.zeros((), jnp.int32)
+    for number, surface in enumerate(world.surfaces if world.settings.shadows else ()):
+        if isinstance(surface, Grid):
+            slopes, more = hidden_slopes(surface, number, hit.p, level, hit, active, between, world.settings.max_steps)
+            hidden, exhausted = [*hidden, slopes], exhausted + more
+        elif isinstance(surface, Walls):
+            hidden = [*hidden, wall_slopes(surface, number, hit.p, level, hit)]
+    return hidden, exhausted
 
-    On other sides the light at a `middle` slope stands for all of it.
+
+def _left_open(hidden: list[tuple[Scalar, Scalar]], half: Scalar) -> list[tuple[Scalar, Scalar]]:
+    """What intervals leave of -half..half: parts that do not overlap, some of them empty. One begins where an interval ends in
+    no other one, and goes on to where the next begins."""
+    begins, parts = [-half, *(high for _, high in hidden)], []
+    for k, begin in enumerate(begins):
+        covered, end = jnp.zeros((), bool), half
+        for low, high in hidden:
+            covered = covered | ((low <= begin) & (begin < high))
+            end = jnp.where((begin < low) & (low < end), low, end)
+        for other in begins[:k]:
+            covered = covered | (other == begin)
+        parts.append((begin, jnp.where(covered, begin, end)))
+    return parts
+
+
+def _own_slopes(n: Vector, level: Vector, middle: Scalar) -> tuple[Scalar, Scalar]:
+    """Between which slopes, in the plane of a level direction, a surface hides the light from its side of the normal n.
+
+    On an upright surface the light at a `middle` slope stands for all of it.
     """
-    along, up = dot(n, level), n[2] > 1e-6
-    return jnp.where(up, -along / jnp.where(up, n[2], 1), jnp.where(along + middle * n[2] > 0, -jnp.inf, jnp.inf))
+    along, upright = dot(n, level), jnp.abs(n[2]) <= 1e-6
+    faces = jnp.where(upright, along + middle * n[2] > 0, n[2] < 0)
+    slope = -along / jnp.where(upright, 1, n[2])
+    low = jnp.where(faces, jnp.where(upright, jnp.inf, slope), -jnp.inf)
+    high = jnp.where(upright, jnp.where(faces, -jnp.inf, jnp.inf), jnp.where(faces, jnp.inf, slope))
+    return low, high
 
 
 def rounded_clamp(cosine: Scalar) -> Scalar:

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..core.affine import Affine
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, largest_component, time_to, unit
+from ..core.vector import dot, greater, largest_component, lesser, quotient, time_to, unit, within
 from ..scene.skirt import Skirt
 from .hit import Hit, orthogonal_tangents
 from .status import Status
@@ -66,13 +66,10 @@ def wall_distance(walls: Walls, ray: Ray, leaving: Hit | None, number: int) -> t
     """
     local = walls.object_from_world.ray(ray)
     o, d = local.o, local.d
-    (size_x, size_y), (cells_x, cells_y) = walls.size, walls.cells
     wide = _WIDE * jnp.finfo(o.dtype).eps
     best, found, nearest = jnp.full_like(walls.base, jnp.inf), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
-    first = 0
-    planes = [(1, 0.0, 0, size_x, cells_x), (1, size_y, 0, size_x, cells_x), (0, 0.0, 1, size_y, cells_y),
-              (0, size_x, 1, size_y, cells_y), (2, walls.base, 0, size_x, 0)]  # fmt: skip
-    for side, (axis, place, along, length, cells) in enumerate(planes):
+    planes = [*_upright(walls), (2, walls.base, 0, walls.size[0], 0, 0)]
+    for side, (axis, place, along, length, cells, first) in enumerate(planes):
         t, ever = time_to(place - o[axis], d[axis])
         at, rate = o + t * d, jnp.where(ever, d[axis], 1)
         off = jnp.abs(o) + jnp.abs(at) + (jnp.abs(o[axis]) + jnp.abs(place)) / jnp.abs(rate) * jnp.abs(d)
@@ -80,21 +77,64 @@ def wall_distance(walls: Walls, ray: Ray, leaving: Hit | None, number: int) -> t
         wider = jnp.where(outwards * d[axis] < 0, wide, -wide) * off
         inside = (at[along] >= -wider[along]) & (at[along] <= length + wider[along])
         if side == _FLOOR:
-            inside = inside & (at[1] >= -wider[1]) & (at[1] <= size_y + wider[1])
+            inside = inside & (at[1] >= -wider[1]) & (at[1] <= walls.size[1] + wider[1])
         else:
-            position = jnp.clip(at[along] / length, 0, 1) * cells
-            cell = jnp.clip(position.astype(jnp.int32), 0, cells - 1)
-            low, high = walls.tops[first + cell], walls.tops[first + cell + 1]
-            top = low + (position - cell.astype(low.dtype)) * (high - low)
+            low, high, share = _tops(walls, first, jnp.clip(at[along] / length, 0, 1) * cells, cells)
             more = wider[2] + jnp.abs(high - low) * (cells / length) * wider[along]
-            inside = inside & (at[2] >= walls.base - wider[2]) & (at[2] <= top + more)
-            first += cells + 1
+            inside = inside & (at[2] >= walls.base - wider[2]) & (at[2] <= low + share * (high - low) + more)
         met = ever & (t > 0) & (t < best) & inside
         if leaving is not None:
             left = (leaving.cell[0] == side) | ((leaving.triangle == 1) & (leaving.cell[1] == side))
             met = met & ~((leaving.object == number) & left)
         best, found, nearest = jnp.where(met, t, best), found | met, jnp.where(met, side, nearest)
     return jnp.where(found, best, 0), found, nearest
+
+
+def _upright(walls: Walls) -> list[tuple[int, float, int, float, int, int]]:
+    """Of each wall: the axis across it, its place there, the axis along it, its length, its cells, and its first of `tops`."""
+    (size_x, size_y), (nx, ny) = walls.size, (n + 1 for n in walls.cells)
+    return [(1, 0.0, 0, size_x, nx - 1, 0), (1, size_y, 0, size_x, nx - 1, nx),
+            (0, 0.0, 1, size_y, ny - 1, 2 * nx), (0, size_x, 1, size_y, ny - 1, 2 * nx + ny)]  # fmt: skip
+
+
+def _tops(walls: Walls, first: int, position: Scalar, cells: int) -> tuple[Scalar, Scalar, Scalar]:
+    """The heights of a wall before and after a position from 0 to `cells` along it, and its share of the way."""
+    cell = jnp.clip(position.astype(jnp.int32), 0, cells - 1)
+    return walls.tops[first + cell], walls.tops[first + cell + 1], position - cell.astype(position.dtype)
+
+
+def wall_slopes(walls: Walls, number: int, p: Vector, level: Vector, leaving: Hit) -> tuple[Scalar, Scalar]:
+    """The lowest and the highest slope that a skirt hides from a point; differentiable. (inf, -inf) where it hides none.
+
+    In a vertical plane the floor and the walls at its ends are one line, as a sheet is, see `hidden_slopes`.
+
+    Args:
+      walls: an upright skirt.
+      number: of its object.
+      p: the point of the hit `leaving`, world frame.
+      level: a horizontal direction of length 1, world frame.
+      leaving: the hit; if that lies on the outside of these walls, they hide nothing beside what its own side does.
+    """
+    o, d = walls.object_from_world.point(p), walls.object_from_world.vector(level)
+    wide, own = _WIDE * float(jnp.finfo(o.dtype).eps) * (largest_component(o[:2]) + max(walls.size)), leaving.object == number
+    low, high = jnp.full_like(walls.base, jnp.inf), jnp.full_like(walls.base, -jnp.inf)
+    for axis, place, along, length, cells, first in _upright(walls):
+        t, ever = time_to(place - o[axis], d[axis])
+        other = o[along] + t * d[along]
+        ahead = ever & (t * largest_component(d) > wide) & (other >= -wide) & (other <= length + wide)
+        t = quotient(jnp.where(ahead, place - o[axis], 1), jnp.where(ahead, d[axis], 1))  # of others it may be huge
+        at = o + t * d
+        *tops, share = _tops(walls, first, within(at[along] / length, 0.0, 1.0) * cells, cells)
+        first_top, last_top = (jnp.where(jnp.isfinite(tops[0] + tops[1]), top, walls.base) for top in tops)
+        for z in (walls.base, first_top + share * (last_top - first_top)):
+            rise = walls.world_from_object.point(jnp.stack([at[0], at[1], z]))[2] - p[2]
+            slope = quotient(rise, t)
+            low, high = jnp.where(ahead, lesser(slope, low), low), jnp.where(ahead, greater(slope, high), high)
+    covers = (o[0] >= -wide) & (o[0] <= walls.size[0] + wide) & (o[1] >= -wide) & (o[1] <= walls.size[1] + wide)
+    covers, above = jnp.where(own, leaving.side < 0, covers), own | (o[2] >= walls.base)
+    low, high = jnp.where(covers & above, -jnp.inf, low), jnp.where(covers & ~above, jnp.inf, high)
+    outside = own & (leaving.side > 0)
+    return jnp.where(outside, jnp.inf, low), jnp.where(outside, -jnp.inf, high)
 
 
 def wall_hit(walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: Flag | None, count_steps: bool) -> Hit:

@@ -1,8 +1,9 @@
-"""How steeply a heightfield rises above one point in one direction: the horizon seen from a hit, between two slopes.
+"""Which slopes a heightfield hides from one point in one direction: the horizon seen from a hit, between two slopes.
 
 `horizon` finds the same for all vertices of a grid. Here the point is any. A walk over the cells below the lower slope's ray
 raises that ray wherever the surface is above it. Its blocks are skipped as in a search for a hit, and it is over where the
-ray reaches the upper slope: it costs about three times as much as a search.
+ray reaches the upper slope: it costs about three times as much as a search. The lower end of what a surface hides is found by
+the same walk upside down.
 """
 
 import dataclasses
@@ -19,11 +20,60 @@ from ..xla.materialise import materialise
 from .grid import Grid, triangle_plane
 from .hit import Hit
 from .search import SKIPS, enough_steps
+from .triangle import plane_through, triangle_corners
 from .walk import MISS, Walk, walking
 from .walk_start import place_on_grid, walk_start
 
 # From an edge's first vertex to its second, by its kind.
 _STEPS = ((1, 0), (0, 1), (1, 1))
+
+
+def hidden_slopes(
+    grid: Grid,
+    number: int,
+    p: Vector,
+    level: Vector,
+    leaving: Hit,
+    active: Flag,
+    between: tuple[Scalar, Scalar],
+    max_steps: int | None,
+) -> tuple[tuple[Scalar, Scalar], Index]:
+    """The lowest and the highest slope that a sheet with two sides hides from a point, and how many walks ran out of steps.
+
+    In a vertical plane the sheet is one line, of which all is hidden between its lowest and its highest point as they are seen.
+    What begins below the point, or at the upper side that the point lies on, hides all from minus infinity on; what begins over
+    it, all up to infinity. Of a sheet with holes what lies between two of its pieces counts as hidden.
+
+    The arguments are those of `skyline_slope`; the slopes are differentiable as its result is. Where they are equal nothing is
+    hidden.
+    """
+    own, lowest = leaving.object == number, between[0]
+    covers, gap = _over_footprint(grid, grid.grid_from_world.point(p))
+    underfoot = jnp.where(own, leaving.side > 0, covers & (gap > 0))
+    overhead = jnp.where(own, leaving.side < 0, covers & (gap <= 0))
+    args = grid, number, p, level, leaving
+    high, ran_out = skyline_slope(*args, active & ~overhead, between, max_steps)
+    stands = active & ~underfoot & (overhead | (high > lowest))
+    low, more = skyline_slope(*args, stands, between, max_steps, above=False)
+    hidden = jnp.where(underfoot, -jnp.inf, jnp.where(stands, low, lowest)), jnp.where(overhead, jnp.inf, high)
+    return hidden, ran_out.astype(jnp.int32) + more.astype(jnp.int32)
+
+
+def _over_footprint(grid: Grid, o: Vector) -> tuple[Flag, Scalar]:
+    """Whether a point in the grid's frame is above or below the surface, or on its border, and how high above it."""
+    cells_x, cells_y = grid.cells
+    wide = _rounding(grid, o)
+    covers = (o[0] >= -wide) & (o[0] <= cells_x + wide) & (o[1] >= -wide) & (o[1] <= cells_y + wide)
+    ix, iy = (jnp.clip(jnp.floor(o[k]).astype(jnp.int32), 0, n - 1) for k, n in enumerate(grid.cells))
+    u, v = o[0] - ix.astype(o.dtype), o[1] - iy.astype(o.dtype)
+    heights = triangle_corners(grid.rows, grid.shape[1], ix, iy, v > u, grid.first)
+    a, b, c = plane_through(heights, v > u)
+    return covers & jnp.isfinite(sum(heights)), lax.stop_gradient(o[2] - (c + a * u + b * v))
+
+
+def _rounding(grid: Grid, o: Vector) -> float:
+    """By how many cells a point on a wall along the border may be off."""
+    return 64 * float(jnp.finfo(o.dtype).eps) * max(grid.cells)
 
 
 def skyline_slope(
@@ -35,11 +85,12 @@ def skyline_slope(
     active: Flag,
     between: tuple[Scalar, Scalar],
     max_steps: int | None,
+    above: bool = True,
 ) -> tuple[Scalar, Flag]:
     """The largest slope at which the surface is seen from a point, and whether the walk ran out of steps.
 
-    The ground below the surface counts as solid. The slope is differentiable in the heights, the transform, the point and the
-    direction: it is that of the edge which makes the horizon.
+    The slope is differentiable in the heights, the transform, the point and the direction: it is that of the edge which makes
+    the horizon.
 
     Args:
       grid: an upright surface.
@@ -50,6 +101,8 @@ def skyline_slope(
       active: False spares the walk.
       between: the slopes that matter: what is below the first counts as the first, and the walk gives up beyond the second.
       max_steps: see `first_triangle`.
+      above: False for the smallest slope: then what is above the second counts as the second, and the walk gives up beyond the
+        first.
     """
     ix, iy, x, y = place_on_grid(grid, leaving)
     a, b, c = triangle_plane(grid, ix, iy, leaving.triangle == 1)
@@ -58,12 +111,14 @@ def skyline_slope(
     local, rise = jnp.stack([*grid.grid_from_world.vector(level)[:2], jnp.zeros_like(o[2])]), grid.grid_from_world.linear[2, 2]
     lowest, highest = between
     fixed = lax.stop_gradient((grid, Ray(o, local), level, leaving, lowest, highest, rise))
-    edge, exhausted = stored(materialise(_highest_edge(*fixed, number, active, max_steps)))
-    return greater(_slope_to(grid, o, level, edge), lowest), exhausted
+    edge, exhausted = stored(materialise(_outermost_edge(*fixed, number, active, max_steps, above)))
+    slope = _slope_to(grid, o, level, edge, above)
+    return (greater(slope, lowest) if above else lesser(slope, highest)), exhausted
 
 
-def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index) -> Scalar:
-    """World-frame slope of the point of an edge above the line o + t level in the plane; differentiable. -inf for no edge.
+def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index, above: bool) -> Scalar:
+    """World-frame slope of the point of an edge above the line o + t level in the plane; differentiable. Of no edge it is
+    -inf, if not `above` inf.
 
     Args:
       grid: which may lean by an infinitesimal, for its derivative in the transform.
@@ -83,10 +138,10 @@ def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index) -> Scalar:
     t, s = to[0] * e[1] - to[1] * e[0], to[0] * level[1] - to[1] * level[0]  # both times `across`
     known = known & (t != 0) & ((t > 0) == (across > 0))  # their product may underflow
     rise = to[2] * across + s * e[2]
-    return jnp.where(known, quotient(rise, jnp.where(known, t, 1)), -jnp.inf)
+    return jnp.where(known, quotient(rise, jnp.where(known, t, 1)), -jnp.inf if above else jnp.inf)
 
 
-def _highest_edge(
+def _outermost_edge(
     grid: Grid,
     ray: Ray,
     level: Vector,
@@ -97,50 +152,59 @@ def _highest_edge(
     number: int,
     active: Flag,
     max_steps: int | None,
+    above: bool,
 ) -> tuple[Index, Flag]:
-    """The edge that makes the horizon, -1 where that is the lowest slope; and whether the walk ran out of steps.
+    """The edge that makes the horizon, -1 where that is the slope to begin with; and whether the walk ran out of steps.
 
-    The walk begins as that of a level ray between the lowest and the highest of the heights, so that it leaves by the sides.
+    The walk begins as that of a level ray between the lowest and the highest of the heights.
 
     Args:
       ray: level, in the grid's frame, t in world units.
       level: its direction, world frame.
       lowest, highest: world frame.
       rise: of a world unit, in the grid's frame.
-      grid, leaving, number, active, max_steps: as for `skyline_slope`.
+      grid, leaving, number, active, max_steps, above: as for `skyline_slope`.
     """
     o = ray.o
     inside = Ray(jnp.stack([o[0], o[1], jnp.clip(o[2], 0, grid.z_top)]), ray.d)
     walk, state, _ = walk_start(grid, inside, leaving, number, None, active & (lowest < highest))
-    state = state | 4  # above the surface
+    state = state | 4 if above else state & ~jnp.uint32(4)
     own = leaving.object == number
-    height = jnp.where(own, walk.z_ray, o[2])
+    z = jnp.where(own, walk.z_ray, o[2])
+    ends = (
+        jnp.where(walk.back_x, grid.pyramid.width, grid.cells[0]),
+        jnp.where(walk.back_y, grid.pyramid.height, grid.cells[1]),
+    )
+    by_side = lesser(walk.distance_x(ends[0]), walk.distance_y(ends[1]))
     # A point on a wall along the border may be inside by rounding; the border does not stand before it then.
-    rounding = 64 * float(jnp.finfo(o.dtype).eps) * max(grid.cells)
-    touching = jnp.where(own, 0, rounding / greater(walk.dx, walk.dy))
-    start = jnp.stack([o[0], o[1], height])
+    touching = jnp.where(own, 0, _rounding(grid, o) / greater(walk.dx, walk.dy))
+    start = jnp.stack([o[0], o[1], z])
 
     def tilted(slope: Scalar) -> Walk:
         slope = slope * rise
-        up = slope > 0
-        at_top = jnp.where(up, (grid.z_top - height) / jnp.where(up, slope, 1) - walk.t_start, jnp.inf)
-        z_ray, t_end, t_stop = height + walk.t_start * slope, jnp.full_like(slope, jnp.inf), lesser(walk.t_stop, at_top)
+        leaves = slope > 0 if above else slope < 0
+        last = grid.z_top - z if above else -z
+        at_last = jnp.where(leaves, last / jnp.where(leaves, slope, 1) - walk.t_start, jnp.inf)
+        z_ray, t_end, t_stop = z + walk.t_start * slope, jnp.full_like(slope, jnp.inf), lesser(by_side, at_last)
         return dataclasses.replace(walk, dz=slope, z_ray=z_ray, t_end=t_end, t_stop=t_stop)
 
     def raised(slope: Scalar, edge: Index) -> Scalar:
-        return materialise(jnp.maximum(_slope_to(grid, start, level, edge), slope))
+        found = _slope_to(grid, start, level, edge, above)
+        return materialise(jnp.maximum(found, slope) if above else jnp.minimum(found, slope))
 
     def advance(carry: tuple[jax.Array, Scalar, Index]) -> tuple[jax.Array, Scalar, Index]:
         state, slope, edge = carry
         here = tilted(slope)
         state = lax.fori_loop(0, SKIPS, lambda _, state: here.skip(state), state)
-        state, found = here.above_cell(state, touching)
+        state, found = here.beside_cell(state, touching, above)
         slope = raised(slope, found)
-        return jnp.where(slope < highest, state, MISS), slope, jnp.where(found >= 0, found, edge)
+        goes_on = slope < highest if above else slope > lowest
+        return jnp.where(goes_on, state, MISS), slope, jnp.where(found >= 0, found, edge)
 
-    # Where the surface's border stands over a ray that comes from outside.
-    edge = jnp.where(~own & (walk.t_start > touching), tilted(lowest).border(state), -1)
-    init = state, raised(lowest, edge), edge
+    # Where the surface's border stands past a ray that comes from outside.
+    first = lowest if above else highest
+    edge = jnp.where(~own & (walk.t_start > touching), tilted(first).border(state, above), -1)
+    init = state, raised(first, edge), edge
     bound = enough_steps(grid)
     budget = bound if max_steps is None else min(max_steps, bound)
     if not grid.early_exit:

@@ -254,30 +254,33 @@ class Walk(eqx.Module):
             whole, near, out, out_x, out_y, through_x, across, diagonal, crosses, on_own, skip_out, gap_out, gap_diagonal
         )
 
-    def above_cell(self, state: jax.Array, beyond: Scalar) -> tuple[jax.Array, Index]:
-        """One cell, for a ray above the surface that nothing stops: goes on, and says which edge stands highest over it.
+    def beside_cell(self, state: jax.Array, beyond: Scalar, above: bool) -> tuple[jax.Array, Index]:
+        """One cell, for a ray on one side of the surface that nothing stops: goes on, and says which edge is furthest past it.
 
         Args:
           state: of the walk.
           beyond: up to which t no edge counts.
+          above: whether the ray is above the surface.
 
         Returns:
-          The state in the next cell, and the edge that is seen from where t is 0 at the largest slope of those above the ray,
-          see `_edge`; -1 where none is, and in a larger block, which is left alone.
+          The state in the next cell, and the edge that is seen from where t is 0 at the largest slope of those above the ray
+          (at the smallest of those below a ray that is below the surface), see `_edge`; -1 where none is, and in a larger
+          block, which is left alone.
         """
-        above, ix, iy, size = self._unpack(state)
+        side, ix, iy, size = self._unpack(state)
         visits = walking(state) & (size == 1)
         cell = self._cell(state, ix, iy, size)
         far, near = self.t_start + cell.out, self.t_start + cell.diagonal
-        on_diagonal = jnp.where(cell.crosses & ~cell.on_own & (near > beyond), -cell.gap_diagonal, 0)
-        on_exit = jnp.where(cell.skip_out | (far <= beyond), 0, -cell.gap_out)
+        past_diagonal, past_exit = (-gap if above else gap for gap in (cell.gap_diagonal, cell.gap_out))
+        on_diagonal = jnp.where(cell.crosses & ~cell.on_own & (near > beyond), past_diagonal, 0)
+        on_exit = jnp.where(cell.skip_out | (far <= beyond), 0, past_exit)
         kind = jnp.where(on_diagonal * far > on_exit * near, 2, cell.through_x.astype(jnp.int32))
         rises = visits & cell.whole & (greater(on_diagonal, on_exit) > 0)
         edge = materialise(jnp.where(rises, self._edge(ix, iy, kind, ahead=True), -1))
-        return jnp.where(visits, self._onwards(above, ix, iy, size, cell.out_x, cell.out_y), state), edge
+        return jnp.where(visits, self._onwards(side, ix, iy, size, cell.out_x, cell.out_y), state), edge
 
-    def border(self, state: jax.Array) -> Index:
-        """The edge by which a ray comes into the grid, see `_edge`; -1 where the ray is above it."""
+    def border(self, state: jax.Array, above: bool) -> Index:
+        """The edge by which a ray comes into the grid, see `_edge`; -1 where the ray is above it (below it, if not `above`)."""
         _, ix, iy, _ = self._unpack(state)
         z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ self.flip[0], iy ^ self.flip[1], self.first)
         u, v = self.x - ix.astype(self.x.dtype), self.y - iy.astype(self.y.dtype)
@@ -285,7 +288,8 @@ class Walk(eqx.Module):
         low = jnp.where(through_x, jnp.where(self.back_x, z10, z00), jnp.where(self.back_y, z01, z00))
         high = jnp.where(through_x, jnp.where(self.back_x, z11, z01), jnp.where(self.back_y, z11, z10))
         along = jnp.where(through_x, jnp.where(self.back_y, 1 - v, v), jnp.where(self.back_x, 1 - u, u))
-        rises = walking(state) & (self._gap(jnp.zeros_like(u), low, high, along) < 0)
+        gap = self._gap(jnp.zeros_like(u), low, high, along)
+        rises = walking(state) & (gap < 0 if above else gap > 0)
         return jnp.where(rises, self._edge(ix, iy, through_x.astype(jnp.int32), ahead=False), -1)
 
     def _edge(self, ix: Index, iy: Index, kind: Index, ahead: bool) -> Index:

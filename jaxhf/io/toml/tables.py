@@ -99,7 +99,10 @@ _DIRECTION: Keys = {
 }
 LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
     "directional": (_directional, {**_DIRECTION, "radiance": Key(colour, None)}),  # the old name of irradiance
-    "sun": (functools.partial(_directional, kind=Sun), {**_DIRECTION, "angular_diameter": Key(number, None)}),
+    "sun": (
+        functools.partial(_directional, kind=Sun),
+        {**_DIRECTION, "angular_diameter": Key(number, None), "chords": Key(whole, None)},
+    ),
     "point": (_point, {"position": Key(numbers(3)), "intensity": Key(colour)}),
     "sky": (Sky, {"radiance": Key(colour), "occlusion": Key(whole, None)}),
 }
