@@ -1,6 +1,7 @@
 """The sun as a disc: against many suns without a size, the area of a circular segment."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ def scene(heights, lights):
     return jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights, 1.0), jaxhf.Matte(1.0))], camera, lights)
 
 
-def spread(count, towards=TOWARDS, diameter=DIAMETER):
+def spread(count, towards: Any = TOWARDS, diameter=DIAMETER):
     """Directions evenly over the sun's disc, on Vogel's spiral (Mathematical Biosciences 44, 1979)."""
     side = np.cross(towards, (0, 0, 1))
     side = side / np.linalg.norm(side)
