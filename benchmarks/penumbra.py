@@ -2,8 +2,8 @@
 
 Two towers 0.35 high, of 9 vertices a side and of one, under a sun in the west, 30 degrees high and 5 degrees wide, seen from
 above; and Jacksboro, azimuth 315, altitude 8, the disc of 4 degrees. Errors are those of ground that sees 1 to 99 % of the
-lights, in shares of the median of the unhidden sun's light; times are medians of prepared frames in turn, in units of that with 8 chords. The CSV file
-goes to standard output.
+lights, in shares of the median of the unhidden sun's light; times are medians of prepared frames in turn, in units of that
+with 8 chords. The CSV file goes to standard output.
 """
 
 import time
