@@ -2,7 +2,7 @@
 
 Two towers 0.35 high, of 9 vertices a side and of one, under a sun in the west, 30 degrees high and 5 degrees wide, seen from
 above; and Jacksboro, azimuth 315, altitude 8, the disc of 4 degrees. Errors are those of ground that sees 1 to 99 % of the
-lights, in shares of the median of the unhidden sun's light; times are medians of prepared frames in turn, in units of that
+lights, in shares of level ground in the whole sun; times are medians of prepared frames in turn, in units of that
 with 8 chords. The CSV file goes to standard output.
 """
 
@@ -67,7 +67,7 @@ def main() -> None:
         penumbra = (lit > 0.01) & (lit < 0.99)
         suns = {chords: ready.with_lights([jaxhf.Sun(towards, 1.0, diameter, chords)]) for chords in CHORDS}
         for chords, sun in suns.items():
-            off = np.abs(np.asarray(jaxhf.render(sun))[..., 0] - truth)[penumbra] / np.median(unshadowed)
+            off = np.abs(np.asarray(jaxhf.render(sun))[..., 0] - truth)[penumbra] / (np.sin(np.deg2rad(altitude)) / np.pi)
             errors[chords] += [off.mean(), off.max()]
         for _ in range(7):
             for chords, sun in suns.items():

@@ -70,13 +70,16 @@ def height_leaf(owner: str, name: str, value: Any, dtype: Any = None) -> jax.Arr
 
 
 def array_leaf(value: Any, dtype: Any) -> jax.Array:
-    """An array of JAX's, which what is done to NumPy's afterwards does not change. What is masked is nan.
+    """An array of JAX's, which what is done to NumPy's afterwards does not change. What is masked is nan; TypeError where
+    there are no numbers.
 
     JAX on a CPU shares the memory of NumPy's arrays that lie aligned, as the copy made here does: so there is no second one.
     """
     if isinstance(value, jax.Array):
         return jnp.asarray(value, dtype)
     given, dtype = numbers(value), np.dtype(dtype)
+    if given.dtype.kind not in "biuf":
+        raise TypeError(f"{given.dtype} stands where numbers must")
     room = np.empty(given.size * dtype.itemsize + _ALIGNED, np.uint8)
     start = -room.ctypes.data % _ALIGNED
     copy = room[start : start + given.size * dtype.itemsize].view(dtype).reshape(given.shape)
