@@ -131,7 +131,7 @@ def test_says_what_is_wrong():
             height_scan(FIELDS, given, given)
     with pytest.raises(ArgumentError, match=r"^ray: vec must be numbers, it is a str"):
         ray(FIELDS, pos, "down")
-    with pytest.raises(ArgumentError, match=r"^HField: data must be numbers, it is an object"):
+    with pytest.raises(ArgumentError, match=r"^HField: data must be an array of real numbers, they are an object"):
         HField(object(), SIZE)
     with pytest.raises(ArgumentError, match=r"^HField: size must be numbers, it is a str"):
         HField(GROUNDS, "large")
