@@ -97,7 +97,7 @@ class Sun(Directional):
         penumbras. One number or (r, g, b); None: pi.
       angular_diameter: of the disc, degrees, at most 10; the sun's is 0.53.
       chords: in how many azimuths the disc is seen. The time grows with them, and steps in penumbras are as large as one of
-        them: 32 keep behind a tower to 1 % what 8 keep to 10 %.
+        them: 32 keep behind a tower to 0.8 % what 8 keep to 4 %, see docs/measurements/settings.md.
     """
 
     angular_diameter: ScalarLeaf
