@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 
 from ..core.errors import ArgumentError, kind_of
 from ..core.settings import Settings
-from ..core.transfers import takes_numbers
 from ..core.types import AnyArray
 from ..io.checkpoint import load_facts
 from ..io.errors import FileError
 from ..io.files import require_folder
 from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
+from ..xla.transfers import takes_numbers
 from .basis import Unknowns
 from .diagnosis import FAR_FROM_ONE, Findings, Region, warnings, where_residuals_are, worst_regions
 from .findings import (

@@ -13,7 +13,6 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_progress
-from ..core.transfers import takes_numbers
 from ..io.terrain import Terrain
 from ..scene.heightfield import Heightfield
 from ..trace.horizon import (
@@ -30,6 +29,7 @@ from ..trace.horizon import (
 from ..trace.normals import vertex_normals
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, on_every_device
+from ..xla.transfers import takes_numbers
 from .surface import both_spacings, spacing
 
 

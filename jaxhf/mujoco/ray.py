@@ -14,7 +14,6 @@ from ..core.affine import Affine
 from ..core.autodiff import stored
 from ..core.errors import ArgumentError, require_kind
 from ..core.ray import Ray
-from ..core.transfers import takes_numbers
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import finite, quotient, unit
 from ..rendering.chunks import trace_batch
@@ -26,6 +25,7 @@ from ..trace.triangle import plane_through, triangle_corners
 from ..trace.walk import WalkResult
 from ..xla.compilation import compiled
 from ..xla.materialise import apart, materialise
+from ..xla.transfers import takes_numbers
 from .hfield import HField, as_numbers, search_grid
 from .pose import pose
 from .solid import Ground, Side, base_faces, column, ground, walls

@@ -14,13 +14,13 @@ from jaxtyping import Bool, Float
 from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, require_kind
 from ..core.ray import Ray
-from ..core.transfers import takes_numbers
 from ..core.types import Point2, Scalar, Vector, require_number
 from ..trace.status import Status
 from ..trace.triangle import plane_through
 from ..trace.walk import WalkResult
 from ..xla.compilation import compiled
 from ..xla.materialise import materialise
+from ..xla.transfers import takes_numbers
 from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import Quaternion, pose, rotation, yaw
 from .ray import first_met, in_hfield, nearest, one_axis, triangle_heights

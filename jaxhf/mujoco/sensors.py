@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_kind, whole_number
-from ..core.transfers import takes_numbers
 from ..scene.camera import require_size
 from ..xla.compilation import compiled
+from ..xla.transfers import takes_numbers
 from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import rotation
 from .ray import first_met

@@ -15,7 +15,6 @@ from ..core.errors import ArgumentError, UserError, require_kind
 from ..core.precision import numbers
 from ..core.ray import Ray
 from ..core.settings import Settings
-from ..core.transfers import takes_numbers
 from ..core.types import array_leaf, float_leaf
 from ..scene.heightfield import Heightfield
 from ..scene.localise import anchor, localise, precision
@@ -26,6 +25,7 @@ from ..trace.intersect import intersect, leave
 from ..trace.world import World, first_hit, make_world, resolve_settings
 from ..xla.compilation import compiled
 from ..xla.devices import prepared_mesh, where_called
+from ..xla.transfers import takes_numbers
 from .chunks import trace_batch, trace_chunks
 from .render import Prepared, PreparedHeightfield, heightfield_grid
 

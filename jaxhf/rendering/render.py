@@ -20,7 +20,6 @@ from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
-from ..core.transfers import takes_numbers
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light
@@ -32,6 +31,7 @@ from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, map_over, on_every_device, prepared_mesh, where_called
 from ..xla.kernel import in_turn, one_kernel
 from ..xla.materialise import unfolded
+from ..xla.transfers import takes_numbers
 from .aovs import known_aovs
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, trace_tiles
