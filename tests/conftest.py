@@ -1,15 +1,15 @@
-"""Strictness for every test: double precision is there, types do not promote by themselves, ranks neither."""
+"""Every test runs as users run it, single precision and no flags, but that types and ranks do not promote by themselves."""
 
 import gc
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import jax
 import pytest
 
-jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # Tracing makes many objects that live on: with fewer collections of them it takes a fifth less time.
@@ -17,27 +17,48 @@ gc.freeze()
 gc.set_threshold(50_000, 50, 100)
 
 SEEDS = Path(__file__).parents[2] / "shared" / "pbrt"
-PEERS = Path(__file__).parents[2] / "shared" / "peers"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--no-skips", action="store_true", help="fail where a test was skipped")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Compiled programs are shared by all workers and by the processes that tests start, for the length of this run."""
+    """Compiled programs are shared by all workers and by the processes that tests start, and by later runs."""
     if not hasattr(config, "workerinput") and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        folder = tempfile.TemporaryDirectory(prefix="jaxhf-tests-", ignore_cleanup_errors=True)
-        config.add_cleanup(folder.cleanup)
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name  # workers and other processes inherit it
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_programs(config))  # workers and other processes inherit it
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
-    # What tests compile themselves, gradients above all, is compiled as jaxhf compiles its own programs: in 0.8 of the time.
-    if jax.__version_info__ < (0, 11):  # XLA ends a process that is given a flag which is no longer there
-        os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_use_fusion_emitters=false"
     for name, value in (("jax_persistent_cache_min_compile_time_secs", 0.1), ("jax_persistent_cache_min_entry_size_bytes", -1)):
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
 
 
+def _programs(config: pytest.Config) -> Path:
+    """Pytest's own cache, a folder for each jaxlib; what no run asked for in two weeks is removed. Without it, a run's own."""
+    if not hasattr(config, "cache"):  # -p no:cacheprovider
+        temporary = tempfile.TemporaryDirectory(prefix="jaxhf-tests-", ignore_cleanup_errors=True)
+        config.add_cleanup(temporary.cleanup)
+        return Path(temporary.name)
+    folder = config.cache.mkdir(f"programs-{jax.lib.__version__}")
+    for path in folder.iterdir():
+        used = path.stat()
+        if time.time() - max(used.st_atime, used.st_mtime) > 14 * 86400:
+            path.unlink()
+    return folder
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """`--no-skips`: what was not tried is not proven. Each reason is in pytest's summary."""
+    reporter = session.config.pluginmanager.get_plugin("terminalreporter")
+    if session.config.option.no_skips and reporter and reporter.stats.get("skipped") and session.exitstatus == 0:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
 @pytest.hookimpl(tryfirst=True)  # before what fixtures compile
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """What `unoptimised` asks for, here and in processes that a test starts; `unoptimised(False)` excepts a test."""
+    """What `x64` and `unoptimised` ask for, the latter in processes that a test starts, too; `(False)` excepts a test."""
+    x64 = item.get_closest_marker("x64")
+    jax.config.update("jax_enable_x64", x64 is not None and x64.args != (False,))
     marker = item.get_closest_marker("unoptimised")
     unoptimised = marker is not None and marker.args != (False,)
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(unoptimised)
@@ -48,23 +69,17 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def unload_programs() -> Iterator[None]:
     """A compiled program holds some hundred and fifty mappings of memory, and Linux allows a process 65530: it aborts there."""
     yield
-    jax.clear_caches()
+    mappings = Path("/proc/self/maps")
+    if not mappings.exists() or mappings.read_bytes().count(b"\n") > 30_000:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
 def seeds() -> Path:
     """The folder of the seed scenes and of their references by pbrt-v2, which lie beside the project, not in it."""
     if not SEEDS.is_dir():
-        pytest.skip("the seed scenes and pbrt-v2's references are not on this machine")
+        pytest.skip("shared/pbrt, the larger seed scenes with pbrt-v2's references, are not beside the project")
     return SEEDS
-
-
-@pytest.fixture(scope="session")
-def peers() -> Path:
-    """The folder of the common work and of what other renderers made of it."""
-    if not PEERS.is_dir():
-        pytest.skip("the peers' measurements are not on this machine")
-    return PEERS
 
 
 @pytest.fixture
