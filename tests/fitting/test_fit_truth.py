@@ -1,0 +1,98 @@
+"""What the plain call of `jaxhf.fit` makes of pictures that jaxhf did not make, against the terrain that was photographed.
+
+Mitsuba 3 rendered a part of the Jacksboro valley under three low suns, with 1024 samples a pixel: shadows on a fifth of the
+ground, the terrain's border against a black background. Known beforehand are a map smoothed over 4 cells and how far it is off.
+benchmarks/references.py makes the files.
+"""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxhf
+
+FOLDER = Path(__file__).parents[1] / "references"
+
+
+@functools.cache
+def case(name: str) -> dict[str, np.ndarray]:
+    return dict(np.load(FOLDER / f"{name}.npz"))
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def scenes(known: dict[str, np.ndarray], albedo: float = 0.7, turn: float = 0.0) -> list[jaxhf.Scene]:
+    """Over the map, as a user would have them; suns that are said to stand `turn` degrees beside their place."""
+    ground = jaxhf.Object(jaxhf.Heightfield(known["prior"], *known["spacing"].tolist()), jaxhf.Matte(albedo))
+    pixels = known["images"].shape[1]
+    made = []
+    for eye, target, towards in zip(known["eyes"], known["targets"], known["towards"], strict=True):
+        camera = jaxhf.Perspective.look_at(eye, target, fov=known["fov"], width=pixels, height=pixels)
+        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        sun = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ towards
+        made.append(jaxhf.Scene([ground], camera, [jaxhf.Directional(sun)]))
+    return made
+
+
+def measured(known: dict[str, np.ndarray]) -> list[np.ndarray]:
+    """The pictures with white noise of 1 % of their brightest pixels."""
+    noise = 0.01 * known["images"].max((1, 2)).mean()
+    drawn = np.random.default_rng(0).standard_normal(known["images"].shape)
+    return list((known["images"] + noise * drawn).astype(np.float32))
+
+
+def error(known: dict[str, np.ndarray]) -> float:
+    """What a map's legend says: the root mean square of its errors."""
+    return rms(known["truth"] - known["prior"])
+
+
+def require_terrain(found: jaxhf.Fit, known: dict[str, np.ndarray], ratio: float) -> None:
+    """That what was found beside the map is the terrain's, `ratio` times nearer than nothing, and no other's.
+
+    Such as that of a terrain which is mirrored, turned, or one cell beside its place.
+    """
+    moved, told = np.asarray(found.heights) - known["prior"], known["truth"] - known["prior"]
+    left = rms(moved - told)
+    assert left < rms(told) / ratio
+    for other in (told[::-1], told[:, ::-1], told[::-1, ::-1], told.T, -told):
+        assert rms(moved - other) > ratio * left
+    for axis in (0, 1):
+        assert rms(np.diff(told, axis=axis)) > 3 * left
+    assert found.heights.dtype == np.float32
+    assert found.settings.edge_samples  # chosen, as border and shadows are in sight
+
+
+@pytest.mark.parametrize(("name", "ratio"), [("fit-small", 8.0), pytest.param("fit-valley", 8.0, marks=pytest.mark.deep)])
+def test_the_plain_call_finds_the_terrain_and_how_sure_it_is(name, ratio):
+    """As measured 12.5 and 12 times nearer than the map; one and two deviations hold 80 and 97, 85 and 99 % of the heights.
+
+    Errors of a map that was smoothed are no white noise, so neighbouring heights are right or wrong together, and shares vary.
+    """
+    known = case(name)
+    found = jaxhf.fit(scenes(known), measured(known), prior=known["prior"], prior_std=error(known), uncertainty=20)
+    require_terrain(found, known, ratio)
+    off = np.abs(np.asarray(found.heights) - known["truth"])
+    assert found.seen.all()
+    assert found.std is not None
+    assert 0.6 < (off < found.std).mean() < 0.92
+    assert (off < 2 * found.std).mean() > 0.92
+    assert rms(found.std) < 2 * rms(off)
+    np.testing.assert_allclose(found.noise, 0.01 * known["images"].max((1, 2)).mean(), rtol=0.25)
+    assert found.stats["chi2"] < 1.5
+
+
+@pytest.mark.deep
+def test_exposures_and_offsets_come_back_with_the_terrain():
+    known = case("fit-small")
+    exposures, offsets = np.array([1, 1.3, 0.8], np.float32), np.array([0, 0.02, -0.01], np.float32)
+    pictures = [
+        exposure * picture + offset for exposure, picture, offset in zip(exposures, measured(known), offsets, strict=True)
+    ]
+    found = jaxhf.fit(scenes(known), pictures, prior=known["prior"], prior_std=error(known), exposures=True, offsets=True)
+    require_terrain(found, known, 8.0)
+    np.testing.assert_allclose(np.asarray(found.exposures), exposures, rtol=0.01)
+    np.testing.assert_allclose(np.asarray(found.offsets), offsets, atol=5e-4)
