@@ -25,16 +25,14 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def scenes(known: dict[str, np.ndarray], albedo: float = 0.7, turn: float = 0.0) -> list[jaxhf.Scene]:
-    """Over the map, as a user would have them; suns that are said to stand `turn` degrees beside their place."""
-    ground = jaxhf.Object(jaxhf.Heightfield(known["prior"], *known["spacing"].tolist()), jaxhf.Matte(albedo))
+def scenes(known: dict[str, np.ndarray]) -> list[jaxhf.Scene]:
+    """Over the map, as a user would have them."""
+    ground = jaxhf.Object(jaxhf.Heightfield(known["prior"], *known["spacing"].tolist()), jaxhf.Matte(0.7))
     pixels = known["images"].shape[1]
     made = []
     for eye, target, towards in zip(known["eyes"], known["targets"], known["towards"], strict=True):
         camera = jaxhf.Perspective.look_at(eye, target, fov=known["fov"], width=pixels, height=pixels)
-        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-        sun = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ towards
-        made.append(jaxhf.Scene([ground], camera, [jaxhf.Directional(sun)]))
+        made.append(jaxhf.Scene([ground], camera, [jaxhf.Directional(towards)]))
     return made
 
 
@@ -61,16 +59,17 @@ def require_terrain(found: jaxhf.Fit, known: dict[str, np.ndarray], ratio: float
     for other in (told[::-1], told[:, ::-1], told[::-1, ::-1], told.T, -told):
         assert rms(moved - other) > ratio * left
     for axis in (0, 1):
-        assert rms(np.diff(told, axis=axis)) > 3 * left
+        assert rms(np.diff(told, axis=axis)) > ratio / 4 * left
     assert found.heights.dtype == np.float32
     assert found.settings.edge_samples  # chosen, as border and shadows are in sight
 
 
-@pytest.mark.parametrize(("name", "ratio"), [("fit-small", 8.0), pytest.param("fit-valley", 8.0, marks=pytest.mark.deep)])
+@pytest.mark.parametrize(("name", "ratio"), [("fit-small", 7.0), pytest.param("fit-valley", 9.0, marks=pytest.mark.deep)])
 def test_the_plain_call_finds_the_terrain_and_how_sure_it_is(name, ratio):
-    """As measured 12.5 and 12 times nearer than the map; one and two deviations hold 80 and 97, 85 and 99 % of the heights.
+    """As measured 12 times nearer than the map; one and two deviations hold 80 and 97, 85 and 99 % of the heights.
 
-    Errors of a map that was smoothed are no white noise, so neighbouring heights are right or wrong together, and shares vary.
+    Where rounding takes the smaller fit another way it is 9 times, with 74 and 97 %; without points on edges it is 6 times.
+    Heights are right or wrong together with their neighbours, so the shares vary.
     """
     known = case(name)
     found = jaxhf.fit(scenes(known), measured(known), prior=known["prior"], prior_std=error(known), uncertainty=20)
@@ -82,7 +81,7 @@ def test_the_plain_call_finds_the_terrain_and_how_sure_it_is(name, ratio):
     assert (off < 2 * found.std).mean() > 0.92
     assert rms(found.std) < 2 * rms(off)
     np.testing.assert_allclose(found.noise, 0.01 * known["images"].max((1, 2)).mean(), rtol=0.25)
-    assert found.stats["chi2"] < 1.5
+    assert found.stats["chi2"] < 2  # 1.2 to 1.5
 
 
 @pytest.mark.deep
@@ -93,6 +92,35 @@ def test_exposures_and_offsets_come_back_with_the_terrain():
         exposure * picture + offset for exposure, picture, offset in zip(exposures, measured(known), offsets, strict=True)
     ]
     found = jaxhf.fit(scenes(known), pictures, prior=known["prior"], prior_std=error(known), exposures=True, offsets=True)
-    require_terrain(found, known, 8.0)
+    require_terrain(found, known, 7.0)
     np.testing.assert_allclose(np.asarray(found.exposures), exposures, rtol=0.01)
     np.testing.assert_allclose(np.asarray(found.offsets), offsets, atol=5e-4)
+
+
+@pytest.mark.deep
+def test_suns_and_cameras_come_back_with_the_terrain():
+    """Suns that are off by 1 to 1.5 degrees, cameras by 50 m, half a cell.
+
+    As measured they come to 0.08 to 0.23 degrees and 17 to 19 m, most of it by a common shift with the terrain: pictures
+    do not tell that. The heights come 4.7 times nearer.
+    """
+    known = case("fit-small")
+    moves, turns = np.array([[40, -30, 20], [-30, 40, -20], [30, 30, -30]]), np.radians((1.5, -1.5, 1.0))
+    said = dict(known)
+    said["eyes"], said["targets"] = known["eyes"] + moves, known["targets"] + moves
+    said["towards"] = np.stack(
+        [
+            np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]) @ towards
+            for turn, towards in zip(turns, known["towards"], strict=True)
+        ]
+    )
+    found = jaxhf.fit(
+        scenes(said), measured(known), prior=known["prior"], prior_std=error(known), light_std=1.5, camera_std=(35.0, 0.1)
+    )
+    require_terrain(found, known, 3.5)
+    for scene, towards, eye in zip(found.scenes, known["towards"], known["eyes"], strict=True):
+        (light,) = scene.lights
+        assert isinstance(light, jaxhf.Directional)
+        cosine = np.float64(light.towards) @ towards / np.linalg.norm(np.float64(light.towards)) / np.linalg.norm(towards)
+        assert np.degrees(np.arccos(cosine)) < 0.5
+        assert np.linalg.norm(np.asarray(scene.camera.world_from_camera)[:3, 3] - eye) < 30
