@@ -21,6 +21,7 @@ from jaxhf.rendering.cast import cast_camera
 
 FOLDER = Path(__file__).parents[1] / "references"
 CYLINDER, MATTE, MIRROR = 1, 2, 3
+TERRAINS = ["rays-hills", pytest.param("rays-valley", marks=pytest.mark.deep)]
 LARGER = [pytest.param(name, marks=pytest.mark.deep) for name in ("landsea-0", "landsea-1", "texture", "landsea-big")]
 LIT_BY_COLOUR = ["hftest", *(case for case in LARGER if case.values != ("texture",))]
 
@@ -73,7 +74,7 @@ def met_and_towards(ref: dict[str, np.ndarray], which: int) -> tuple[np.ndarray,
     return p, np.broadcast_to(ref["towards"], p.shape) if which == 0 else ref["lamp"][:3] - p
 
 
-@pytest.mark.parametrize("name", ["rays-hills", "rays-valley"])
+@pytest.mark.parametrize("name", TERRAINS)
 def test_hits_and_normals_agree_with_mitsuba(name):
     """To the rounding of single precision, over 5 km of the valley's metres, too, and of the kept normals."""
     ref = kept(name)
@@ -87,7 +88,7 @@ def test_hits_and_normals_agree_with_mitsuba(name):
 
 
 @pytest.mark.parametrize("which", [0, 1], ids=["sun", "lamp"])
-@pytest.mark.parametrize("name", ["rays-hills", "rays-valley"])
+@pytest.mark.parametrize("name", TERRAINS)
 def test_cast_shadows_agree_with_mitsuba(name, which):
     """A quarter to a half of what is seen is dark.
 
@@ -121,7 +122,7 @@ def agreement(image: np.ndarray, ref: np.ndarray) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("which", [0, 1], ids=["sun", "lamp"])
-@pytest.mark.parametrize("name", ["rays-hills", "rays-valley"])
+@pytest.mark.parametrize("name", TERRAINS)
 def test_light_agrees_with_mitsuba(name, which):
     """But where a triangle and its shading normal face the light from different sides: Mitsuba's reflectance asks the latter.
 
