@@ -84,9 +84,10 @@ def configured(monkeypatch, tmp_path):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     monkeypatch.setenv("JAXHF_CACHE", str(tmp_path / "kept"))
 
-    def set_up(wanted=True):
+    def set_up(wanted=True, precision="float32"):
         values.clear()
-        arguments.set_up_jax(Namespace(devices=1, precision="float32", cache=wanted))
+        arguments.set_up_jax(Namespace(devices=1, precision=precision, cache=wanted))
+        assert values["jax_enable_x64"] == (precision == "float64")
         return values
 
     return set_up
@@ -97,7 +98,7 @@ def test_who_says_where_programs_are_kept(configured, monkeypatch, tmp_path):
     folder = values["kept"]
     assert (folder.parent, values["jax_compilation_cache_dir"]) == (tmp_path / "kept", str(folder))
     assert folder.is_dir()
-    values = configured(wanted=False)
+    values = configured(wanted=False, precision="float64")
     assert (values["jax_enable_compilation_cache"], "kept" in values) == (False, False)
     for off in ("off", ""):
         monkeypatch.setenv("JAXHF_CACHE", off)
@@ -108,15 +109,12 @@ def test_who_says_where_programs_are_kept(configured, monkeypatch, tmp_path):
     assert not (tmp_path / "not").exists()
 
 
-def test_a_folder_that_cannot_be_written_gets_one_warning(configured, monkeypatch, tmp_path):
+def test_where_nothing_can_be_kept_there_is_one_warning(configured, monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("JAXHF_CACHE", str(tmp_path / "file"))
     with pytest.warns(UserWarning, match="compiled programs are not kept") as said:
         assert "kept" not in configured()
     assert len(said) == 1
-
-
-def test_without_a_home_folder_nothing_is_kept(configured, monkeypatch):
     monkeypatch.delenv("JAXHF_CACHE")
     monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as it does for a user who is not known
     with pytest.warns(UserWarning, match="compiled programs are not kept: Could not determine home"):

@@ -11,11 +11,10 @@ import pytest
 import jaxhf
 from jaxhf.cli.main import main
 from jaxhf.cli.scene_warnings import scene_warnings
-from jaxhf.core.errors import ArgumentError, UserError
 
 HILLS = np.array([[0.0, 1.0, 0.0], [2.0, 3.0, 2.0], [0.0, 1.0, 1.0]])  # 3 at (1, 1); spacing 1
 SCENES = Path(__file__).parents[2] / "scenes"
-SUN = jaxhf.Directional.from_angles()
+SUN, NADIR = jaxhf.Directional.from_angles(), jaxhf.Directional.from_angles(90, -30)
 
 
 def scene(eye=(1.0, -4.0, 3.0), target=(1.0, 1.0, 0.0), heights=HILLS, lights=(SUN,), fov=45.0, turn=None, width=8, albedo=0.7):
@@ -29,26 +28,17 @@ def scene(eye=(1.0, -4.0, 3.0), target=(1.0, 1.0, 0.0), heights=HILLS, lights=(S
     [
         ({}, None),
         ({"lights": ()}, "no lights"),
-        (
-            {"lights": (SUN, jaxhf.Directional.from_angles(90, -30))},
-            r"lights\[1\]: it shines from below the horizon, .* is -0.5:",
-        ),
+        ({"lights": (SUN, NADIR)}, r"lights\[1\]: it shines from below the horizon, .* is -0.5:"),
         ({"fov": 0.7}, "camera: fov is 0.7 degrees"),
-        ({"fov": 1.0}, None),
-        ({"fov": 175.0}, "camera: fov is 175 degrees, more than 170; what it looks at is a dot"),
         ({"albedo": (0.5, 1.25, 1.0)}, r"objects\[0\]: albedo is 1.25, more than 1: it sends out more light than it gets"),
-        ({"albedo": jaxhf.ImageTexture(np.full((2, 2, 3), 1.5))}, r"objects\[0\]: albedo is 1.5"),
-        ({"albedo": 1.0}, None),
         ({"heights": HILLS * np.nan}, r"objects\[0\]: none of its heights is finite"),
         ({"heights": np.where(HILLS == 3, -3.4e38, HILLS)}, r"heights reach -3.4e\+38; is that a value that means no height"),
         # A point of the triangle (1, 1), (2, 1), (2, 2), at (1.5, 1.25): 3 - 0.5 - 0.25.
         ({"eye": (1.5, 1.25, 2.26)}, None),
         ({"eye": (1.5, 1.25, 2.15)}, r"eye stands 0.1 below the surface of objects\[0\], whose height there is 2.25:"),
-        ({"eye": (1.25, 1.5, 1.95)}, r"eye stands 0.05 below .* is 2:"),  # of (1, 1), (2, 2), (1, 2): 3 - 0.5 * 2
         ({"eye": (2.5, 1.25, -1.0)}, None),  # beside it
         ({"eye": (1.5, 1.25, 1.9), "turn": np.eye(4)}, None),  # where an object is turned, below has no meaning
         ({"target": (1.0, -9.0, 3.0)}, "none of the terrain is in the picture, it spans x 0 to 2, y 0 to 2, z 0 to 3"),
-        ({"target": (-9.0, -4.0, 3.0)}, "none of the terrain is in the picture"),
         ({"target": (-9.0, -4.0, 3.0), "width": 80}, None),  # a wide picture sees it at its right end
     ],
 )
@@ -66,76 +56,25 @@ def test_scenes_that_come_along_are_meant():
 
 def test_warnings_are_printed_and_stay_when_quiet(tmp_path, capsys):
     path = tmp_path / "dark.toml"
-    path.write_text(SCENE[: SCENE.index("[[lights]]")] + SCENE[SCENE.index("[[objects]]") :])
+    camera = 'camera = { type = "perspective", eye = [1, -4, 3], target = [1, 1, 0] }'
+    path.write_text(camera + '\nobjects = [{ shape = "heightfield", heights = [[0, 1], [2, 3]] }]')
     assert main(["info", str(path), "--quiet"]) == 0
     assert capsys.readouterr() == ("", "jaxhf: warning: the scene has no lights: the picture is black\n")
 
 
-SCENE = """samples = 1
-[camera]
-type = "perspective"
-eye = [1, -4, 3]
-target = [1, 1, 0]
-[[lights]]
-type = "sky"
-radiance = 1
-[[lights]]
-type = "directional"
-altitude = 45
-[[objects]]
-shape = "heightfield"
-heights = [[0, 1], [2, 3]]
-dx = 1
-"""
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "line", "said"),
-    [
-        ("[1, -4, 3]", "[0.5, 1e308, 1e308]", 4, "camera.eye must be within -1e+18 and 1e+18, it is [0.5, 1e+308, 1e+308]"),
-        ("radiance = 1", "radiance = 1e39", 8, "lights[0].radiance must be within -1e+30 and 1e+30, it is 1e+39"),
-        ("altitude = 45", "altitude = 100", 11, "lights[1].altitude must be from -90 to 90 degrees, it is 100"),
-        ("2, 3]", "2, 1e39]", 14, "objects[0].heights must fit into float32, the largest is 1e+39"),
-        ("dx = 1", "dx = 1e-300", 15, "objects[0].dx must be from 1e-18 to 1e+18, it is 1e-300"),
-        ("dx = 1", f"dx = {'9' * 400}", 15, "objects[0].dx must be within -1e+30 and 1e+30, it is 9999"),
-        ("dx = 1", "transform = [{ scale = 1e20 }, { scale = 1e20 }]", 15, "transform must be within -1e+30 and 1e+30"),
-        ("samples = 1", "samples = 10000000000", 1, "samples must be at most 1048576, it is 10000000000"),
-    ],
-)
-def test_numbers_that_no_scene_can_mean(tmp_path, capsys, old, new, line, said):
-    path = tmp_path / "scene.toml"
-    assert SCENE.count(old) == 1
-    path.write_text(SCENE.replace(old, new))
-    assert main(["info", str(path)]) == 2
-    out, err = capsys.readouterr()
-    assert (out, err.count("\n")) == ("", 1)
-    assert err.startswith(f"jaxhf: error: {path}:{line}: ")
-    assert said in err
-
-
-def test_a_map_of_no_heights_is_an_error(tmp_path, capsys):
-    np.save(tmp_path / "none.npy", np.full((4, 5), np.nan))
-    for command in ("hillshade", "slope", "aspect", "relief"):
-        assert main([command, str(tmp_path / "none.npy"), "-o", str(tmp_path / "map.npy")]) == 2
-        assert "heights must hold a finite one" in capsys.readouterr().err
-    assert not (tmp_path / "map.npy").exists()
-
-
-def test_pictures_of_bytes_are_refused():
-    picture = np.full((8, 8, 3), 100, np.uint8)
-    with pytest.raises(ArgumentError, match=r"targets\[0\] must hold linear radiance in floats, 1 being white; it holds uint8"):
-        jaxhf.fit([scene()], [picture])
-    with pytest.raises(ArgumentError, match="texels must hold linear colours in floats, 1 being white; theirs are uint8"):
-        jaxhf.ImageTexture(picture)
-
-
-MISUSE = """
+PROCESS = """
 import sys
 import jaxhf
 import numpy as np
+eye = (0, -3, 2), (0, 0, 0)
 field = jaxhf.Heightfield(np.eye(4))
-camera = jaxhf.Perspective.look_at((0, -3, 2), (0, 0, 0))
-scene = jaxhf.Scene([jaxhf.Object(field)], camera, [jaxhf.Sky(1.0)])
+# NumPy's whole numbers are whole numbers.
+camera = jaxhf.Perspective.look_at(*eye, fov=np.float32(40), width=np.int64(640), height=np.uint16(480))
+jaxhf.Orthographic.look_at(*eye, extent=np.float32(2), width=np.int64(8), height=np.int8(8))
+scene = jaxhf.Scene([jaxhf.Object(field)], camera, [jaxhf.Sky(1.0, occlusion=np.int64(4))], samples=np.int64(4))
+settings = jaxhf.Settings(samples=np.int32(9), max_depth=np.int64(2), chunk=np.int64(256))
+whole = camera.width, camera.height, scene.samples, scene.lights[0].occlusion, settings.samples, settings.chunk
+print(whole, {type(number).__name__ for number in whole})
 ray = (0, 0, 1), (0, 0, -1)
 for line in sys.stdin.read().splitlines():
     try:
@@ -146,58 +85,31 @@ for line in sys.stdin.read().splitlines():
         print("not ours:", type(error), error)
 """
 ANSWERS = {
+    "jaxhf.fit([scene], [np.ones((8, 8, 3), np.uint8)])": "fit: targets[0] must hold linear radiance in floats, 1 being white; "
+    "it holds uint8 (load_image decodes a picture)",
+    'jaxhf.cast(field, *ray, "flat")': "cast: settings must be a jaxhf.Settings, it is a str",
     'jaxhf.render("x.toml")': "render: scene must be a jaxhf.Scene, it is a str; jaxhf.load_scene reads one from a file",
-    "jaxhf.render([scene, scene])": "render: scene must be a jaxhf.Scene, it is a list; render takes one at a time",
     'jaxhf.render(scene, aovs="depth")': "render: aovs must be a list of names, as in aovs=('depth',); it is 'depth'",
     "jaxhf.render(scene, mesh=2)": "render: mesh must be a jax.sharding.Mesh, it is an int; jax.make_mesh makes one",
     "jaxhf.render(scene, progress=True)": "render: progress must be a function of (done, in all), it is True",
-    "jaxhf.sky_view(field, progress=1)": "sky_view: progress must be a function of (done, in all), it is 1",
-    'jaxhf.save_mesh("a.ply", np.eye(3))': "save_mesh: terrain must be a jaxhf.Terrain, it is a ndarray",
     'jaxhf.save_heights(np.eye(3), "a.npy")': "save_heights: path must be the name of a file, it is a ndarray",
-    'jaxhf.render(scene, "draft")': "settings must be a jaxhf.Settings, it is a str",
     "jaxhf.render(field)": "render: scene must be a jaxhf.Scene, it is a Heightfield; "
     "which has a camera and lights besides: jaxhf.Scene([jaxhf.Object(heightfield)], camera, lights)",
     'jaxhf.cast("t.tif", *ray)': "cast: surface must be a jaxhf.Heightfield or a Scene, it is a str; "
     "jaxhf.Heightfield(heights, dx, dy) makes one",
-    'jaxhf.cast(field, *ray, "flat")': "cast: settings must be a jaxhf.Settings, it is a str",
     "jaxhf.cast(field, (0, 0, 1), None)": "cast: d must have shape (..., 3), its shape is ()",
     "jaxhf.fit(scene, [1.0])": "fit: scenes must be a list, one for each picture, it is a Scene",
     'jaxhf.fit([scene], ["a.png"])': "fit: targets[0] must be an image, it is a name: jaxhf.load_image('a.png')",
     "jaxhf.Scene(jaxhf.Object(field), camera)": "Scene: objects and lights must be lists of them, here an Object stands alone",
-    "jaxhf.Scene([field], camera)": "Scene: objects does not take a Heightfield, jaxhf.Object(shape, material) does",
     'jaxhf.Matte("red")': "'red' stands where numbers must",
     "jaxhf.Heightfield(np.eye(4), dx=(1, 2))": "Heightfield: dx must be one number, it is a tuple",
-    'jaxhf.hillshade("t.tif")': "hillshade: heights must be an array of real numbers or a Terrain, they are a str",
-    "jaxhf.Settings(samples=10**10)": "Settings: samples must be at most 1048576, it is 10000000000",
 }
 
 
 def test_misuse_says_what_was_wanted():
-    """In a process of its own: in that of the tests jaxtyping refuses most of it first."""
-    run = subprocess.run([sys.executable, "-c", MISUSE], input="\n".join(ANSWERS), capture_output=True, text=True, timeout=120)
-    assert run.stdout.splitlines() == list(ANSWERS.values()), run.stderr
-
-
-NUMPY = """
-import jaxhf
-import numpy as np
-eye = (0, -3, 2), (0, 0, 0)
-camera = jaxhf.Perspective.look_at(*eye, fov=np.float32(40), width=np.int64(640), height=np.uint16(480))
-jaxhf.Orthographic.look_at(*eye, extent=np.float32(2), width=np.int64(8), height=np.int8(8))
-field = jaxhf.Object(jaxhf.Heightfield(np.eye(3)))
-scene = jaxhf.Scene([field], camera, [jaxhf.Sky(1.0, occlusion=np.int64(4))], samples=np.int64(4))
-settings = jaxhf.Settings(samples=np.int32(9), max_depth=np.int64(2), chunk=np.int64(256))
-whole = camera.width, camera.height, scene.samples, scene.lights[0].occlusion, settings.samples, settings.chunk
-assert whole == (640, 480, 4, 4, 9, 256)
-assert {type(number) for number in whole} == {int}
-"""
-
-
-def test_numpys_whole_numbers_are_whole_numbers():
-    """In such a process, too; warnings, as of arrays in static fields, are errors."""
-    subprocess.run([sys.executable, "-W", "error", "-c", NUMPY], check=True, timeout=120)
-
-
-def test_what_is_no_number_is_the_users_mistake():
-    with pytest.raises(UserError, match="'blue' stands where numbers must"):
-        jaxhf.Sky("blue")
+    """In a process of its own: here jaxtyping refuses most of it first. Warnings, as of static arrays, are errors."""
+    command = [sys.executable, "-W", "error", "-c", PROCESS]
+    run = subprocess.run(command, input="\n".join(ANSWERS), capture_output=True, text=True, timeout=120)
+    whole, *answers = run.stdout.splitlines() or [run.stderr]
+    assert whole == "(640, 480, 4, 4, 9, 256) {'int'}"
+    assert answers == list(ANSWERS.values()), run.stderr

@@ -12,14 +12,6 @@ from jaxhf.io.checkpoint import save_checkpoint
 from jaxhf.io.files import save_text
 
 
-@pytest.mark.parametrize("name", ["http://a/b.tif", "s3://bucket/b.tif"])
-def test_an_address_is_no_file(name):
-    """It is named as it was given: `Path` would have http:/a/b.tif."""
-    for call in (jaxhf.load_heights, jaxhf.load_image, jaxhf.load_scene, lambda path: jaxhf.save_image(path, np.ones((2, 2)))):
-        with pytest.raises(ValueError, match=f"^{name}: this is an address, files are neither read from the network nor"):
-            call(name)
-
-
 @pytest.mark.skipif(sys.platform in ("darwin", "win32"), reason="these take names in Unicode alone")
 def test_names_that_are_not_utf_8(tmp_path):
     """As bytes in Latin-1 are, on a disk of long ago; the header beside a raster is found."""

@@ -30,15 +30,11 @@ def test_fractal_falls_off_as_its_exponent_says():
     assert slope == pytest.approx(-1.5, abs=0.02)  # 50,000 samples of a logarithm that scatters by 0.64
 
 
-def test_level_fills_what_lies_lower():
+def test_level_fills_what_lies_lower_and_waves_run_where_they_are_sent():
     plain, filled = fractal([32, 32], seed=2), fractal([32, 32], seed=2, level=0.4)
     np.testing.assert_array_equal(filled, np.maximum(plain, 0.4))
     assert (plain < 0.4).any()
-
-
-def test_waves_run_where_they_are_sent():
-    """Waves that run north do not change from west to east."""
-    heights = waves([32, 32], seed=1, direction=90.0, spread=0.0)
+    heights = waves([32, 32], seed=1, direction=90.0, spread=0.0)  # to the north: no change from west to east
     np.testing.assert_allclose(heights, np.repeat(heights[:, :1], 32, axis=1), atol=1e-12)
     assert np.ptp(heights[:, 0]) > 0.99
 
@@ -66,9 +62,8 @@ def test_grid_is_red_along_u_and_green_along_v():
 
 
 def test_checker_starts_with_its_first_colour():
-    np.testing.assert_array_equal(
-        checker([2, 4], squares=2, first=(1.0, 0.0, 0.0), second=(0.0, 0.0, 1.0))[:, :, 0], [[1, 1, 0, 0], [0, 0, 1, 1]]
-    )
+    texels = checker([2, 4], squares=2, first=(1.0, 0.0, 0.0), second=(0.0, 0.0, 1.0))
+    np.testing.assert_array_equal(texels[:, :, 0], [[1, 1, 0, 0], [0, 0, 1, 1]])
 
 
 def test_sky_is_bright_at_the_sun_and_blue_at_the_top():
@@ -79,29 +74,21 @@ def test_sky_is_bright_at_the_sun_and_blue_at_the_top():
     top, bottom = texels[-1, 128], texels[0, 128]
     assert top[2] / top[0] > 3
     assert bottom[2] / bottom[0] < 1.2
-
-
-def test_clouds_cover_their_part_of_the_sky():
-    clear, cloudy = (sky([64, 256], clouds=clouds) for clouds in (0.0, 0.3))
-    changed = np.abs(clear - cloudy).max(2) > 0
-    assert changed.mean() == pytest.approx(0.3, abs=0.01)
+    clear, cloudy = (sky([64, 256], clouds=clouds) for clouds in (0.0, 0.3))  # clouds cover their part of it
+    assert (np.abs(clear - cloudy).max(2) > 0).mean() == pytest.approx(0.3, abs=0.01)
 
 
 @pytest.mark.parametrize(
     ("make", "parameters", "message"),
     [
         (fractal, {"size": [1, 5]}, r"size must be at least 2 x 2, it is \[1, 5\]"),
-        (fractal, {"size": [-3, 5]}, r"size must be at least 2 x 2, it is \[-3, 5\]"),
         (waves, {"size": [2**15, 2**15]}, f"at most {MAX_PIXELS} pixels"),
-        (bumps, {"size": [2**15, 2**15]}, f"at most {MAX_PIXELS} pixels"),
-        (grid, {"size": [0, 5]}, r"size must be at least 1 x 1, it is \[0, 5\]"),
         (fractal, {"range": (1.0, 0.0)}, r"range must be \(lowest, highest\), it is \[1.0, 0.0\]"),
         (fractal, {"seed": -1}, "non-negative"),
         (waves, {"count": 0}, "count must be from 1 on, it is 0"),
         (waves, {"lengths": (0.5, 0.1)}, r"lengths must be \(shortest, longest\), both positive, they are \[0.5, 0.1\]"),
         (bumps, {"radius": 0.0}, "count and radius must be positive, they are 12 and 0.0"),
         (grid, {"lines": 0}, "lines must be from 1 on, it is 0"),
-        (checker, {"squares": -2}, "squares must be from 1 on, it is -2"),
         (sky, {"clouds": 1.5}, r"clouds must lie in 0..1, it is 1.5"),
         (sky, {"sun_radius": 0.0}, "sun_radius must be positive, it is 0.0"),
     ],

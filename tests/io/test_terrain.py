@@ -5,16 +5,17 @@ import re
 import struct
 import sys
 import zipfile
-import zlib
 
+import geotiffs
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from test_images import write_png
 
-from jaxhf import Terrain, jacksboro, load_heights, save_heights, save_mesh
+from jaxhf import Terrain, jacksboro, load_heights, load_image, save_heights, save_image, save_mesh
 from jaxhf.io.files import MAX_PIXELS
-from jaxhf.io.georeference import metres_per_degree
 
 # What a file with the north first holds: two rows, the northern one 1 2 3.
 NORTH_FIRST = np.array([[1, 2, 3], [4, 5, 6]], np.uint16)
@@ -41,14 +42,10 @@ def write_tiff(
         named = {2048: 4326} if model == GEOGRAPHIC and keys is None else {}
         keys = {1024: model, 1025: raster, **named, **(keys or {})}
         doubles = [value for value in keys.values() if isinstance(value, float)]
-        entries = [
-            (key, 34736, 1, doubles.index(value)) if isinstance(value, float) else (key, 0, 1, value)
-            for key, value in sorted(keys.items())
-        ]
-        directory = (1, 1, 0, len(keys), *(number for entry in entries for number in entry))
-        tags.append((34735, "H", len(directory), directory, True))
-        if doubles:
-            tags.append((34736, "d", len(doubles), doubles, True))
+        directory = [1, 1, 0, len(keys)]
+        for key, value in sorted(keys.items()):
+            directory += (key, 34736, 1, doubles.index(value)) if isinstance(value, float) else (key, 0, 1, value)
+        tags += [(34735, "H", len(directory), directory, True), (34736, "d", len(doubles), doubles, True)][: 1 + bool(doubles)]
     if nodata is not None:
         tags.append((42113, "s", 0, nodata, True))
     if metadata is not None:
@@ -60,14 +57,6 @@ def placed(terrain):
     return terrain.dx, terrain.dy, terrain.x0, terrain.y0
 
 
-def test_npy_is_in_jaxhfs_order(tmp_path):
-    np.save(tmp_path / "x.npy", SOUTH_FIRST.astype(np.float64))
-    terrain = load_heights(tmp_path / "x.npy")
-    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
-    assert terrain.heights.dtype == np.float64
-    assert placed(terrain) == (1, 1, 0, 0)
-
-
 def test_png_is_flipped(tmp_path):
     Image.fromarray(NORTH_FIRST * 10000).save(tmp_path / "x.png")
     terrain = load_heights(tmp_path / "x.png", z_scale=0.5, dx=30.0, dy=20.0, x0=5e6, y0=-7.0)
@@ -76,14 +65,14 @@ def test_png_is_flipped(tmp_path):
     assert placed(terrain) == (30, 20, 5e6, -7)
 
 
-@pytest.mark.parametrize("compression", [None, "zlib"])
 @pytest.mark.parametrize("dtype", [np.int16, np.uint16, np.float32, ">f4", np.float64])
-def test_tiff_is_flipped(tmp_path, dtype, compression):
-    write_tiff(tmp_path / "x.tif", NORTH_FIRST.astype(dtype), scale=None, compression=compression)
-    terrain = load_heights(tmp_path / "x.tif")
-    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
-    assert terrain.heights.dtype == (np.float64 if dtype is np.float64 else np.float32)
-    assert placed(terrain) == (1, 1, 0, 0)
+def test_tiff_is_flipped(tmp_path, dtype):
+    for compression in (None, "zlib"):
+        write_tiff(tmp_path / "x.tif", NORTH_FIRST.astype(dtype), scale=None, compression=compression)
+        terrain = load_heights(tmp_path / "x.tif")
+        np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
+        assert terrain.heights.dtype == (np.float64 if dtype is np.float64 else np.float32)
+        assert placed(terrain) == (1, 1, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -107,14 +96,6 @@ def test_tiff_is_placed_by_its_tags(tmp_path, raster, tie, x0, y0):
     assert placed(load_heights(tmp_path / "x.tiff", x0=0.0, dy=7.0)) == (30, 7, 0, y0)
 
 
-def test_tiff_in_degrees_becomes_local_metres(tmp_path):
-    write_tiff(tmp_path / "x.tif", NORTH_FIRST, model=GEOGRAPHIC, scale=(0.01, 0.01, 0), tie=(0, 0, 0, 10, 45.01, 0))
-    terrain = load_heights(tmp_path / "x.tif")
-    # The mean latitude is 45 degrees: 78,847 m and 111,132 m to a degree there, as tables of WGS84 have it.
-    np.testing.assert_allclose((terrain.dx, terrain.dy), (788.47, 1111.32), rtol=1e-5)
-    assert placed(terrain)[2:] == (0, 0)
-
-
 MOON, MARS = 1737400.0, 3396190.0
 
 
@@ -135,7 +116,8 @@ IN_DEGREES = {"model": GEOGRAPHIC, "scale": (0.01, 0.01, 0), "tie": (0, 0, 0, 10
         ({2048: 32767, 2057: MOON, 2058: MOON}, MOON / 2, MOON),
         ({2048: 32767, 2057: MOON, 2059: 0.0}, MOON / 2, MOON),
         ({2048: 49900, 2057: MARS, 2058: 3376200.0}, *ellipse_at_60(MARS, 3376200.0)),
-        # The Earth's systems without axes.
+        # The Earth's system in full, and those without axes.
+        ({2048: 4326}, *EARTH_AT_60),
         ({2048: 4269}, *EARTH_AT_60),
         ({2048: 32767, 2056: 7030}, *EARTH_AT_60),
         ({2048: 32767, 2057: MOON}, MOON / 2, MOON),
@@ -145,14 +127,15 @@ def test_degrees_are_those_of_the_files_globe(tmp_path, keys, along_x, along_y):
     write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
     terrain = load_heights(tmp_path / "x.tif")
     np.testing.assert_allclose((terrain.dx, terrain.dy), np.radians(0.01) * np.array((along_x, along_y)), rtol=1e-7)
+    assert placed(terrain)[2:] == (0, 0)
 
 
-@pytest.mark.parametrize("keys", [{2048: 32767}, {2048: 30100}, {}])
-def test_a_globe_of_unknown_size_needs_a_cell_size(tmp_path, keys):
-    write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
-    with pytest.raises(ValueError, match=r"x\.tif: its degrees are on a globe of unknown size: dx and dy must be given"):
-        load_heights(tmp_path / "x.tif", dx=3.0)
-    assert placed(load_heights(tmp_path / "x.tif", dx=3.0, dy=4.0)) == (3, 4, 0, 0)
+def test_a_globe_of_unknown_size_needs_a_cell_size(tmp_path):
+    for keys in ({2048: 32767}, {2048: 30100}, {}):
+        write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
+        with pytest.raises(ValueError, match=r"x\.tif: its degrees are on a globe of unknown size: dx and dy must be given"):
+            load_heights(tmp_path / "x.tif", dx=3.0)
+        assert placed(load_heights(tmp_path / "x.tif", dx=3.0, dy=4.0)) == (3, 4, 0, 0)
 
 
 SCALED = '<Item name="OFFSET" sample="0" role="offset">-500</Item><Item name="SCALE" sample="0" role="scale">0.25</Item>'
@@ -165,14 +148,6 @@ def test_gdals_scale_and_offset_are_applied(tmp_path):
     terrain = load_heights(tmp_path / "x.tif", z_scale=2.0)
     np.testing.assert_array_equal(terrain.heights, [[-998, np.nan, -997], [-999.5, -999, -998.5]])
     assert terrain.heights.dtype == np.float32
-
-
-@pytest.mark.parametrize(
-    ("latitude", "east", "north"), [(0.0, 111320, 110574), (45.0, 78847, 111132), (-75.0, 28902, 111618), (90.0, 0, 111694)]
-)
-def test_metres_per_degree(latitude, east, north):
-    """Tables of WGS84 give these in kilometres with three digits."""
-    np.testing.assert_allclose(metres_per_degree(latitude), (east, north), atol=1)
 
 
 HOLES = [
@@ -209,15 +184,6 @@ def test_npz_by_its_names(tmp_path):
     np.testing.assert_array_equal(load_heights(tmp_path / "sole.npz").heights, heights)
 
 
-@pytest.mark.parametrize(("ymin", "ymax"), [(44.99, 45.01), (45.01, 44.99)])
-def test_elevation_has_the_north_first_and_degrees(tmp_path, ymin, ymax):
-    bounds = {"xmin": 10.0, "xmax": 10.03, "ymin": ymin, "ymax": ymax}
-    np.savez(tmp_path / "x.npz", elevation=NORTH_FIRST, dx=0.01, dy=0.01, **bounds)
-    terrain = load_heights(tmp_path / "x.npz")
-    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
-    np.testing.assert_allclose((terrain.dx, terrain.dy), (788.47, 1111.32), rtol=1e-5)
-
-
 def test_jacksboro():
     pytest.importorskip("matplotlib")
     terrain = jacksboro()
@@ -228,112 +194,45 @@ def test_jacksboro():
     # A sphere of 6371 km is within 0.6 % of the ellipsoid; the field lies at 36.59 degrees north, with 3" to a cell.
     second = np.radians(3 / 3600) * 6371000
     np.testing.assert_allclose((terrain.dx, terrain.dy), (second * np.cos(np.radians(36.59)), second), rtol=6e-3)
-    assert placed(terrain)[2:] == (0, 0)
-    # The Cumberland Mountains fill the south-west, Powell Valley lies in the north-east below a ridge that runs to the
-    # east-north-east, the lowland of the Great Valley in the south-east.
-    half = 172, 201
-    assert terrain.heights[: half[0], : half[1]].mean() > terrain.heights[: half[0], half[1] :].mean() + 150
-    assert terrain.heights[: half[0], : half[1]].mean() > terrain.heights[half[0] :, : half[1]].mean()
+    assert placed(terrain)[2:] == (0, 0)  # as degrees lie, whose file has the north first
+    # The Cumberland Mountains fill the south-west, Powell Valley the north-east, the Great Valley the south-east.
+    (south_west, south_east), (north_west, _) = [np.array_split(half, 2, 1) for half in np.array_split(terrain.heights, 2)]
+    assert south_west.mean() > max(south_east.mean() + 150, north_west.mean())
 
 
 def test_extras_are_named(tmp_path, monkeypatch):
-    write_tiff(tmp_path / "x.tif", NORTH_FIRST)
-    monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(ValueError, match=r"x.tif: reading .tif needs rasterio: pip install 'jaxhf\[geo\]'"):
-        load_heights(tmp_path / "x.tif")
-    monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(ValueError, match=r"x.glb: writing .glb needs trimesh: pip install 'jaxhf\[mesh\]'"):
-        save_mesh(tmp_path / "x.glb", Terrain(np.zeros((2, 2))))
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(ValueError, match=r"pip install 'jaxhf\[plot\]'"):
-        jacksboro()
+    tiff(NORTH_FIRST)(tmp_path / "x.tif")
+    (tmp_path / "x.exr").touch()
+    for library, call, said in (
+        (
+            "rasterio",
+            lambda: load_heights(tmp_path / "x.tif"),
+            r"x.tif: reading .tif needs rasterio: pip install 'jaxhf\[geo\]'",
+        ),
+        ("OpenEXR", lambda: load_image(tmp_path / "x.exr"), r"x.exr: reading .exr needs OpenEXR: pip install 'jaxhf\[exr\]'"),
+        ("OpenEXR", lambda: save_image(tmp_path / "x.exr", np.ones((2, 2))), r"x.exr: writing .exr needs OpenEXR: pip install"),
+        ("trimesh", lambda: save_mesh(tmp_path / "x.glb", Terrain(SQUARE)), r"x.glb: writing .glb needs trimesh: pip install "),
+        ("matplotlib", jacksboro, r"pip install 'jaxhf\[plot\]'"),
+    ):
+        monkeypatch.setitem(sys.modules, library, None)
+        with pytest.raises(ValueError, match=said):
+            call()
 
 
 def save(**arrays):
     return lambda path: np.savez(path, **arrays) if path.suffix == ".npz" else np.save(path, *arrays.values())
 
 
-def bomb_png(path):
-    header = struct.pack(">IIBBBBB", 40000, 40000, 16, 0, 0, 0, 0)
-    part = struct.pack(">I", 13) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
-    path.write_bytes(b"\x89PNG\r\n\x1a\n" + part + struct.pack(">I", 0) + b"IEND" + struct.pack(">I", zlib.crc32(b"IEND")))
-
-
-def cut_tiff(path):
-    write_tiff(path, np.zeros((64, 64), np.float32))
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def cut_npz(path):
-    np.savez(path, heights=np.zeros((64, 64)))
-    path.write_bytes(path.read_bytes()[:5000])
-
-
 def lying_npz(path):
-
     member = io.BytesIO()
     np.lib.format.write_array_header_1_0(member, {"descr": "<f8", "fortran_order": False, "shape": (16000, 16000)})
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("heights.npy", member.getvalue())
 
 
-BAD_FILES = [
-    ("line.npy", save(a=np.zeros(4)), {}, "shape (ny, nx), theirs is (4,)"),
-    ("thin.npy", save(a=np.zeros((1, 5))), {}, "at least 2x2, theirs is (1, 5)"),
-    ("empty.npy", save(a=np.zeros((0, 5))), {}, "its size must be positive"),
-    ("bool.npy", save(a=np.zeros((2, 2), bool)), {}, "heights must be numbers, they are bool"),
-    ("text.npy", save(a=np.array([["a"]])), {}, "must hold real numbers, it holds <U1"),
-    ("names.npz", save(a=np.zeros((2, 2)), b=np.zeros((2, 2))), {}, "an array 'heights', or only one, it holds a, b"),
-    ("dx.npz", save(heights=np.zeros((2, 2)), dx=np.zeros(3)), {}, "its dx must be one number, its shape is (3,)"),
-    ("bare.npz", save(elevation=np.zeros((2, 2)), dx=1.0, dy=1.0), {}, "beside 'elevation' it must hold xmin, ymax, ymin"),
-    (
-        "metres.npz",
-        save(elevation=np.zeros((2, 2)), dx=30.0, dy=30.0, xmin=0.0, ymin=5e6, ymax=5e6),
-        {},
-        "degrees must lie on a globe",
-    ),
-    ("cut.npz", cut_npz, {}, "not a zip file"),
-    ("lying.npz", lying_npz, {}, "its header declares 2048000000 bytes of data, 0 are there"),
-    ("rgb.png", lambda path: Image.new("RGB", (2, 2)).save(path), {}, "it has red, green and blue of 8 bits"),
-    ("bomb.png", bomb_png, {}, f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000"),
-    ("cut.tif", cut_tiff, {}, "cut.tif: it is cut off, damaged or of another kind"),
-    ("text.tif", lambda path: path.write_text("no"), {}, "text.tif: it is cut off, damaged or of another kind"),
-    ("rgb.tif", lambda path: write_rgb(path), {}, "must be one band, it has 3"),
-    (
-        "scale.tif",
-        lambda path: write_tiff(path, NORTH_FIRST, scale=None, metadata=SCALED.replace("0.25", "x")),
-        {},
-        "its scale and offset must be finite, the scale not zero; they are 0.0 and -500.0",
-    ),
-    (
-        "grads.tif",
-        lambda path: write_tiff(path, NORTH_FIRST, keys={2054: 9105}, **IN_DEGREES),
-        {},
-        "must be in degrees, their unit is grad",
-    ),
-    ("high.npy", save(a=np.full((2, 2), 1e300)), {"z_scale": 1e10}, "heights times z_scale must fit into float64"),
-    ("rotated.tif", lambda path: write_raster(path, (30, 5, 0, 0, -20, 0)), {}, "its pixels must lie along x and y"),
-    ("lying.tif", lambda path: lying_tiff(path, 16000), {}, "it is cut off, damaged or of another kind"),
-    ("bomb.tif", lambda path: lying_tiff(path, 40000), {}, f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000"),
-    ("x.npy", save(a=np.zeros((2, 2))), {"dx": 0.0}, "dx must be positive and finite, it is 0.0"),
-    ("x.npy", save(a=np.zeros((2, 2))), {"y0": np.nan}, "y0 must be finite, it is nan"),
-    ("x.npy", save(a=np.zeros((2, 2))), {"z_scale": 0.0}, "z_scale must be finite and not zero, it is 0.0"),
-    ("x.tfi", lambda path: path.touch(), {}, "cannot read heights from the ending '.tfi'; did you mean '.tif'?"),
-]
-
-
-def write_raster(path, transform, values=NORTH_FIRST, **profile):
-    """A GeoTIFF by rasterio."""
-    rasterio = pytest.importorskip("rasterio")
-    ny, nx = values.shape
-    profile = {"driver": "GTiff", "transform": rasterio.Affine(*transform), "crs": "EPSG:32616", **profile}
-    with rasterio.open(path, "w", height=ny, width=nx, count=1, dtype=values.dtype, **profile) as dataset:
-        dataset.write(values, 1)
-
-
 def lying_tiff(path, side):
     """Of 4 x 4 pixels in 256 x 256 tiles, that declares more."""
-    write_raster(path, (2, 0, 0, 0, -2, 0), np.ones((4, 4), np.uint16))
+    geotiffs.write(path, np.ones((4, 4), np.uint16))
     data = path.read_bytes()
     for tag in (256, 257, 278):  # ImageWidth, ImageLength and RowsPerStrip, of 16 bits
         at = data.index(struct.pack("<HHI", tag, 3, 1))
@@ -341,8 +240,42 @@ def lying_tiff(path, side):
     path.write_bytes(data)
 
 
-def write_rgb(path):
-    pytest.importorskip("tifffile").imwrite(path, np.zeros((4, 4, 3), np.uint8), photometric="rgb")
+def tiff(values: np.ndarray = NORTH_FIRST, **tags):
+    return lambda path: write_tiff(path, values, **tags)
+
+
+SQUARE = np.zeros((2, 2))
+GLOBE = {"elevation": SQUARE, "dx": 30.0, "dy": 30.0, "xmin": 0.0, "ymin": 5e6, "ymax": 5e6}
+BAD_FILES = [
+    ("line.npy", save(a=np.zeros(4)), {}, "shape (ny, nx), theirs is (4,)"),
+    ("empty.npy", save(a=np.zeros((0, 5))), {}, "its size must be positive"),
+    ("names.npz", save(a=SQUARE, b=SQUARE), {}, "an array 'heights', or only one, it holds a, b"),
+    ("bare.npz", save(elevation=SQUARE, dx=1.0, dy=1.0), {}, "beside 'elevation' it must hold xmin, ymax, ymin"),
+    ("metres.npz", save(**GLOBE), {}, "degrees must lie on a globe"),
+    ("lying.npz", lying_npz, {}, "its header declares 2048000000 bytes of data, 0 are there"),
+    ("rgb.png", lambda path: Image.new("RGB", (2, 2)).save(path), {}, "it has red, green and blue of 8 bits"),
+    (
+        "bomb.png",
+        lambda path: write_png(path, (40000, 40000, 16, 0, 0, 0, 0), b""),
+        {},
+        f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000",
+    ),
+    ("lying.tif", lambda path: lying_tiff(path, 16000), {}, "it is cut off, damaged or of another kind"),
+    ("bomb.tif", lambda path: lying_tiff(path, 40000), {}, f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000"),
+    ("rgb.tif", tiff(np.zeros((3, 4, 4), np.uint8), planarconfig="separate"), {}, "must be one band, it has 3"),
+    ("scale.tif", tiff(scale=None, metadata=SCALED.replace("0.25", "x")), {}, "the scale not zero; they are 0.0 and -500.0"),
+    ("grads.tif", tiff(keys={2054: 9105}, **IN_DEGREES), {}, "must be in degrees, their unit is grad"),
+    (
+        "rotated.tif",
+        lambda path: geotiffs.write(path, NORTH_FIRST, (30, 5, 0, 0, -20, 0)),
+        {},
+        "its pixels must lie along x and y",
+    ),
+    ("high.npy", save(a=np.full((2, 2), 1e300)), {"z_scale": 1e10}, "heights times z_scale must fit into float64"),
+    ("x.npy", save(a=SQUARE), {"dx": 0.0}, "dx must be positive and finite, it is 0.0"),
+    ("x.npy", save(a=SQUARE), {"z_scale": 0.0}, "z_scale must be finite and not zero, it is 0.0"),
+    ("x.tfi", lambda path: path.touch(), {}, "cannot read heights from the ending '.tfi'; did you mean '.tif'?"),
+]
 
 
 @pytest.mark.parametrize(("name", "make", "arguments", "message"), BAD_FILES, ids=[f"{row[0]} {row[2]}" for row in BAD_FILES])
@@ -354,25 +287,18 @@ def test_what_is_not_terrain_is_refused_by_name(tmp_path, name, make, arguments,
     assert str(path) in str(error.value)
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="none: there is no such file"):
-        load_heights(tmp_path / "none")
-
-
-def test_terrain_checks_itself():
-    with pytest.raises(ValueError, match="dy must be positive and finite, it is -1"):
-        Terrain(np.zeros((2, 2)), dy=-1.0)
-
-
 def test_a_terrain_becomes_a_heightfield():
-    terrain = Terrain(np.array([[1, np.nan, 3], [4, 5, 1e39]]), 30.0, 20.5, 500000.25, 4.1e6)
-    field = terrain.heightfield()
-    np.testing.assert_array_equal(field.heights, terrain.heights)
-    assert field.heights.dtype == np.float64
+    terrain = Terrain(np.array([[1, np.nan, 3], [4, 5, 1e30]]), 30.0, 20.5, 500000.25, 4.1e6)
+    field = terrain.heightfield()  # in the precision that JAX has
+    np.testing.assert_array_equal(field.heights, terrain.heights.astype(np.float32))
+    assert field.heights.dtype == np.float32
     assert placed(field) == placed(terrain)
+    with jax.enable_x64(True):
+        assert terrain.heightfield().heights.dtype == np.float64
+        assert terrain.heightfield(np.float32).heights.dtype == np.float32
+    terrain.heights[0, 0] = 1e39
     with pytest.raises(ValueError, match=r"heights must fit into float32, the largest is 1e\+39"):
-        terrain.heightfield(np.float32)
-    assert Terrain(np.ones((2, 2))).heightfield(np.float32).heights.dtype == np.float32
+        terrain.heightfield()
 
 
 @pytest.mark.parametrize("ending", [".npy", ".npz", ".tif"])
@@ -415,26 +341,22 @@ def test_bare_heights_are_written_where_no_place_goes_with_them(tmp_path):
     again = load_heights(tmp_path / "x.npy").heights
     np.testing.assert_array_equal(again, [[1, 2.5], [3, 4]])
     assert again.dtype == np.float32
+    with pytest.raises(FileNotFoundError, match="none: there is no such file"):
+        load_heights(tmp_path / "none")
+    with pytest.raises(FileNotFoundError, match=r"y\.npy: there is no folder"):
+        save_heights(tmp_path / "none" / "y.npy", again)
+    (tmp_path / "z.npy").mkdir()
     for name, heights, message in (
-        ("y.npz", np.zeros((2, 2)), "y.npz: what is written must be a Terrain, whose place goes with it; it is a ndarray"),
+        ("y.npz", SQUARE, "y.npz: what is written must be a Terrain, whose place goes with it; it is a ndarray"),
         (
             "y.npy",
             np.zeros(4),
-            "y.npy: heights must be a Terrain, or float32 or float64 of shape (ny, nx); they are float64 of shape (4,)",
+            "y.npy: heights must be a Terrain, or float32 or float64 of shape (ny, nx); they are float64 of",
         ),
         ("y.npy", np.zeros((2, 2), int), "they are int64 of shape (2, 2)"),
+        ("y.hgt", again, "y.hgt: cannot write heights with the ending '.hgt'"),
+        ("z.npy", again, "z.npy: heights cannot be written here, it is a folder"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
             save_heights(tmp_path / name, heights)
-    assert [path.name for path in tmp_path.iterdir()] == ["x.npy"]
-
-
-def test_where_heights_cannot_be_written(tmp_path):
-    terrain = Terrain(np.zeros((2, 2)))
-    with pytest.raises(ValueError, match=r"x\.hgt: cannot write heights with the ending '\.hgt'"):
-        save_heights(tmp_path / "x.hgt", terrain)
-    with pytest.raises(FileNotFoundError, match=r"x\.npy: there is no folder"):
-        save_heights(tmp_path / "none" / "x.npy", terrain)
-    (tmp_path / "x.npz").mkdir()
-    with pytest.raises(ValueError, match=r"x\.npz: heights cannot be written here, it is a folder"):
-        save_heights(tmp_path / "x.npz", terrain)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["x.npy", "z.npy"]

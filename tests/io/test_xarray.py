@@ -11,6 +11,10 @@ SOUTH_FIRST = np.array([[4, 5, 6], [1, 2, 3]], np.float32)
 X, Y = [500.0, 530.0, 560.0], [40.0, 60.0]
 
 
+def on(x, values: np.ndarray = SOUTH_FIRST):
+    return xarray.DataArray(values, dims=("y", "x"), coords={"y": Y, "x": x})
+
+
 def placed(terrain):
     return terrain.dx, terrain.dy, terrain.x0, terrain.y0
 
@@ -19,7 +23,7 @@ def placed(terrain):
 @pytest.mark.parametrize("north_first", [False, True])
 @pytest.mark.parametrize("west_first", [False, True])
 def test_any_order_of_dimensions_and_either_direction(turned, north_first, west_first):
-    array = xarray.DataArray(SOUTH_FIRST[None], dims=("band", "y", "x"), coords={"y": Y, "x": X})
+    array = on(X).expand_dims("band")
     array = array[:, :: -1 if north_first else 1, :: 1 if west_first else -1]
     terrain = Terrain.from_xarray(array.transpose("x", "band", "y") if turned else array)
     np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
@@ -37,13 +41,17 @@ def test_as_the_file_itself(tmp_path):
     place = xarray.DataArray(0, attrs={"crs_wkt": wkt})
     coords = {"x": -85 + 0.01 * np.array([0.5, 1.5, 2.5]), "y": 37 - 0.01 * np.array([0.5, 1.5]), "spatial_ref": place}
     attrs = {"_FillValue": -9, "scale_factor": 0.5, "add_offset": 100.0}
-    terrain, expected = (
-        Terrain.from_xarray(xarray.DataArray(stored, coords, ("y", "x"), attrs=attrs)),
-        load_heights(tmp_path / "x.tif"),
-    )
+    array = xarray.DataArray(stored, coords, ("y", "x"), attrs=attrs)
+    terrain, expected = Terrain.from_xarray(array), load_heights(tmp_path / "x.tif")
     np.testing.assert_array_equal(terrain.heights, expected.heights)
     np.testing.assert_allclose(placed(terrain), placed(expected), rtol=1e-12)
     assert terrain.dx > 800
+    other = Terrain.from_xarray(array, nodata=4.0)  # of what is stored, 0.5 * 4 + 100; the array's own is then a height
+    np.testing.assert_array_equal(other.heights, [[np.nan, 0.5 * -9 + 100, 103], [100.5, 101, 101.5]])
+    np.testing.assert_array_equal(other.heights, load_heights(tmp_path / "x.tif", nodata=4.0).heights)
+    save_heights(tmp_path / "z.tif", other)
+    with rasterio.open(tmp_path / "z.tif") as z:
+        assert z.nodata == 4
     save_heights(tmp_path / "y.tif", terrain)
     with rasterio.open(tmp_path / "x.tif") as x, rasterio.open(tmp_path / "y.tif") as y:
         assert (x.crs, x.nodata) == (y.crs, y.nodata)
@@ -67,12 +75,9 @@ def test_longitude_and_latitude_are_degrees():
         (xarray.DataArray(SOUTH_FIRST), r"must have dimensions y and x, or lat and lon, it has \('dim_0', 'dim_1'\)"),
         (xarray.DataArray(np.zeros((2, 2, 2)), dims=("band", "y", "x")), "must have dimensions y and x"),
         (xarray.DataArray(SOUTH_FIRST, dims=("y", "x")), "must have coordinates along y"),
-        (
-            xarray.DataArray(SOUTH_FIRST, dims=("y", "x"), coords={"y": Y, "x": [0.0, 1, 3]}),
-            r"must have evenly spaced coordinates along x, their steps go from 1\.0 to 2\.0",
-        ),
-        (xarray.DataArray(SOUTH_FIRST, dims=("y", "x"), coords={"y": Y, "x": [0.0, 0, 0]}), "dx must be positive"),
-        (xarray.DataArray(SOUTH_FIRST > 4, dims=("y", "x"), coords={"y": Y, "x": X}), "must be numbers, they are bool"),
+        (on([0.0, 1, 3]), r"must have evenly spaced coordinates along x, their steps go from 1\.0 to 2\.0"),
+        (on([0.0, 0, 0]), "dx must be positive"),
+        (on(X, SOUTH_FIRST > 4), "must be numbers, they are bool"),
     ],
 )
 def test_what_is_no_terrain_is_refused(array, message):
