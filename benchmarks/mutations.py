@@ -32,6 +32,12 @@ from mutants import OPERATORS, WithoutDerivative, counts
 
 ROOT = Path(__file__).parents[1]
 TABLE = ROOT / "docs" / "measurements" / "mutations.csv"
+# Most of the time goes into compilation of changed programs, which no cache holds. A test that says otherwise keeps its word.
+PLUGIN = """import pytest
+def pytest_collection_modifyitems(items):
+    for item in items:
+        item.add_marker(pytest.mark.unoptimised)
+"""
 DERIVED = re.compile("trace/(normals|intersect)|scene/camera|shade|boundary/(term|sample)")  # where derivatives may go missing
 
 # Room: modules -> pytest's arguments for the tests aimed at them, those first that fail soonest.
@@ -118,16 +124,18 @@ class Tree:
         for part in ("jaxhf", "tests", "scenes", "docs"):
             shutil.copytree(ROOT / part, self.root / part)
         shutil.copy(ROOT / "pyproject.toml", self.root)
+        (self.root / "unoptimised.py").write_text(PLUGIN)
         (folder / "shared").symlink_to(ROOT.parent / "shared")  # scenes that are not part of the project
 
     def run(self, tests: str, limit: float = 3600) -> tuple[str, str]:
         """What became of a change, in so many seconds of processor time; and the test that failed, with its error."""
         names = [part if part.startswith("-") else f"tests/{part}" for part in shlex.split(tests)]
-        command = [sys.executable, "-m", "pytest", "-xqrfE", "--tb=no", "-p", "no:cacheprovider", "-m", "not slow and not deep"]
+        command = [sys.executable, "-m", "pytest", "-xqrfE", "--tb=no", "-p", "no:cacheprovider", "-p", "unoptimised"]
+        command += ["-m", "not slow and not deep", *names]
         programs = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(self.root / "programs"))
         changed = {"PYTHONPATH": str(self.root), "JAX_COMPILATION_CACHE_DIR": programs, "COLUMNS": "400"}
         done = subprocess.run(
-            [*command, *names], cwd=self.root, env=os.environ | changed, capture_output=True, text=True, check=False,
+            command, cwd=self.root, env=os.environ | changed, capture_output=True, text=True, check=False,
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_CPU, (int(limit), int(limit))),
         )  # fmt: skip
         if done.returncode in (0, -24, -9):
@@ -142,11 +150,12 @@ class Tree:
                 sys.exit(f"without a change {change.tests} do not pass: {found[1]}")
             self.spent[change.tests] = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - start
         path = self.root / change.path.relative_to(ROOT)
+        kept = path.read_text()
         path.write_text(change.code)
         try:
             return self.run(change.tests, 60 + 3 * self.spent[change.tests])
         finally:
-            shutil.copy2(change.path, path)
+            path.write_text(kept)
 
 
 def main() -> int:
