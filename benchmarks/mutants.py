@@ -7,11 +7,11 @@ traces a function once, each change needs a process of its own all the same. cos
 
 import re
 from collections.abc import Iterator
+from typing import Any
 
 from cosmic_ray.operators.operator import Operator
 from cosmic_ray.operators.provider import OperatorProvider
 from parso.python.tree import Name
-from parso.tree import NodeOrLeaf
 
 # Of cosmic-ray's operators those whose result is of the same type, which alone would give it away.
 _BINARY = "Add_Sub Sub_Add Mul_Div Div_Mul FloorDiv_Mul Mod_FloorDiv Pow_Mul BitAnd_BitOr BitOr_BitAnd BitXor_BitOr"
@@ -25,14 +25,14 @@ _CALLS = "maximum minimum greater lesser abs clip sqrt floor ceil unit stop_grad
 _CALLS += "degrees isfinite flip sin cos tan normalised quotient round max min"
 
 
-def _text(*nodes: NodeOrLeaf) -> str:
+def _text(*nodes: Any) -> str:
     return "".join(node.get_code() for node in nodes).strip()
 
 
 class Shorter(Operator):
     """Leaves out a term, a factor, a condition, a keyword, a call around an argument, `at[].set()`, or a statement."""
 
-    def variants(self, node: NodeOrLeaf) -> Iterator[str]:
+    def variants(self, node: Any) -> Iterator[str]:
         parts = getattr(node, "children", [])
         if node.type in _SUMS:
             yield from (_text(*parts[:k], *parts[k + 2 :]) for k in range(1, len(parts), 2))
@@ -56,31 +56,32 @@ class Shorter(Operator):
         elif node.type == "simple_stmt" and parts[0].type in ("atom_expr", "power"):
             yield "pass\n"
 
-    def mutation_positions(self, node: NodeOrLeaf) -> list:
+    def mutation_positions(self, node: Any) -> Any:
         return [(node.start_pos, node.end_pos) for _ in self.variants(node)]
 
-    def mutate(self, node: NodeOrLeaf, index: int) -> NodeOrLeaf:
+    def mutate(self, node: Any, index: int) -> Any:
         return Name(list(self.variants(node))[index], node.start_pos, node.get_first_leaf().prefix)
 
     @classmethod
-    def examples(cls) -> tuple:
+    def examples(cls) -> Any:
         return ()
 
 
 class WithoutDerivative(Shorter):
     """Takes its derivative from a sum or a product that is given a name."""
 
-    def variants(self, node: NodeOrLeaf) -> Iterator[str]:
+    def variants(self, node: Any) -> Iterator[str]:
         if node.type in ("arith_expr", "term") and node.parent.type == "expr_stmt" and "//" not in _text(node):
             yield f'__import__("jax").lax.stop_gradient({_text(node)})'
 
 
 _KINDS = ("ReplaceBinaryOperator_", _BINARY), ("ReplaceComparisonOperator_", _COMPARISON), ("ReplaceUnaryOperator_", _UNARY)
 _NAMES = [kind + name for kind, names in (*_KINDS, ("", _OTHERS)) for name in names.split()]
-OPERATORS = [*(OperatorProvider()[name]() for name in _NAMES), Shorter(), WithoutDerivative()]
+_PROVIDER: Any = OperatorProvider()
+OPERATORS = [*(_PROVIDER[name]() for name in _NAMES), Shorter(), WithoutDerivative()]
 
 
-def counts(node: NodeOrLeaf) -> bool:
+def counts(node: Any) -> bool:
     """False in what no test could tell: annotations, types, texts of errors, what is printed, decorators."""
     while (parent := node.parent) is not None:
         if parent.type in (
