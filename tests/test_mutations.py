@@ -56,7 +56,7 @@ def test_what_no_test_can_tell_stays():
     from mutants import counts
 
     code = 'N = int\nSize = int | None\n\ndef f(x: int | None, *, k=-1) -> int | None:\n    """1 + 1"""\n    return x + k\n'
-    code += '\n\ndef g(x):\n    raise ValueError(f"{x + 1}")\n'
+    code += '\n\ndef g(x):\n    y = f"{x + 1}"\n    raise ValueError(x + 1)\n'
     found = [node.get_code().strip() for node in ast_nodes(get_ast(code)) if node.type == "operator" and counts(node)]
     assert [sign for sign in found if sign not in "()[]:,.="] == ["+"]
 
