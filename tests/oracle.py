@@ -421,3 +421,27 @@ def shading_normals(
         turns.append(sum(np.linalg.norm(three[i] - three[j]) for i, j in ((0, 1), (1, 2), (2, 0))) / length)
         cancels.append(added / length)
     return np.array(result).reshape(-1, 3), np.array(turns), np.array(cancels)
+
+
+def view_rays(eye, target, fov: float, width: int, height: int, up=(0, 0, 1)) -> Float[np.ndarray, "h w 3"]:
+    """Unit directions of a pinhole camera's rays through the centres of its pixels; fov is across the shorter side, degrees."""
+    ahead = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    pixel = 2 * np.tan(np.radians(fov / 2)) / min(width, height)
+    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) * pixel, (np.arange(height) + 0.5 - height / 2) * pixel)
+    d = ahead + x[..., None] * right - y[..., None] * np.cross(right, ahead)
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def sunlit(heights: np.ndarray, dx: float, dy: float, x0: float, y0: float, o: Vectors, d: Vectors, towards) -> np.ndarray:
+    """Radiance along rays from above, of matte white triangles in a sun of irradiance pi with shadows; 0 beside the terrain."""
+    hit = cast(heights, dx, dy, x0, y0, o, d)
+    wi = np.divide(towards, np.linalg.norm(towards))
+    cos = hit.place.n @ wi
+    lit = (hit.status == HIT) & (cos > 0)
+    start = hit.place.p[lit] + 1e-9 * (dx + dy) * hit.place.n[lit]
+    hidden = cast(heights, dx, dy, x0, y0, start, np.broadcast_to(wi, start.shape)).status == HIT
+    cos[~lit] = 0
+    cos[np.flatnonzero(lit)[hidden]] = 0
+    return cos

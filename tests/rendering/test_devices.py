@@ -1,9 +1,10 @@
 """Several devices and several processes, which can be had only before JAX is first used: each case in processes of its own."""
 
+import functools
 import socket
 import subprocess
 import sys
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ auto = 2 * (jax.sharding.AxisType.Auto,)
 meshes = {"none": None}
 if jax.device_count() == 4:
     meshes["all"] = jax.make_mesh((2, 2), ("down", "across"), axis_types=auto)
-if jax.local_device_count() == 4:
+if "more meshes" in parts:
     meshes["three"] = jax.make_mesh((1, 3), ("a", "b"), axis_types=auto, devices=jax.devices()[1:])
     meshes["last"] = jax.make_mesh((1, 1), ("a", "b"), axis_types=auto, devices=jax.devices()[3:])
 x = np.linspace(0, 6, 20)
@@ -37,13 +38,18 @@ scene = jaxhf.Scene(
     lights=[jaxhf.Directional((1.0, 0.2, 0.3))],
 )
 settings = jaxhf.Settings(chunk=64)
-results = {}
-for name, mesh in meshes.items():
-    results[f"image {name}"] = jaxhf.render(scene, settings, mesh=mesh)
-mesh = meshes.get("all")
-results["in parts"] = jaxhf.render(scene, settings, progress=lambda done, total: None, mesh=mesh)
-prepared = jaxhf.prepare(scene, settings, mesh=mesh)
-results["prepared"] = jaxhf.render(prepared)
+results, mesh = {}, meshes.get("all")
+if "pictures" in parts:
+    for name, each in meshes.items():
+        results[f"image {name}"] = jaxhf.render(scene, settings, mesh=each)
+    results["in parts"] = jaxhf.render(scene, settings, progress=lambda done, total: None, mesh=mesh)
+    prepared = jaxhf.prepare(scene, settings, mesh=mesh)
+    results["prepared"] = jaxhf.render(prepared)
+    if mesh is not None:
+        try:
+            jaxhf.render(prepared, mesh=jax.make_mesh((4,), ("other",), axis_types=auto[:1]))
+        except ValueError as error:
+            results["refused"] = str(error)
 jax.config.update("jax_disable_most_optimizations", True)  # pictures alone are compared bit by bit
 for name, edge_samples in (("slope", 0), ("slope with edges", 600)):
     if name in parts:
@@ -58,89 +64,85 @@ if "fitted" in parts:
     targets = [np.asarray(jaxhf.render(scene, settings, mesh=mesh)) for scene in small]
     found = jaxhf.fit(small, targets, settings=settings, start=0.0, levels=(1.0,), max_steps=3, mesh=mesh)
     results |= {"fitted": found.heights, "truth": heights[:6, :6]}
-if mesh is not None:
-    try:
-        jaxhf.render(prepared, mesh=jax.make_mesh((4,), ("other",), axis_types=auto[:1]))
-    except ValueError as error:
-        results["refused"] = str(error)
 np.savez(path, devices=jax.device_count(), **results)
 """
 
 
-# Derivatives and fits are the same sums over devices, whether these belong to one process or to two.
-PARTS = {
-    "1 device": ["slope", "slope with edges", "fitted"],
-    "4 devices": ["slope with edges", "fitted"],
-    "2 processes": ["slope"],
+# Devices of a process, processes, and what they compute. Derivatives and fits are the same sums over devices, whether these
+# belong to one process or to two.
+RUNS = {
+    "one": (1, 1, ["pictures", "slope"]),
+    "four": (4, 1, ["pictures", "slope"]),
+    "some of four": (4, 1, ["pictures", "more meshes"]),
+    "two processes": (2, 2, ["pictures", "slope"]),
+    "more on one": (1, 1, ["slope with edges", "fitted"]),
+    "more on four": (4, 1, ["slope with edges", "fitted"]),
 }
-
-
-def _run(folder: Path, name: str, devices: int, processes: int = 1) -> list[dict[str, np.ndarray]]:
-    """What each process found."""
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    paths = [folder / f"{process}.npz" for process in range(processes)]
-    running = [
-        subprocess.Popen([sys.executable, "-c", PROGRAM, *map(str, (devices, path, processes, process, port)), *PARTS[name]])
-        for process, path in enumerate(paths)
-    ]
-    try:
-        assert [process.wait(timeout=600) for process in running] == [0] * processes
-    finally:
-        for process in running:
-            process.kill()
-    return [dict(np.load(path)) for path in paths]
+Found = Callable[[str], list[dict[str, np.ndarray]]]
 
 
 @pytest.fixture(scope="module")
-def one(tmp_path_factory) -> dict[str, np.ndarray]:
-    return _run(tmp_path_factory.mktemp("one"), "1 device", devices=1)[0]
+def found(tmp_path_factory) -> Found:
+    """What each process of a run found."""
+
+    @functools.cache
+    def run(name: str) -> list[dict[str, np.ndarray]]:
+        devices, processes, parts = RUNS[name]
+        with socket.socket() as free:
+            free.bind(("localhost", 0))
+            port = free.getsockname()[1]
+        paths = [tmp_path_factory.mktemp("run") / "found.npz" for _ in range(processes)]
+        running = [
+            subprocess.Popen([sys.executable, "-c", PROGRAM, *map(str, (devices, path, processes, process, port)), *parts])
+            for process, path in enumerate(paths)
+        ]
+        try:
+            assert [process.wait(timeout=600) for process in running] == [0] * processes
+        finally:
+            for process in running:
+                process.kill()
+        return [dict(np.load(path)) for path in paths]
+
+    return run
 
 
-@pytest.fixture(scope="module")
-def four(tmp_path_factory) -> dict[str, np.ndarray]:
-    """Four devices of one process."""
-    return _run(tmp_path_factory.mktemp("four"), "4 devices", devices=4)[0]
+FURTHER = [pytest.param(name, marks=pytest.mark.deep) for name in ("some of four", "two processes")]
 
 
-@pytest.fixture(scope="module")
-def two(tmp_path_factory) -> list[dict[str, np.ndarray]]:
-    """Two processes with two devices each."""
-    return _run(tmp_path_factory.mktemp("two"), "2 processes", devices=2, processes=2)
-
-
-def test_pictures_have_the_same_bits_on_any_number_of_devices(one, four, two):
-    for found in (four, *two):
-        assert found["devices"] == 4
-        pictures = [name for name in found if name.startswith("image")]
-        assert len(pictures) == (4 if found is four else 2)
-        for name in (*pictures, "in parts", "prepared"):
-            np.testing.assert_array_equal(found[name], one["image none"], err_msg=name)
+@pytest.mark.parametrize("name", ["four", *FURTHER])
+def test_pictures_have_the_same_bits_on_any_number_of_devices(found, name):
+    (one,) = found("one")
+    for each in found(name):
+        assert each["devices"] == 4
+        pictures = [name for name in each if name.startswith("image")]
+        assert len(pictures) == (4 if name == "some of four" else 2)
+        for picture in (*pictures, "in parts", "prepared"):
+            np.testing.assert_array_equal(each[picture], one["image none"], err_msg=picture)
+        assert "render: the scene was prepared on Mesh" in str(each["refused"])
     assert one["image none"].std() > 0.05
 
 
-def test_derivatives_agree_over_processes(one, two):
+@pytest.mark.parametrize("name", ["four", pytest.param("two processes", marks=pytest.mark.deep)])
+def test_derivatives_agree(found, name):
     """Their sums are taken in another order, in single precision."""
-    slope = one["slope"]
-    for found in two:
-        np.testing.assert_allclose(found["slope"], slope, atol=1e-5 * np.abs(slope).max())
+    slope = found("one")[0]["slope"]
+    for each in found(name):
+        np.testing.assert_allclose(each["slope"], slope, atol=1e-5 * np.abs(slope).max())
     assert np.abs(slope).max() > 1e-5
 
 
-def test_derivatives_of_boundaries_agree_over_devices(one, four):
+@pytest.mark.deep
+def test_derivatives_of_boundaries_agree_over_devices(found):
     """In single precision a sample of a boundary may go to the next edge."""
-    with_edges = one["slope with edges"]
+    (one,), (four,) = found("more on one"), found("more on four")
+    with_edges, slope = one["slope with edges"], found("one")[0]["slope"]
     assert np.linalg.norm(four["slope with edges"] - with_edges) < 0.1 * np.linalg.norm(with_edges)
-    assert np.linalg.norm(with_edges - one["slope"]) > 0.2 * np.linalg.norm(one["slope"])
+    assert np.linalg.norm(with_edges - slope) > 0.2 * np.linalg.norm(slope)
 
 
-def test_fits_agree_over_devices(one, four):
+@pytest.mark.deep
+def test_fits_agree_over_devices(found):
     """What sums in another order change in single precision, the iterations of LSMR enlarge: 2e-4 was seen."""
+    (one,), (four,) = found("more on one"), found("more on four")
     np.testing.assert_allclose(four["fitted"], one["fitted"], atol=1e-3 * np.ptp(one["truth"]))
     assert np.std(one["fitted"] - one["truth"]) < 0.5 * np.std(one["truth"])
-
-
-def test_a_prepared_scene_is_not_rendered_on_another_mesh(four, two):
-    for found in (four, *two):
-        assert "render: the scene was prepared on Mesh" in str(found["refused"])

@@ -1,6 +1,7 @@
 """The derivative inside triangles, pixel by pixel, for every number in a scene; two scenes that hold all kinds of things.
 
-No leaf is named here: they are found in the pytree, so that a new one is tested as soon as it is in a scene.
+No leaf is named here: they are found in the pytree, so that a new one is tested as soon as it is in a scene. Derivatives are
+those of users, in single precision; what they are held against, central differences of pictures, is in double.
 """
 
 import dataclasses
@@ -93,14 +94,18 @@ def nodes(tree: Any) -> list[Any]:
     return found
 
 
-def random_change(leaf: jax.Array, upright: bool) -> jax.Array:
-    """As large as the leaf; `upright` ones of a matrix do not tilt what stands."""
+def random_change(leaf: np.ndarray, upright: bool) -> np.ndarray:
+    """As large as the leaf; `upright` ones of a matrix do not tilt what stands. Numbers of single precision."""
     change = np.random.default_rng(6).uniform(-1, 1, leaf.shape) * np.abs(leaf).max()
     if leaf.shape == (4, 4):
         change[3] = 0  # the last row of an affine matrix stays
         if upright:
             change[2, :2] = change[:2, 2] = 0
-    return jnp.asarray(change)
+    return change.astype(np.float32)
+
+
+def in_precision(tree: Any, dtype: Any) -> Any:
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf, np.float32), dtype), tree)
 
 
 @functools.partial(jax.jit, static_argnames=("settings",))
@@ -128,7 +133,7 @@ def test_reverse_mode_keeps_no_heights_a_tile():
     """A conditional that returned the derivative of all heights or normals would cost every tile a pass over them."""
     scene = parallel()
     place = scene.objects[0].world_from_object
-    field = jaxhf.Heightfield(waves(37, 53, 5, 0.06))
+    field = jaxhf.Heightfield(waves(37, 53, 5, 0.06).astype(np.float32))
     # Under a directional light one conditional a picture, not a tile, has all of a terrain's bounds.
     light = jaxhf.Point((0.5, 0.5, 3.0), 10.0)
     scene = jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(0.5), place)], scene.camera, [light])
@@ -141,26 +146,43 @@ def test_reverse_mode_keeps_no_heights_a_tile():
     assert max(sizes) < 37 * 53
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_every_leaf_pixel_by_pixel(name):
+@functools.cache
+def changes(name: str) -> dict[str, tuple[jaxhf.Scene, np.ndarray, np.ndarray]]:
+    """Of each leaf: a change of it alone, and central differences along that with STEP and with half of it."""
+    with jax.enable_x64(True):
+        scene = in_precision(SCENES[name](), np.float64)
+        leaves, structure = jax.tree.flatten_with_path(scene)
+        upright = any(isinstance(light, jaxhf.Sun) for light in scene.lights)  # it is seen in upright planes
+        found = {}
+        for k, (path, leaf) in enumerate(leaves):
+            change = [np.zeros(other.shape, np.float32) for _, other in leaves]
+            change[k] = random_change(np.asarray(leaf), upright)
+            direction = jax.tree.unflatten(structure, change)
+            both = differences(scene, in_precision(direction, np.float64), SETTINGS)
+            found[jax.tree_util.keystr(path)] = (direction, *map(np.asarray, both))
+    return found
+
+
+DOUBLE = pytest.param(np.float64, 1e-6, 1e-10, marks=[pytest.mark.deep, pytest.mark.x64])
+
+
+@pytest.mark.parametrize(("dtype", "rtol", "between"), [(np.float32, 5e-5, 1e-4), DOUBLE])
+@pytest.mark.parametrize("name", ["reflected", pytest.param("parallel", marks=pytest.mark.deep)])
+def test_every_leaf_pixel_by_pixel(name, dtype, rtol, between):
     """Against central differences, in forward and in reverse mode.
 
     A ray counts where the picture is smooth within the step: there the differences with half the step agree but for a third
     derivative, while the border of a cell or of a shadow between the two shows. This asks nothing of the derivative itself.
-    The two differences together are exact but for a fifth derivative times STEP^4, and a rounding of 1e-16 / STEP.
+    The two differences together are exact but for a fifth derivative times STEP^4, and a rounding of 1e-16 / STEP. In single
+    precision 6e-6 of a picture's largest derivative was seen.
     """
-    scene = jax.tree.map(jnp.asarray, SCENES[name]())
-    leaves, structure = jax.tree.flatten_with_path(scene)
-    weights = np.random.default_rng(7).normal(size=(SIZE, SIZE, 3))
-    gradients = jax.tree.leaves(reverse(scene, jnp.asarray(weights), SETTINGS))
-    upright = any(isinstance(light, jaxhf.Sun) for light in scene.lights)  # it is seen in upright planes
+    scene = in_precision(SCENES[name](), dtype)
+    weights = np.random.default_rng(7).normal(size=(SIZE, SIZE, 3)).astype(np.float32)
+    gradients = jax.tree.leaves(reverse(scene, jnp.asarray(weights, dtype), SETTINGS))
     borders = [f".objects[{k}].shape" for k, obj in enumerate(scene.objects) if isinstance(obj.shape, jaxhf.Skirt)]
-    for k, (path, _) in enumerate(leaves):
-        where = jax.tree_util.keystr(path)
-        changes = [random_change(leaf, upright) if j == k else jnp.zeros_like(leaf) for j, (_, leaf) in enumerate(leaves)]
-        change = jax.tree.unflatten(structure, changes)
-        wide, narrow = (np.asarray(value) for value in differences(scene, change, SETTINGS))
-        exact, numeric = np.asarray(forward(scene, change, SETTINGS)), (4 * narrow - wide) / 3
+    for k, (where, (change, wide, narrow)) in enumerate(changes(name).items()):
+        exact = np.asarray(forward(scene, in_precision(change, dtype), SETTINGS), np.float64)
+        numeric = (4 * narrow - wide) / 3
         size = np.abs(numeric)
         smooth = np.abs(wide - narrow) < 1e-4 * (size + 0.01)
         assert smooth.mean() > 0.9, where
@@ -168,12 +190,15 @@ def test_every_leaf_pixel_by_pixel(name):
             assert not exact.any(), where
         else:
             assert np.mean(size > 1e-4) > 0.1, where  # or all could be zero
-        np.testing.assert_allclose(exact[smooth], numeric[smooth], rtol=1e-6, atol=1e-9, err_msg=where)
-        np.testing.assert_allclose(np.vdot(gradients[k], changes[k]), np.vdot(weights, exact), rtol=1e-10, err_msg=where)
+        bound = rtol * (size + size.max()) + 1e-9
+        assert np.all(np.abs(exact - numeric)[smooth] <= bound[smooth]), where
+        backwards = np.vdot(gradients[k], jax.tree.leaves(change)[k])
+        assert abs(backwards - np.vdot(weights, exact)) <= between * np.abs(exact).sum(), where
 
 
+@pytest.mark.deep  # `cast` has zero derivatives there, too; this takes the largest programs of `parallel`
 def test_a_miss_has_no_derivative():
-    scene = jax.tree.map(jnp.asarray, parallel())
+    scene = in_precision(parallel(), np.float32)
     shift = jnp.zeros((4, 4)).at[0, 3].set(0.5)
     scene = eqx.tree_at(lambda scene: scene.camera.world_from_camera, scene, scene.camera.world_from_camera + shift)
     image, aovs = jaxhf.render(scene, SETTINGS, aovs=("status",))
@@ -190,8 +215,9 @@ def test_a_miss_has_no_derivative():
         np.testing.assert_array_equal(leaf, missed.sum() if name.endswith("lights[1].radiance") else 0, name)
 
 
+@pytest.mark.deep  # two of the largest programs
 def test_what_rays_met_has_its_derivative_beside_points_on_edges():
-    scene = jax.tree.map(jnp.asarray, parallel())
+    scene = in_precision(parallel(), np.float32)
 
     def depth(heights: jax.Array, edge_samples: int) -> jax.Array:
         settings = dataclasses.replace(SETTINGS, edge_samples=edge_samples)
@@ -204,4 +230,4 @@ def test_what_rays_met_has_its_derivative_beside_points_on_edges():
         for count in (0, 64)
     )
     assert np.abs(plain).max() > 0.1
-    np.testing.assert_allclose(beside, plain, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(beside, plain, rtol=1e-4, atol=1e-5)

@@ -1,11 +1,13 @@
-"""The picture as a whole: where its pixels look, what its AOVs hold, and its bits."""
+"""The picture as a whole: where its pixels look, what its AOVs hold, and its bits; against NumPy in double precision."""
 
 import functools
 from typing import Any
 
+import aimed
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import pytest
 
 import jaxhf
@@ -15,8 +17,9 @@ pytestmark = pytest.mark.unoptimised
 
 EYE, TARGET = (-0.25, -0.75, 1.25), (0.5, 0.5, 0.125)  # exact in binary, so that an offset takes nothing from them
 WIDTH, HEIGHT, FOV = 24, 16, 24.0
-SKY = np.array([0.1, 0.2, 0.4])
-ROUNDING = 1e-12  # some hundred operations in float64
+SKY = np.array([0.1, 0.2, 0.4], np.float32)
+SUN, LAMP = (-1, 0.5, 0.5), (1.5, 0.25, 0.5)
+ROUNDING = 1e-5  # some hundred operations in single precision
 PLAIN = jaxhf.Settings(shadows=False)
 
 
@@ -29,31 +32,20 @@ def terrain(seed=0, roughness=0.1):
     return roughness * np.sum(a * np.sin(4 * b * x + 4 * c * y + 7 * d), axis=0)
 
 
-def scene(heights=None, dtype: Any = np.float64, camera: jaxhf.Perspective | None = None, offset=(0.0, 0.0, 0.0), samples=1):
+def scene(heights=None, dtype: Any = np.float32, camera: jaxhf.Perspective | None = None, offset=(0.0, 0.0, 0.0), samples=1):
     heights = terrain(roughness=0.2) if heights is None else heights
     if camera is None:
         camera = jaxhf.Perspective.look_at(np.add(EYE, offset), np.add(TARGET, offset), fov=FOV, width=WIDTH, height=HEIGHT)
     field = jaxhf.Heightfield(np.asarray(heights, dtype), x0=offset[0], y0=offset[1])
-    lights = [jaxhf.Directional((-1, 0.5, 0.5), (2, 3, 4)), jaxhf.Point(np.add((1.5, 0.25, 0.5), offset), 2.0), jaxhf.Sky(SKY)]
+    lights = [jaxhf.Directional(SUN, (2, 3, 4)), jaxhf.Point(np.add(LAMP, offset), 2.0), jaxhf.Sky(SKY)]
     return jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte((0.5, 0.6, 0.7)))], camera, lights, samples)
 
 
 @functools.cache
-def rendered(dtype: Any, offset=(0.0, 0.0, 0.0)):
+def rendered(dtype: Any = np.float32, offset=(0.0, 0.0, 0.0)):
     """The image and all AOVs of `scene`, in NumPy."""
     image, aovs = jaxhf.render(scene(dtype=dtype, offset=offset), aovs=jaxhf.AOVS)
     return np.asarray(image), {name: np.asarray(value) for name, value in aovs.items()}
-
-
-def directions(eye, target, fov, width, height, up=(0, 0, 1)):
-    """The unit directions of a camera's rays through its pixels' centres, by hand, shape (height, width, 3)."""
-    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    pixel = 2 * np.tan(np.radians(fov / 2)) / min(width, height)
-    x, y = np.meshgrid((np.arange(width) + 0.5 - width / 2) * pixel, (np.arange(height) + 0.5 - height / 2) * pixel)
-    d = forward + x[..., None] * right - y[..., None] * np.cross(right, forward)
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
 # What an AOV is: its shape beyond (h, w), whether it is of floats, and its value where there is nothing.
@@ -70,7 +62,7 @@ AOV_KINDS = {
 }
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@aimed.PRECISIONS
 def test_shapes_and_dtypes(dtype):
     assert set(AOV_KINDS) == set(jaxhf.AOVS)
     image, aovs = rendered(dtype)
@@ -81,32 +73,38 @@ def test_shapes_and_dtypes(dtype):
         assert aovs[name].dtype == {"f": dtype, "i": np.int32, "b": np.bool_}[kind], name
 
 
-def test_aovs_by_hand():
-    image, aovs = rendered(np.float64)
-    met = aovs["status"] == jaxhf.Status.HIT
+def test_aovs_against_the_oracle():
+    """Rays by hand; the sun's and the lamp's shadows by rays towards them."""
+    image, aovs = rendered()
+    ground = terrain(roughness=0.2).astype(np.float32), 1 / 8, 1 / 8, 0.0, 0.0
+    d = oracle.view_rays(EYE, TARGET, FOV, WIDTH, HEIGHT).reshape(-1, 3)
+    exact = oracle.cast(*ground, np.broadcast_to(EYE, d.shape), d, slack=1e-6)
+    shown = {name: value.reshape(len(d), *value.shape[2:]) for name, value in aovs.items()}
+    assert exact.decided.mean() > 0.98
+    np.testing.assert_array_equal(shown["status"][exact.decided], exact.status[exact.decided])
+    met = shown["status"] == jaxhf.Status.HIT
     assert 0.5 < met.mean() < 0.95
     for name, (_, _, nothing) in AOV_KINDS.items():
         if name != "steps":
-            np.testing.assert_array_equal(aovs[name][~met], np.broadcast_to(nothing, aovs[name][~met].shape), name)
-    np.testing.assert_array_equal(image[~met], np.broadcast_to(SKY, image[~met].shape))
+            np.testing.assert_array_equal(shown[name][~met], np.broadcast_to(nothing, shown[name][~met].shape), name)
+    np.testing.assert_array_equal(image.reshape(-1, 3)[~met], np.broadcast_to(SKY, (np.sum(~met), 3)))
+    np.testing.assert_array_equal(shown["object"], np.where(met, 0, -1))
+    assert np.all(shown["steps"][met] > 0)
 
-    depth = np.where(met, aovs["depth"], 0)
-    p = EYE + depth[..., None] * directions(EYE, TARGET, FOV, WIDTH, HEIGHT)
-    np.testing.assert_allclose(aovs["uv"][met], p[met][:, :2], rtol=ROUNDING)
-    np.testing.assert_array_equal(aovs["cell"][met], np.floor(p[met][:, :2] * 8))
-    np.testing.assert_allclose(np.linalg.norm(aovs["normal"][met], axis=-1), 1, rtol=ROUNDING)
-    assert np.all(aovs["normal"][met][:, 2] > 0)
-    np.testing.assert_array_equal(aovs["object"], np.where(met, 0, -1))
-    assert np.all(aovs["steps"][met] > 0)
-    for light in range(2):
-        assert 0.05 < aovs["shadow"][met][:, light].mean() < 0.95
-
-    # Bilinear interpolation would be another surface: this one is linear in each of a cell's two triangles.
-    heights, (ix, iy) = terrain(roughness=0.2), aovs["cell"][met].T
-    u, v = (p[met][:, :2] * 8 - aovs["cell"][met]).T
-    z00, z10, z01, z11 = heights[iy, ix], heights[iy, ix + 1], heights[iy + 1, ix], heights[iy + 1, ix + 1]
-    z = np.where(v > u, z00 + (z11 - z01) * u + (z01 - z00) * v, z00 + (z10 - z00) * u + (z11 - z10) * v)
-    np.testing.assert_allclose(p[met][:, 2], z, atol=ROUNDING)
+    known, place = met & exact.decided & (exact.spread < 1e-4), exact.place
+    inside = known & (place.inside > 1e-3)
+    assert inside.sum() > 0.9 * met.sum()
+    np.testing.assert_allclose(shown["depth"][known], exact.t[known], rtol=1e-5)
+    np.testing.assert_allclose(shown["uv"][known], place.uv[known], atol=1e-5)
+    np.testing.assert_array_equal(shown["cell"][inside], place.cell[inside])
+    normals, *_ = oracle.shading_normals(*ground[:3], place, "six")
+    np.testing.assert_allclose(shown["normal"][inside], normals[inside], atol=1e-4)
+    n = -place.n * np.sign((place.n * d).sum(1))[:, None]  # on the side that is seen: at the western border from below
+    start = place.p + 1e-6 * n
+    for light, (towards, distance) in enumerate(((np.broadcast_to(SUN, d.shape), np.inf), (np.subtract(LAMP, start), 1))):
+        hidden = (oracle.cast(*ground, start, towards).t < distance) | ((n * towards).sum(1) < 0)
+        assert np.mean((shown["shadow"][:, light] == hidden)[known]) > 0.98
+        assert 0.05 < hidden[known].mean() < 0.95
 
 
 def test_a_view_of_nothing():
@@ -132,29 +130,29 @@ def test_unknown_aov_is_an_error():
 # Where pixels look.
 
 
-@pytest.mark.parametrize(("width", "height"), [(15, 9), (9, 15)])
+@pytest.mark.parametrize(("width", "height"), [(15, 9), pytest.param(9, 15, marks=pytest.mark.deep)])
 def test_perspective_camera(width, height):
     """The middle of the picture shows the target, +x is right, and fov is the angle across the shorter side."""
     eye, target = np.array([1.0, -4.0, 3.0]), np.array([0.5, 0.25, 0.0])
-    ground = jaxhf.Heightfield(np.zeros((2, 2)), dx=40.0, x0=-20.0, y0=-20.0)
+    ground = jaxhf.Heightfield(np.zeros((2, 2), np.float32), dx=40.0, x0=-20.0, y0=-20.0)
     camera = jaxhf.Perspective.look_at(eye, target, fov=30, width=width, height=height)
     _, aovs = jaxhf.render(jaxhf.Scene([jaxhf.Object(ground)], camera), jaxhf.Settings(chunk=64), aovs=("uv", "depth"))
     p = np.asarray(aovs["uv"]) * 40 - 20
-    np.testing.assert_allclose(p[height // 2, width // 2], target[:2], atol=1e-13)
+    np.testing.assert_allclose(p[height // 2, width // 2], target[:2], atol=40 * 1e-6)
     assert np.all(np.diff(p[..., 0], axis=1) > 0)  # the view is to the north: right is east,
     assert np.all(np.diff(p[..., 1], axis=0) < 0)  # and the upper rows are farther away
-    d = directions(eye, target, 30, width, height)
-    np.testing.assert_allclose(p, (eye - eye[2] / d[..., 2:] * d)[..., :2], atol=1e-12)
+    d = oracle.view_rays(eye, target, 30, width, height)
+    np.testing.assert_allclose(p, (eye - eye[2] / d[..., 2:] * d)[..., :2], atol=40 * 1e-6)
     np.testing.assert_allclose(aovs["depth"], -eye[2] / d[..., 2], rtol=ROUNDING)
     row = d[height // 2] if width < height else d[:, width // 2]
     across = np.degrees(np.arccos(row[0] @ row[-1]))  # from centre to centre: a pixel less than the whole side
     assert 30 * 0.8 < across < 30
 
 
-@pytest.mark.parametrize(("width", "height"), [(10, 6), (6, 10)])
+@pytest.mark.parametrize(("width", "height"), [(6, 10), pytest.param(10, 6, marks=pytest.mark.deep)])
 def test_orthographic_camera_straight_down(width, height):
     """Columns run east, rows run south, and the shorter side spans the extent."""
-    field = jaxhf.Heightfield(terrain(), dx=2.0, dy=3.0, x0=-5.0, y0=7.0)
+    field = jaxhf.Heightfield(terrain().astype(np.float32), dx=2.0, dy=3.0, x0=-5.0, y0=7.0)
     camera = jaxhf.Orthographic.look_at((2, 18, 9), (2, 18, 0), (0, 1, 0), extent=4.5, width=width, height=height)
     _, aovs = jaxhf.render(jaxhf.Scene([jaxhf.Object(field)], camera), jaxhf.Settings(chunk=64), aovs=("uv",))
     for row in range(height):
@@ -168,15 +166,17 @@ def test_orthographic_camera_straight_down(width, height):
 
 def test_an_offset_costs_no_bit():
     """At 5e6 float32 has steps of 0.5, half of this terrain."""
-    image, aovs = rendered(np.float32)
-    far_image, far_aovs = rendered(np.float32, offset=(5e6, 4.5e6, 0.0))
+    image, aovs = rendered()
+    far_image, far_aovs = rendered(offset=(5e6, 4.5e6, 0.0))
     np.testing.assert_array_equal(far_image, image)
     for name, value in aovs.items():
         np.testing.assert_array_equal(far_aovs[name], value, name)
 
 
+@pytest.mark.deep
+@pytest.mark.x64  # of the whole picture, with smooth normals and three lights
 def test_single_precision_agrees_with_double():
-    single, single_aovs = rendered(np.float32)
+    single, single_aovs = rendered()
     double, double_aovs = rendered(np.float64)
     inside = (single_aovs["status"] == double_aovs["status"]) & (single_aovs["shadow"] == double_aovs["shadow"]).all(-1)
     assert inside.mean() > 0.98  # edges
@@ -186,7 +186,7 @@ def test_single_precision_agrees_with_double():
 @pytest.mark.unoptimised(False)  # two programs, whose bits are the same as users compile them
 @pytest.mark.parametrize("transformation", [jax.jit, jax.jacfwd, jax.vmap])
 def test_there_is_no_progress_within_a_transformation(transformation):
-    heights = jnp.zeros((1, 3, 3) if transformation is jax.vmap else (3, 3))
+    heights = jnp.zeros((1, 3, 3) if transformation is jax.vmap else (3, 3), np.float32)
     camera = jaxhf.Perspective.look_at((0, -1, 1), (0, 0, 0), width=4, height=4)
     for owner, fun in (
         ("render", lambda z, **how: jaxhf.render(jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(z))], camera, ()), **how)),
@@ -218,7 +218,7 @@ def test_progress_gives_the_same_bits():
 def test_samples_are_those_of_a_larger_picture():
     """The picture, and its derivative."""
     large = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=2 * WIDTH, height=2 * HEIGHT)
-    weights = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, 3))
+    weights = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
 
     def loss(heights, scene, weights):
         image = jaxhf.render(scene.with_heights(heights), PLAIN)
@@ -230,7 +230,7 @@ def test_samples_are_those_of_a_larger_picture():
     (_, large_image), large_gradient = value_and_grad(scene().heights, scene(camera=large), repeated)
     blocks = np.asarray(large_image).reshape(HEIGHT, 2, WIDTH, 2, 3)
     np.testing.assert_allclose(image, blocks.mean((1, 3)), rtol=ROUNDING)
-    np.testing.assert_allclose(gradient, large_gradient, atol=1e-10)
+    np.testing.assert_allclose(gradient, large_gradient, atol=1e-4 * np.abs(gradient).max())
     assert np.abs(gradient).max() > 1
 
 
@@ -238,15 +238,13 @@ def test_samples_round_up_to_a_square():
     def program(samples, settings=PLAIN):
         return jax.jit(lambda scene: jaxhf.render(scene, settings)).lower(scene(samples=samples)).as_text()
 
-    nine = program(1, jaxhf.Settings(shadows=False, samples=9))
+    nine = program(1, jaxhf.Settings(shadows=False, samples=9))  # which stand for the scene's
     assert program(5) == program(9) == nine
     assert program(4) != nine
-    assert program(10) != nine
-    assert program(5, jaxhf.Settings(shadows=False, samples=1)) == program(1)
 
 
 def test_exhausted_rays_are_no_misses():
-    full_image, full = rendered(np.float64)
+    full_image, full = rendered()
     assert full["exhausted"].sum() == 0
     image, cut = jaxhf.render(scene(), jaxhf.Settings(max_steps=1), aovs=jaxhf.AOVS)
     status, out_of_steps = np.asarray(cut["status"]), np.asarray(cut["status"]) == jaxhf.Status.EXHAUSTED
@@ -266,22 +264,22 @@ def test_exhausted_rays_are_no_misses():
 @pytest.mark.parametrize("hole", [np.nan, np.inf, -np.inf])
 def test_holes_show_the_background_and_cast_no_shadow(hole):
     # A ridge along x = 1/2, 1/8 high and 1/8 wide at each side, in light from the east at slope 1/2. Its middle is missing.
-    heights = np.zeros((9, 9))
+    heights = np.zeros((9, 9), np.float32)
     heights[:, 4] = 1 / 8
     broken = heights.copy()
     broken[4, 4] = hole
     camera = jaxhf.Perspective.look_at((0.5, 0.5, 2), (0.5, 0.5, 0), (0, 1, 0), fov=18, width=WIDTH, height=HEIGHT)
 
     def seen(heights):
-        light = jaxhf.Directional((1, 0, 0.5))
-        lights = [light, jaxhf.Point((0.5, 0.5, 9)), jaxhf.Sky(SKY)]  # the structure of `scene`: no new program
+        # The structure of `scene`: no new program.
+        lights = [jaxhf.Directional((1, 0, 0.5)), jaxhf.Point((0.5, 0.5, 9)), jaxhf.Sky(SKY)]
         base = scene(heights, camera=camera)
         image, aovs = jaxhf.render(jaxhf.Scene(base.objects, camera, lights), aovs=jaxhf.AOVS)
         return np.asarray(image), {name: np.asarray(value) for name, value in aovs.items()}
 
     image, aovs = seen(broken)
     _, whole = seen(heights)
-    d = directions((0.5, 0.5, 2), (0.5, 0.5, 0), 18, WIDTH, HEIGHT, up=(0, 1, 0))
+    d = oracle.view_rays((0.5, 0.5, 2), (0.5, 0.5, 0), 18, WIDTH, HEIGHT, up=(0, 1, 0))
     assert np.all(whole["status"] == jaxhf.Status.HIT)
     x, y = (whole["uv"] * 8).transpose(2, 0, 1)
     hole = (np.abs(x - 4) < 1) & (np.abs(y - 4) < 1)
@@ -300,9 +298,10 @@ def test_holes_show_the_background_and_cast_no_shadow(hole):
 # Transformations of JAX.
 
 
+@pytest.mark.deep
 def test_vmap_of_gradients_equals_a_loop():
-    many = jnp.stack([jnp.asarray(terrain(seed)) for seed in range(3)])
-    target = jnp.asarray(np.random.default_rng(2).uniform(size=(HEIGHT, WIDTH, 3)))
+    many = jnp.stack([jnp.asarray(terrain(seed), np.float32) for seed in range(3)])
+    target = jnp.asarray(np.random.default_rng(2).uniform(size=(HEIGHT, WIDTH, 3)), np.float32)
 
     def loss(heights):
         return jnp.sum((jaxhf.render(scene(heights=terrain()).with_heights(heights), PLAIN) - target) ** 2)
@@ -312,23 +311,23 @@ def test_vmap_of_gradients_equals_a_loop():
     for heights, value, gradient in zip(many, values, gradients, strict=True):
         alone, alone_gradient = value_and_grad(heights)
         np.testing.assert_allclose(value, alone, rtol=ROUNDING)
-        np.testing.assert_allclose(gradient, alone_gradient, atol=1e-10)
+        np.testing.assert_allclose(gradient, alone_gradient, atol=1e-4 * np.abs(alone_gradient).max())
     assert np.ptp(values) > 1e-3
 
 
 def test_with_heights_compiles_nothing(compilations):
     first = scene()
-    rendered(np.float64)
+    rendered()
     jaxhf.render(first.with_heights(terrain(3)), aovs=jaxhf.AOVS)  # small things outside the renderer, once
     compilations.clear()
     image, _ = jaxhf.render(first.with_heights(terrain(4)), aovs=jaxhf.AOVS)
     assert not compilations
     jax.jit(lambda x: x + 1)(1.5)
     assert compilations  # this is how a compilation is seen
-    assert np.abs(np.asarray(image) - rendered(np.float64)[0]).max() > 0.1
+    assert np.abs(np.asarray(image) - rendered()[0]).max() > 0.1
 
 
 def test_with_heights_keeps_shape_and_precision():
     with pytest.raises(ValueError, match=r"heights must keep their shape \(9, 9\), theirs is \(9, 8\)"):
         scene().with_heights(np.zeros((9, 8)))
-    assert scene(dtype=np.float32).with_heights(terrain()).heights.dtype == np.float32
+    assert scene().with_heights(terrain()).heights.dtype == np.float32
