@@ -33,7 +33,12 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 SLOW = {"docs/gallery.md"}  # minutes
-DEEP = {"docs/tutorials/photographs.md"}  # over ten seconds of a processor
+LARGE = {"README.md", "docs/tutorials/photographs.md"}  # whose time goes into pictures or steps, not into compilation
+DEEP = {  # over four seconds of a processor
+    "docs/coming-from/gdal.md",
+    *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/sun-and-sky")),
+    *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "photographs", "robots")),
+}
 FOREIGN = {"gdaldem", "gdalinfo", "gdal_translate"}  # programs that may not be here
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
@@ -113,9 +118,10 @@ def reader(tmp_path, monkeypatch) -> Iterator[None]:
 
 
 def page(name: str) -> Any:
-    """Short ones compile sooner, to slower programs."""
-    how = {name: [pytest.mark.slow] for name in SLOW} | {name: [pytest.mark.deep] for name in DEEP}
-    return pytest.param(name, marks=[*how.get(name, [pytest.mark.unoptimised]), pytest.mark.xdist_group(name)])
+    """Cheap ones compile sooner, to slower programs."""
+    tier = [pytest.mark.slow] if name in SLOW else [pytest.mark.deep] if name in DEEP else []
+    how = [] if name in SLOW | LARGE else [pytest.mark.unoptimised]
+    return pytest.param(name, marks=[*tier, *how, pytest.mark.xdist_group(name)])
 
 
 @pytest.mark.parametrize("name", [page(name) for name in NAMES])

@@ -61,18 +61,27 @@ def test_shadows_are_those_of_every_crossing(kind, shape):
 def test_a_wall_casts_a_shadow_of_its_height_over_the_tangent():
     heights = np.zeros((9, 80))
     heights[:, 60] = 10.0
+    distance = 0.5 * (60 - np.arange(80)) + np.zeros((9, 1))
     for altitude in (15, 30, 50):
-        length = 10 / np.tan(np.deg2rad(altitude))
-        dark = ~lit(heights, 0.5, 2.0, 90.0, float(altitude))
-        distance = 0.5 * (60 - np.arange(80))
-        np.testing.assert_array_equal(dark, np.broadcast_to((distance > 0) & (distance < length), dark.shape))
-    shaded = jaxhf.hillshade(heights, 0.5, 2.0, azimuth=90.0, altitude=30.0, compute_edges=True, shadows=True)
-    plain = jaxhf.hillshade(heights, 0.5, 2.0, azimuth=90.0, altitude=30.0, compute_edges=True)
-    dark = ~lit(heights, 0.5, 2.0, 90.0, 30.0)
+        dark = (distance > 0) & (distance < 10 / np.tan(np.deg2rad(altitude)))
+        np.testing.assert_array_equal(~lit(heights, 0.5, 2.0, 90.0, float(altitude)), dark)
+    light, dark = {"azimuth": 90.0, "altitude": 30.0}, (distance > 0) & (distance < 10 * np.sqrt(3))
+    assert dark.sum() == 9 * 34
+    level = int(1.5 + 254 / 2)  # the sine of 30 degrees
+    shaded = jaxhf.hillshade(heights, 0.5, 2.0, **light, compute_edges=True, shadows=True)
+    plain = jaxhf.hillshade(heights, 0.5, 2.0, **light, compute_edges=True)
     np.testing.assert_array_equal(shaded, np.where(dark, 1, plain))
-    assert plain[0, 40] == int(1.5 + 254 * np.sin(np.deg2rad(30)))
-    taller = jaxhf.hillshade(heights, 1.0, 4.0, azimuth=90.0, altitude=30.0, z_factor=2.0, compute_edges=True, shadows=True)
+    assert plain[0, 40] == level
+    taller = jaxhf.hillshade(heights, 1.0, 4.0, **light, z_factor=2.0, compute_edges=True, shadows=True)
     np.testing.assert_array_equal(taller, shaded)
+
+    # Of a tint a shadow leaves a third and a little, and level ground all; slopes are as without shadows.
+    tint = jaxhf.color_relief(heights).astype(float)
+    flat = np.abs(distance) > 0.5  # beyond the neighbours of the wall
+    drawn, unshadowed = (jaxhf.relief(heights, 0.5, 2.0, **light, shadows=on) for on in (True, False))
+    np.testing.assert_array_equal(drawn[dark], np.floor(tint * (1 / 3 + 2 / 3 / level) + 0.5)[dark])
+    np.testing.assert_array_equal(drawn[flat & ~dark], tint[flat & ~dark])
+    np.testing.assert_array_equal(drawn[~dark], unshadowed[~dark])
 
 
 def test_shadows_are_those_of_rays():
