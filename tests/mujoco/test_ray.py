@@ -102,33 +102,6 @@ def test_derivatives_are_differences_of_mujocos_rays():
     assert not any(np.any(slope) for slope in program(*singles, weights * missed[:, None])[2])
 
 
-@pytest.mark.x64  # central differences with steps of 1e-6
-@pytest.mark.deep
-def test_gradients_match_central_differences():
-    """Of distances and normals of triangles, walls and base, in the heights, size, pose and rays."""
-    o, d = cases(TILTED, GROUND)
-    pick = np.concatenate([np.arange(k * COUNT, k * COUNT + 8) for k in range(4)])
-    field = HField.from_model(TILTED.model, "ground")
-    numbers = tuple(map(jnp.asarray, (GROUND.astype(np.float64), SIZE, field.pos, field.quat, o[pick], d[pick])))
-
-    def weighted(numbers, weights):
-        t, n = ray(HField(*numbers[:4]), *numbers[4:])
-        return weights @ t + (weights @ n).sum()
-
-    program = jax.jit(jax.value_and_grad(weighted), compiler_options=jaxhf.compiler_options())
-    random, eps = np.random.default_rng(0), 1e-6
-    weights = jnp.asarray(random.normal(size=len(pick)))
-    tangents = tuple(jnp.asarray(random.normal(size=value.shape)) for value in numbers)
-    _, slopes = program(numbers, weights)
-    ahead, behind = (
-        program(tuple(value + sign * eps * tangent for value, tangent in zip(numbers, tangents, strict=True)), weights)[0]
-        for sign in (1, -1)
-    )
-    along = [jnp.vdot(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True)]
-    assert all(abs(part) > 1e-2 for part in along)
-    np.testing.assert_allclose(sum(along), (ahead - behind) / (2 * eps), rtol=1e-6)
-
-
 def test_prepared_and_replaced():
     """Bounds at hand change no bit; `dataclasses.replace` makes a height field anew; a quat of zero turns nothing."""
     o, d = cases(Reference(GROUND, SIZE), GROUND)
