@@ -17,7 +17,7 @@ def heights(nrow: int, ncol: int, seed: int = 0) -> np.ndarray:
     return (data - data.min()) / (data.max() - data.min())
 
 
-def matrix(quat: np.ndarray) -> np.ndarray:
+def matrix(quat: Any) -> np.ndarray:
     """MuJoCo's rotation by a quaternion of any length."""
     found = np.empty(9)
     mujoco.mju_quat2Mat(found, np.asarray(quat, float) / np.linalg.norm(quat))

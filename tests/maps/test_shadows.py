@@ -1,5 +1,7 @@
 """Cast shadows: a wall by hand, rays of `jaxhf.cast`, and every crossing of every ray."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from test_skyview import every_crossing
@@ -39,7 +41,8 @@ def test_a_wall_casts_a_shadow_of_its_height_over_the_tangent():
     for altitude in (15, 30, 50):
         dark = (distance > 0) & (distance < 10 / np.tan(np.deg2rad(altitude)))
         np.testing.assert_array_equal(~lit(heights, 0.5, 2.0, 90.0, float(altitude)), dark)
-    light, dark = {"azimuth": 90.0, "altitude": 30.0}, (distance > 0) & (distance < 10 * np.sqrt(3))
+    light: Any = {"azimuth": 90.0, "altitude": 30.0}
+    dark = (distance > 0) & (distance < 10 * np.sqrt(3))
     assert dark.sum() == 9 * 34
     level = int(1.5 + 254 / 2)  # the sine of 30 degrees
     shaded = jaxhf.hillshade(heights, 0.5, 2.0, **light, compute_edges=True, shadows=True)

@@ -111,7 +111,7 @@ def test_prepared_and_replaced():
     turned = dataclasses.replace(upright.prepared(), quat=(0, 0, 0, 1))
     assert turned._grid is None
     np.testing.assert_allclose(
-        ray(turned, o * [-1, -1, 1], d * [-1, -1, 1])[1], np.asarray(n) * np.float32([-1, -1, 1]), atol=1e-5
+        ray(turned, o * [-1, -1, 1], d * [-1, -1, 1])[1], np.asarray(n) * np.array([-1, -1, 1], np.float32), atol=1e-5
     )
     np.testing.assert_array_equal(rotation(jnp.zeros(4)), np.eye(3))
     assert jnp.isfinite(jax.jacobian(rotation)(jnp.zeros(4))).all()

@@ -1,5 +1,7 @@
 """Height scans against MuJoCo's rays, walks, the closed form of a plane and central differences."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,19 +102,20 @@ def test_derivatives_on_a_plane():
     world, level = np.asarray(scan.p[..., :2], float) - place[:2], turn @ [0.1 * top, -0.05 * top]
     local = world @ turn
     np.testing.assert_allclose(scan.heights, place[2] + top / 2 + world @ level, atol=1e-5)
-    close = {"rtol": 1e-3, "atol": 2e-4}  # of sums of some thousand numbers near 1
+    # Sums of some thousand numbers near 1.
+    alike = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=2e-4)
     robot = weights.sum(1)
-    np.testing.assert_allclose(of_pos, np.column_stack([robot[:, None] * level, 0 * robot]), **close)
-    np.testing.assert_allclose(of_place, [*-robot.sum() * level, robot.sum()], **close)
+    alike(of_pos, np.column_stack([robot[:, None] * level, 0 * robot]))
+    alike(of_place, [*-robot.sum() * level, robot.sum()])
     aside = np.stack([-(world - (pos - place)[:, None, :2])[..., 1], (world - (pos - place)[:, None, :2])[..., 0]], -1)
     w, i, j, k = quat.T
     about_z = 0.5 * np.column_stack([-k, -j, i, w])  # (0, 0, 0, 1) times the quaternion, by half of the angle
-    np.testing.assert_allclose((of_quat * about_z).sum(1), (weights * (aside @ level)).sum(1), **close)
+    alike((of_quat * about_z).sum(1), (weights * (aside @ level)).sum(1))
     z = 0.5 + 0.1 * local[..., 0] - 0.05 * local[..., 1]
     by_size = [-top * 0.1 * local[..., 0] / rx, top * 0.05 * local[..., 1] / ry, z, 0 * z]
-    np.testing.assert_allclose(of_size, [(weights * part).sum() for part in by_size], **close)
+    alike(of_size, [(weights * part).sum() for part in by_size])
     for of_vertex, of_ray in ((1, 1), (x, local[..., 0]), (y, local[..., 1])):
-        np.testing.assert_allclose((of_data * of_vertex).sum(), top * (weights * of_ray).sum(), **close)
+        alike((of_data * of_vertex).sum(), top * (weights * of_ray).sum())
 
 
 @pytest.mark.x64  # central differences with steps of 1e-7

@@ -28,33 +28,37 @@ def sensors(count):
     return HField(grounds, SIZE, places), pos, quat, references
 
 
-@pytest.mark.parametrize("pixels", [False, True])
-def test_batched_sensors_meet_what_rays_meet(pixels):
-    """Each of two height fields has 16 of its own, of 175 rays: a lidar, or a picture whose axis is not in its middle."""
-    fields, pos, quat, references = sensors(16)
-    if pixels:
-        fx, fy, cx, cy = 20.0, 9.0, 3.0, 5.5  # of 25 x 7 pixels, whose middle is 12.5, 3.5
-        x, y = np.meshgrid((np.arange(25) + 0.5 - cx) / fx, (cy - np.arange(7) - 0.5) / fy)
-        pattern = np.stack([x, y, -np.ones_like(x)], -1).reshape(-1, 3)
-        found = depth_image(fields, pos, quat, 25, 7, intrinsics=(fx, fy, cx, cy))
-        assert found[0].shape == found[1].shape == (2, 16, 7, 25)
-        depth, dist = (np.asarray(value).reshape(2, 16, 175) for value in found)
-    else:
-        pattern = lidar_pattern(7, (-60.0, 0.0), (-180.0, 180.0), 14.4)
-        scan = lidar(fields, pos, quat, pattern)
-        depth = dist = np.asarray(scan.dist)
-        np.testing.assert_array_equal(scan.mask, depth >= 0)
+def some(pos, quat, references, pattern):
+    """Which field and sensor, its directions, and what MuJoCo says of the rays."""
     assert pattern.shape == (175, 3)
-    for k, robot in ((0, 0), (0, 15), (1, 0), (1, 7)):
-        d = pattern @ matrix(quat[k, robot]).T
-        t, n = references[k](np.tile(pos[k, robot], (175, 1)), d)
-        np.testing.assert_allclose(depth[k, robot], t, rtol=1e-5, atol=1e-5)
-        np.testing.assert_allclose(dist[k, robot], np.where(t < 0, -1, t * np.linalg.norm(d, axis=1)), rtol=1e-5, atol=1e-5)
-        if not pixels:
-            np.testing.assert_allclose(scan.n[k, robot], n, atol=1e-4)
-            p = np.where((t < 0)[:, None], pos[k, robot], pos[k, robot] + t[:, None] * d)
-            np.testing.assert_allclose(scan.p[k, robot], p, atol=1e-4)
-    assert 0.2 < (depth > 0).mean() < 0.8
+    for k, sensor in ((0, 0), (0, 15), (1, 0), (1, 7)):
+        d = pattern @ matrix(quat[k, sensor]).T
+        yield (k, sensor), d, *references[k](np.tile(pos[k, sensor], (175, 1)), d)
+
+
+def test_batched_lidars_meet_what_rays_meet():
+    fields, pos, quat, references = sensors(16)
+    pattern = lidar_pattern(7, (-60.0, 0.0), (-180.0, 180.0), 14.4)
+    scan = lidar(fields, pos, quat, pattern)
+    assert 0.2 < np.mean(scan.mask) < 0.8
+    for at, d, t, n in some(pos, quat, references, pattern):
+        np.testing.assert_array_equal(scan.mask[at], t >= 0)
+        np.testing.assert_allclose(scan.dist[at], t, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(scan.n[at], n, atol=1e-4)
+        np.testing.assert_allclose(scan.p[at], pos[at] + np.maximum(t, 0)[:, None] * d, atol=1e-4)
+
+
+def test_batched_pictures_with_an_axis_off_their_middle_meet_what_rays_meet():
+    fields, pos, quat, references = sensors(16)
+    fx, fy, cx, cy = 20.0, 9.0, 3.0, 5.5  # of 25 x 7 pixels, whose middle is 12.5, 3.5
+    x, y = np.meshgrid((np.arange(25) + 0.5 - cx) / fx, (cy - np.arange(7) - 0.5) / fy)
+    found = depth_image(fields, pos, quat, 25, 7, intrinsics=(fx, fy, cx, cy))
+    assert found[0].shape == found[1].shape == (2, 16, 7, 25)
+    depth, dist = (np.asarray(value).reshape(2, 16, 175) for value in found)
+    assert 0.2 < np.mean(depth >= 0) < 0.8
+    for at, d, t, _ in some(pos, quat, references, np.stack([x, y, -np.ones_like(x)], -1).reshape(-1, 3)):
+        np.testing.assert_allclose(depth[at], t, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(dist[at], np.where(t < 0, -1, t * np.linalg.norm(d, axis=1)), rtol=1e-5, atol=1e-5)
 
 
 def test_depth_image_sees_what_rays_meet():
@@ -115,9 +119,9 @@ def test_lidar_meets_what_rays_meet():
     assert pattern.shape == (2800, 3)
     np.testing.assert_allclose(pattern[[0, -400]], [[-0.5, 0, -np.sqrt(0.75)], [-1, 0, 0]], atol=1e-12)
     scan = lidar(FIELD, POS, QUAT, pattern)
-    some = np.arange(0, 2800, 41)
-    t, n = REFERENCE(np.tile(POS, (len(some), 1)), pattern[some] @ TURN.T)
-    np.testing.assert_allclose(scan.dist[some], t, atol=1e-5)
-    np.testing.assert_allclose(scan.n[some], n, atol=1e-4)
+    picked = np.arange(0, 2800, 41)
+    t, n = REFERENCE(np.tile(POS, (len(picked), 1)), pattern[picked] @ TURN.T)
+    np.testing.assert_allclose(scan.dist[picked], t, atol=1e-5)
+    np.testing.assert_allclose(scan.n[picked], n, atol=1e-4)
     assert 0.1 < (t < 0).mean() < 0.9
     assert lidar_pattern(2, (-10.0, 10.0), (-45.0, 45.0), 30.0).shape == (8, 3)
