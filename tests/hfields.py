@@ -17,6 +17,13 @@ def heights(nrow: int, ncol: int, seed: int = 0) -> np.ndarray:
     return (data - data.min()) / (data.max() - data.min())
 
 
+def matrix(quat: Any) -> np.ndarray:
+    """MuJoCo's rotation by a quaternion of any length."""
+    found = np.empty(9)
+    mujoco.mju_quat2Mat(found, np.asarray(quat, float) / np.linalg.norm(quat))
+    return found.reshape(3, 3)
+
+
 def rays(kind: str, data: np.ndarray, size: np.ndarray, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Origins and directions in the height field's frame."""
     random, (nrow, ncol), (rx, ry, top, base) = np.random.default_rng(seed), data.shape, size

@@ -1,4 +1,4 @@
-"""`jaxhf.mujoco.ray` against MuJoCo's own rays, closed forms where those are wrong, and central differences."""
+"""`jaxhf.mujoco.ray` against MuJoCo's own rays and their differences, and closed forms where those are wrong."""
 
 import dataclasses
 
@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hfields import KINDS, SIZE, Reference, heights, rays
+from hfields import KINDS, SIZE, Reference, heights, matrix, rays
 
 import jaxhf
 from jaxhf.mujoco import HField, ray
@@ -23,7 +23,10 @@ def cases(reference: Reference, data: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return reference.in_world(o, d)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-5)])
+DOUBLE = [pytest.mark.x64, pytest.mark.deep]  # to the last bits of MuJoCo's numbers, which are double
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), pytest.param(np.float64, 1e-10, marks=DOUBLE)])
 def test_equals_mujoco(dtype, tolerance):
     """In double precision but for a handful of the rays at edges, where MuJoCo's answer hangs on a rounding."""
     field = HField.from_model(TILTED.model, "ground")
@@ -51,72 +54,84 @@ def test_no_ray_slips_through_where_mujoco_loses_some():
     end = o + d
     inside = (np.abs(end[:, :2]) < 0.99 * SIZE[:2]).all(1)
     o, d = end - d * [0.02, 0.02, 1], d * [0.02, 0.02, 1]
-    upright = HField(data.astype(np.float64), SIZE, quat=(2, 0, 0, 0))
-    t = np.asarray(ray(upright, o, d)[0])
-    np.testing.assert_allclose(t[inside], 1, atol=1e-9)
+    t = np.asarray(ray(HField(data, SIZE, quat=(2, 0, 0, 0)), o, d)[0])
+    np.testing.assert_allclose(t[inside], 1, atol=1e-5)  # a ray's own numbers are single ones
     lost = np.abs(Reference(data, SIZE)(o[inside], d[inside])[0] - 1) > 1e-9
     assert lost.sum() > 10  # else MuJoCo is mended, and the docstring of `ray` says too much
 
 
-def test_gradients_match_central_differences():
-    """Of distances and normals of triangles, walls and base, in the heights, size, pose and rays; none at a miss."""
+def test_derivatives_are_differences_of_mujocos_rays():
+    """Ray by ray along one change of everything, in single precision; backwards the same sum; none at a miss.
+
+    MuJoCo holds heights in single precision, and steps are 1e-3: a difference is good to some 1e-4, but where a step leads
+    into another triangle, as two sizes of steps tell.
+    """
     o, d = cases(TILTED, GROUND)
     pick = np.concatenate([np.arange(k * COUNT, k * COUNT + 8) for k in range(4)])
-    field = HField.from_model(TILTED.model, "ground")
-    numbers = tuple(map(jnp.asarray, (GROUND.astype(np.float64), SIZE, field.pos, field.quat, o[pick], d[pick])))
+    field, random = HField.from_model(TILTED.model, "ground"), np.random.default_rng(0)
+    numbers = GROUND, SIZE, field.pos, field.quat, o[pick], d[pick]
+    tangents = [random.normal(size=value.shape) for value in numbers]
 
-    def weighted(numbers, weights):
-        t, n = ray(HField(*numbers[:4]), *numbers[4:])
-        return weights @ t + (weights @ n).sum(), t
+    def met(eps):
+        data, size, pos, quat, o, d = (
+            np.asarray(value, float) + eps * tangent for value, tangent in zip(numbers, tangents, strict=True)
+        )
+        moved = Reference(data, size)
+        moved.data.geom_xpos[1], moved.data.geom_xmat[1] = pos, matrix(quat).ravel()
+        t, n = moved(o, d)
+        return np.column_stack([t, n])
 
-    program = jax.jit(jax.value_and_grad(weighted, has_aux=True), compiler_options=jaxhf.compiler_options())
-    random, eps = np.random.default_rng(0), 1e-6
-    weights = jnp.asarray(random.normal(size=len(pick)))
-    tangents = tuple(jnp.asarray(random.normal(size=value.shape)) for value in numbers)
-    (_, t), slopes = program(numbers, weights)
-    (ahead, _), (behind, _) = (
-        program(tuple(value + sign * eps * tangent for value, tangent in zip(numbers, tangents, strict=True)), weights)[0]
-        for sign in (1, -1)
-    )
-    along = [jnp.vdot(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True)]
-    assert all(abs(part) > 1e-2 for part in along)
-    np.testing.assert_allclose(sum(along), (ahead - behind) / (2 * eps), rtol=1e-6)
-    missed = np.asarray(t) < 0
+    whole, half = ((met(eps) - met(-eps)) / (2 * eps) for eps in (1e-3, 5e-4))
+    smooth = np.abs(whole - half).max(1) < 2e-3 * (1 + np.abs(whole).max(1))
+    assert smooth.sum() >= 26
+
+    def both(numbers, tangents, weights):
+        found, forward = jax.linearize(lambda *numbers: jnp.column_stack(ray(HField(*numbers[:4]), *numbers[4:])), *numbers)
+        return found, forward(*tangents), jax.linear_transpose(forward, *numbers)(weights)
+
+    singles = [tuple(np.asarray(value, np.float32) for value in values) for values in (numbers, tangents)]
+    weights = random.normal(size=whole.shape).astype(np.float32)
+    program = jax.jit(both, compiler_options=jaxhf.compiler_options())
+    found, along, slopes = program(*singles, weights)
+    np.testing.assert_allclose(along[smooth], whole[smooth], rtol=3e-3, atol=3e-3)
+    assert np.abs(whole[smooth]).max(0).min() > 1e-2
+    back = sum(np.vdot(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True))
+    np.testing.assert_allclose(back, np.vdot(weights, along), rtol=1e-3)
+    missed = np.asarray(found[:, 0]) < 0
     assert 3 < missed.sum() < 20
-    assert all((slope == 0).all() for slope in program(numbers, jnp.asarray(missed.astype(np.float64)))[1])
+    assert not any(np.any(slope) for slope in program(*singles, weights * missed[:, None])[2])
 
 
 def test_prepared_and_replaced():
     """Bounds at hand change no bit; `dataclasses.replace` makes a height field anew; a quat of zero turns nothing."""
     o, d = cases(Reference(GROUND, SIZE), GROUND)
-    upright = HField(GROUND.astype(np.float64), SIZE)
+    upright = HField(GROUND, SIZE)
     t, n = ray(upright, o, d)
     np.testing.assert_array_equal(ray(upright.prepared(), o, d)[0], t)
     turned = dataclasses.replace(upright.prepared(), quat=(0, 0, 0, 1))
     assert turned._grid is None
-    np.testing.assert_allclose(ray(turned, o * [-1, -1, 1], d * [-1, -1, 1])[1], np.asarray(n) * [-1, -1, 1], atol=1e-12)
+    np.testing.assert_allclose(
+        ray(turned, o * [-1, -1, 1], d * [-1, -1, 1])[1], np.asarray(n) * np.array([-1, -1, 1], np.float32), atol=1e-5
+    )
     np.testing.assert_array_equal(rotation(jnp.zeros(4)), np.eye(3))
     assert jnp.isfinite(jax.jacobian(rotation)(jnp.zeros(4))).all()
 
 
-def test_says_what_is_wrong():
-    with pytest.raises(ValueError, match="HField: data must lie from 0 to 1, it goes from 0 to 2"):
-        HField(2 * GROUND, SIZE)
-    with pytest.raises(ValueError, match="HField: data must lie from 0 to 1, it goes from nan to nan"):
-        HField(np.full((2, 2), np.nan), SIZE)
-    with pytest.raises(ValueError, match="HField: quat must not be zero"):
-        HField(GROUND, SIZE, quat=jnp.zeros(4))
-    with pytest.raises(ValueError, match="HField: pos must be finite"):
-        HField(GROUND, SIZE, pos=(0, np.inf, 0))
-    with pytest.raises(ValueError, match="HField: size must be positive"):
-        HField(GROUND, (1, 1, 0, 1))
-    with pytest.raises(ValueError, match=r"HField: quat must have shape \(4,\), its shape is \(3,\)"):
-        HField(GROUND, SIZE, quat=(1, 0, 0))
-    with pytest.raises(ValueError, match="geom must be a height field, 0 is none"):
-        HField.from_model(TILTED.model, 0)
-    with pytest.raises(ValueError, match=r"geom must be a number from 0 to \d+, it is 99"):
-        HField.from_model(TILTED.model, 99)
-    with pytest.raises(ValueError, match="no geom there is named 'none'"):
-        HField.from_model(TILTED.model, "none")
-    with pytest.raises(ValueError, match="ray: pnt must begin with the axes"):
-        ray(HField(np.stack([GROUND, GROUND]), SIZE), np.zeros(3), np.ones(3))
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: HField(2 * GROUND, SIZE), "HField: data must lie from 0 to 1, it goes from 0 to 2"),
+        (lambda: HField(np.full((2, 2), np.nan), SIZE), "HField: data must lie from 0 to 1, it goes from nan to nan"),
+        (lambda: HField(GROUND, SIZE, quat=jnp.zeros(4)), "HField: quat must not be zero"),
+        (lambda: HField(GROUND, SIZE, pos=(0, np.inf, 0)), "HField: pos must be finite"),
+        (lambda: HField(GROUND, (1, 1, 0, 1)), "HField: size must be positive"),
+        (lambda: HField(GROUND, SIZE, quat=(1, 0, 0)), r"HField: quat must have shape \(4,\), its shape is \(3,\)"),
+        (lambda: HField.from_model(TILTED.model, 0), "geom must be a height field, 0 is none"),
+        (lambda: HField.from_model(TILTED.model, 99), r"geom must be a number from 0 to \d+, it is 99"),
+        (lambda: HField.from_model(TILTED.model, "none"), "no geom there is named 'none'"),
+        (lambda: ray(HField(np.stack([GROUND, GROUND]), SIZE), np.zeros(3), np.ones(3)), "ray: pnt must begin with the axes"),
+    ],
+)
+def test_says_what_is_wrong(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

@@ -53,6 +53,12 @@ def test_light_by_date_and_place():
     light = jaxhf.Directional.at(NOON, 46.5, 8, irradiance=2.0)
     np.testing.assert_array_equal(light.towards, towards(*jaxhf.sun(NOON, 46.5, 8)))
     np.testing.assert_array_equal(light.irradiance, 2.0)
+    # In the morning the air lifts it by 0.229 degrees.
+    morning = datetime.datetime.fromisoformat(SPA[0][0]).replace(tzinfo=datetime.UTC)
+    for kind in (jaxhf.Directional, jaxhf.Sun):
+        lifted, seen = kind.at(morning, 51.5, -0.1, refraction=True), kind.at(morning, 51.5, -0.1)
+        altitudes = [np.rad2deg(np.arcsin(one.towards[2])) for one in (lifted, seen)]
+        np.testing.assert_allclose(altitudes, [3.2013, 2.9724], atol=0.005)
 
 
 @pytest.mark.parametrize(

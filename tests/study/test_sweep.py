@@ -234,7 +234,7 @@ def test_a_gradient_of_zero_points_nowhere(monkeypatch):
 
 def test_small_fits_are_measured_on_any_shape(sweep):
     """The side that is short already stays as it is; there need be no reference."""
-    heights = np.random.default_rng(0).uniform(0, 0.1, (3, 40))
+    heights = np.random.default_rng(0).uniform(0, 0.1, (3, 40)).astype(np.float32)
     thin = thinned(jaxhf.Heightfield(heights, dx=0.1, dy=0.5), 32)
     np.testing.assert_array_equal(thin.heights, heights[:, ::2])
     assert (thin.dx, thin.dy) == (0.2, 0.5)
@@ -256,6 +256,7 @@ def test_short_runs_are_repeated(monkeypatch):
         assert len(runs) == count
 
 
+@pytest.mark.deep  # each part of it is in the tests above
 def test_a_real_sweep(tmp_path, sweep):
     command = [sys.executable, "-m", "jaxhf", "tradeoff", "scene.toml", "-o", "out", "--devices", "1", "--repeats", "3"]
     done = subprocess.run(
