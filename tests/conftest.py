@@ -54,6 +54,13 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A file's tests share compiled programs, so they stay on one worker; pages have groups of their own."""
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(str(item.path)))
+
+
 @pytest.hookimpl(tryfirst=True)  # before what fixtures compile
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """What `x64` and `unoptimised` ask for, the latter in processes that a test starts, too; `(False)` excepts a test."""
