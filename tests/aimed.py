@@ -9,9 +9,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 from jaxtyping import Float, Int
 
 HIT, MISS, OPEN = 1, 0, -1
+DOUBLE = pytest.param(np.float64, marks=(pytest.mark.x64, pytest.mark.deep))
+PRECISIONS = pytest.mark.parametrize("dtype", [np.float32, DOUBLE])
+"""As users run it; that the same holds in double precision is a further proof."""
 
 
 class Rays(NamedTuple):
