@@ -205,7 +205,10 @@ def test_normals_of_one_cell_by_hand():
     rows = {
         "six": [[lower + upper, lower], [upper, lower + upper]],
         "six-equal": [[s * (lower + upper), s * lower], [s * upper, s * (lower + upper)]],
-        "six-angle": [[both, s * lower], [s * upper, both]],  # of length 1; both triangles have the same angles, at 00 and at 11
+        "six-angle": [
+            [both, s * lower],
+            [s * upper, both],
+        ],  # of length 1; both triangles have the same angles, at 00 and at 11
         # Right-up at 00 is flat; up-left at 10 goes through 11 and 00; left-down at 11 through 01 and 10, with slopes 1 and 1.
         "four": [[[0, 0, 1], s * lower], [s * upper, three]],
         "central": [[[0, 0, 1], [0, -1, 1]], [[-1, 0, 1], [-1, -1, 1]]],

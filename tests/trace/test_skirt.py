@@ -25,20 +25,13 @@ def triangles() -> np.ndarray:
     """Of walls and floor, (n, 3, 3), in the object's frame."""
     z, (ny, nx) = HEIGHTS.astype(float), HEIGHTS.shape
     x, y = 1.5 * np.arange(nx), 2.0 * np.arange(ny)
-    sides = [
-        (x, np.zeros(nx), z[0]),
-        (x, np.full(nx, y[-1]), z[-1]),
-        (np.zeros(ny), y, z[:, 0]),
-        (np.full(ny, x[-1]), y, z[:, -1]),
-    ]
     found = []
-    for a, b, top in sides:
-        high, low = np.stack([a, b, top], 1), np.stack([a, b, np.full(len(a), BASE)], 1)
+    for a, b, top in ((x, 0 * x, z[0]), (x, 0 * x + y[-1], z[-1]), (0 * y, y, z[:, 0]), (0 * y + x[-1], y, z[:, -1])):
+        high, low = np.stack([a, b, top], 1), np.stack([a, b, 0 * a + BASE], 1)
         for k in range(len(a) - 1):
             found += [(low[k], low[k + 1], high[k + 1]), (low[k], high[k + 1], high[k])]
-    corners = [np.array([px, py, BASE]) for px, py in ((0, 0), (x[-1], 0), (x[-1], y[-1]), (0, y[-1]))]
-    found += [(corners[0], corners[1], corners[2]), (corners[0], corners[2], corners[3])]
-    return np.array(found)
+    corners = [(px, py, BASE) for px, py in ((0, 0), (x[-1], 0), (x[-1], y[-1]), (0, y[-1]))]
+    return np.array([*found, corners[:3], [corners[0], *corners[2:]]])
 
 
 def nearest(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
