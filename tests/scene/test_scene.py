@@ -159,14 +159,6 @@ def test_the_old_name_of_irradiance(make):
     np.testing.assert_array_equal(dataclasses.replace(light, towards=(0, 1, 0)).irradiance, light.irradiance)
 
 
-def test_settings_are_frozen_and_hashable():
-    one = jaxhf.Settings(shadows=False)
-    assert {one: "found"}[jaxhf.Settings(shadows=False)] == "found"
-    assert one != jaxhf.Settings()
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        one.shadows = True  # pyright: ignore[reportAttributeAccessIssue]
-
-
 @pytest.mark.parametrize(
     ("arguments", "spacing"),
     [({}, (1 / 4, 1 / 2)), ({"dx": 3.0}, (3, 3)), ({"dy": 2.0}, (2, 2)), ({"dx": 3.0, "dy": 2.0}, (3, 2))],
@@ -209,17 +201,6 @@ def test_whole_numbers_in_jax_become_floats():
     np.testing.assert_array_equal(point.p, (-0.5, -0.25, 5))
 
 
-def test_defaults():
-    assert OBJECT.world_from_object is None
-    assert isinstance(OBJECT.material, jaxhf.Matte)
-    np.testing.assert_array_equal(np.asarray(OBJECT.material.albedo), (0.7, 0.7, 0.7))
-    np.testing.assert_array_equal(jaxhf.Mirror().reflectance, (0.9, 0.9, 0.9))
-    np.testing.assert_array_equal(jaxhf.Matte((1, 2, 3)).albedo, (1, 2, 3))
-    made = jaxhf.Scene([OBJECT], CAMERA)
-    assert (made.lights, made.samples) == ((), 1)
-    assert (CAMERA.fov, CAMERA.width, CAMERA.height) == (45, 512, 512)
-
-
 SHOWN = [
     (jaxhf.Perspective.look_at((4.5e6 + 0.25, 0, 2), (4.5e6 + 0.25, 0, 0), up=(0, 1, 0), width=640, height=480),
      "Perspective(eye=(4500000.25, 0, 2), looking=(0, 0, -1), fov=45, 640 x 480)"),
@@ -228,6 +209,9 @@ SHOWN = [
     (jaxhf.Point(jnp.array([1, 2, 3])), "Point(p=(1, 2, 3), intensity=(1, 1, 1))"),
     (jaxhf.Sky(1e-5), "Sky(radiance=(1e-05, 1e-05, 1e-05))"),
     (jaxhf.Matte(jaxhf.ImageTexture(jnp.ones((2, 4, 3)))), "Matte(albedo=ImageTexture(texels=f32[2,4,3]))"),
+    (CAMERA, "Perspective(eye=(0, 0, 0), looking=(0, 0, 1), fov=45, 512 x 512)"),
+    (OBJECT, "Object(Heightfield(2 x 3, dx=0.5, dy=1, x0=0, y0=0, heights 0 .. 0), Matte(albedo=(0.7, 0.7, 0.7)))"),
+    (jaxhf.Mirror(), "Mirror(reflectance=(0.9, 0.9, 0.9))"),
     (jaxhf.Cylinder(), "Cylinder(radius=1, z_min=-1, z_max=1)"),
     (jaxhf.Heightfield([[300, NAN, 900], [1, 2, 3]], dx=30.0, x0=7.0),
      "Heightfield(2 x 3, dx=30, dy=30, x0=7, y0=0, heights 1 .. 900)"),
