@@ -11,12 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
-from compare import heightfield
 
 import jaxhf
 from jaxhf.shade.lighting import rounded_clamp
 from jaxhf.shade.radiance import _reflect
 
+pytestmark = pytest.mark.unoptimised  # but for shadows, which are as users compile them
+OPTIMISED, DEEP = pytest.mark.unoptimised(False), pytest.mark.deep
 ROUNDING = 4e-6
 ALBEDO = np.array([0.2, 0.5, 0.8])
 RADIANCE = np.array([1.0, 2.0, 3.0])
@@ -25,7 +26,6 @@ FLAT = np.zeros((5, 9))
 TILTED = 0.3 * X - 0.2 * Y
 TILTED_NORMAL = np.array([-0.3, 0.2, 1.0]) / np.sqrt(1.13)
 UP = np.array([0, 0, 1])
-STEP = np.where(X < 3.5, 0.0, 1.0)  # a plain, a wall between x = 3 and x = 4, a plateau
 
 
 def ground(heights, material=None, **placement):
@@ -110,42 +110,47 @@ def test_sky(side):
     assert 0 < met.mean() < 1
 
 
+ROUGH = aimed.Ground(aimed.random_heights((17, 33), 2.0, seed=3))
+WALL = np.where(np.arange(33) < 3.5, 0.0, 1.0) * np.ones((17, 1))  # a plain, a wall between x = 3 and x = 4, a plateau
+
+
+def shadows(heights, camera, light):
+    """A picture of flat triangles, and where it is in shadow; one program for all lights of a kind."""
+    scene = jaxhf.Scene([ground(heights)], camera, [light])
+    image, aov = jaxhf.render(scene, jaxhf.Settings(shading="flat"), aovs=("shadow",))
+    return np.asarray(image), np.asarray(aov["shadow"])[..., 0]
+
+
 # The wall's upper edge is the line x = 4, z = 1. Seen from a light at slope 1/2, or from (6, *, 2), it lies over x = 2, z = 0.
 BEHIND_WALL = {"directional": jaxhf.Directional((1, 0, 0.5)), "point": jaxhf.Point((6, 2.5, 2), 10.0)}
 
 
-DOUBLE = pytest.param(1e-9, marks=(pytest.mark.x64, pytest.mark.deep))
-
-
-@pytest.mark.parametrize("extent", [3.97, 1e-2, DOUBLE])
+@OPTIMISED
+@pytest.mark.parametrize("extent", [3.97, 1e-2, pytest.param(1e-9, marks=(pytest.mark.x64, DEEP))])
 @pytest.mark.parametrize("kind", BEHIND_WALL)
 def test_wall_casts_a_shadow(kind, extent):
     light = BEHIND_WALL[kind]
-    scene = jaxhf.Scene([ground(STEP)], vertical(2, 1.99, extent), [light])
-    image, aov = jaxhf.render(scene, aovs=("shadow",))
+    image, shadow = shadows(WALL, vertical(2, 1.99, extent), light)
     x, y = places(2, 1.99, extent)
     lit = x < 2
-    np.testing.assert_array_equal(aov["shadow"][:, :, 0], ~lit)
-    p, n = np.stack([x, y, 0 * x], -1), UP
+    np.testing.assert_array_equal(shadow, ~lit)
+    p = np.stack([x, y, 0 * x], -1)
     if isinstance(light, jaxhf.Point):
-        expected = ALBEDO / np.pi * from_point(p, n, np.asarray(light.p), np.asarray(light.intensity))
+        expected = ALBEDO / np.pi * from_point(p, UP, np.asarray(light.p), np.asarray(light.intensity))
     else:
         expected = np.broadcast_to(ALBEDO * np.sqrt(0.2), p.shape)
     np.testing.assert_allclose(image, np.where(lit[..., None], expected, 0), rtol=ROUNDING)
 
 
+@OPTIMISED
 def test_light_before_the_wall_is_not_blocked():
     """Where most rays to it would go on into the wall; just before the wall's foot; above the plain."""
     x, y = places(1, 1.7, 1.9)
     for p in ((2.5, 2.0, 0.3), (2.999, 2.0, 0.5), (0.5, 1.0, 3.0)):
-        scene = jaxhf.Scene([ground(STEP)], vertical(1, 1.7, 1.9), [jaxhf.Point(p, 10.0)])
-        image, aov = jaxhf.render(scene, aovs=("shadow",))
-        assert not aov["shadow"].any()
-        expected = ALBEDO / np.pi * from_point(np.stack([x, y, 0 * x], -1), (0, 0, 1), np.array(p), 10.0)
+        image, shadow = shadows(WALL, vertical(1, 1.7, 1.9), jaxhf.Point(p, 10.0))
+        assert not shadow.any()
+        expected = ALBEDO / np.pi * from_point(np.stack([x, y, 0 * x], -1), UP, np.array(p), 10.0)
         np.testing.assert_allclose(image, expected, rtol=ROUNDING)
-
-
-ROUGH = aimed.Ground(aimed.random_heights((17, 33), 1.0, seed=3), dx=0.3, dy=0.5)
 
 
 def hidden(p, d, before):
@@ -154,14 +159,14 @@ def hidden(p, d, before):
     return crossings.has_changed_sides(course, np.ones(len(p), int), np.zeros(len(p)), np.full(len(p), before))
 
 
+@OPTIMISED
 @pytest.mark.parametrize("kind", [jaxhf.Directional, jaxhf.Point])
 def test_shadows_of_rough_terrain(kind):
     """At each pixel by hand: the triangle below it, the light's cosine, and all that may stand in the light's way."""
-    at = np.array([-0.8, 0.3, 0.5]) if kind is jaxhf.Directional else np.array([2.0, 5.0, 3.0])
-    lit = jaxhf.Scene([jaxhf.Object(heightfield(ROUGH, np.float32), jaxhf.Matte(1.0))], vertical(4.8, 4, 7.7), [kind(at, 1.0)])
-    image, aov = jaxhf.render(lit, jaxhf.Settings(shading="flat"), aovs=("shadow",))
-    o = np.stack([*(values.ravel() for values in places(4.8, 4, 7.7)), np.full(256, 9.0)], axis=1)
-    below = oracle.cast(*ROUGH, o, np.tile([0.0, 0.0, -1.0], (256, 1))).place
+    at = np.array([-0.8, 0.3, 0.4]) if kind is jaxhf.Directional else np.array([13.0, 8.0, 5.0])
+    image, shadow = shadows(ROUGH.heights, vertical(16, 8, 15.7), kind(at, 1.0))
+    o = np.stack([*(values.ravel() for values in places(16, 8, 15.7)), np.full(256, 9.0)], axis=1)
+    below = oracle.cast(*ROUGH, o, np.tile(-UP, (256, 1))).place
 
     def seen(at):
         to = at - below.p if kind is jaxhf.Point else at + 0 * below.p
@@ -171,16 +176,17 @@ def test_shadows_of_rough_terrain(kind):
     distance = np.linalg.norm(to, axis=1)
     cosine = (to * below.n).sum(1) / distance
     facing, sure = cosine > 0.01, lower[1] == higher[1]
-    shadow, image = np.asarray(aov["shadow"]).reshape(256), np.asarray(image).reshape(256, 3)
-    np.testing.assert_array_equal(shadow[facing & sure], dark[facing & sure])
+    np.testing.assert_array_equal(shadow.ravel()[facing & sure], dark[facing & sure])
     irradiance = np.where(dark | (cosine < 0), 0, cosine) / (distance**2 if kind is jaxhf.Point else 1)
     sure &= facing | (cosine < -0.01)
-    np.testing.assert_allclose(image[sure], np.tile(irradiance[sure] / np.pi, (3, 1)).T, rtol=1e-4, atol=1e-6)
+    expected = irradiance[sure, None] * ALBEDO / np.pi
+    np.testing.assert_allclose(image.reshape(256, 3)[sure], expected, rtol=1e-4, atol=1e-6)
     assert min((dark & facing & sure).mean(), (~dark & facing).mean()) > 0.1
     assert sure.mean() > 0.9
 
 
 @pytest.mark.parametrize("place", [(16, 16), (12, 20), (14.5, 18.25), (14.5, 18), (7.25, 21.5)])
+@OPTIMISED
 @aimed.PRECISIONS
 def test_a_light_on_the_ground_is_not_behind_it(place, dtype):
     """In a bowl it lights all but the triangles that it stands on, whose planes it is in; just below the ground, nothing."""
@@ -251,7 +257,7 @@ def test_texture_lookup():
         np.testing.assert_allclose(found, texture_by_hand(texels, uv[:, 0], uv[:, 1], "clamp"), rtol=TEXELS)
 
 
-@pytest.mark.parametrize("wrap", ["repeat", "clamp"])
+@pytest.mark.parametrize("wrap", ["repeat", pytest.param("clamp", marks=DEEP)])
 def test_texture_lies_on_the_ground(wrap):
     texels = np.random.default_rng(2).uniform(size=(4, 6, 3))
     textured = ground(FLAT, jaxhf.Matte(jaxhf.ImageTexture(texels, wrap=wrap)))
@@ -298,7 +304,7 @@ def test_mirror_under_the_sky():
         np.testing.assert_allclose(image, np.broadcast_to(reflectance * RADIANCE, image.shape), rtol=ROUNDING)
 
 
-@pytest.mark.parametrize("max_depth", [0, 1, 4])
+@pytest.mark.parametrize("max_depth", [pytest.param(0, marks=DEEP), pytest.param(1, marks=DEEP), 4])
 def test_max_depth_ends_what_parallel_mirrors_reflect(max_depth):
     eye = np.array([0.1, 2.0, 0.5])
     camera, d = perspective(eye, (3.0, 2.1, 0.4), fov=80)
@@ -330,30 +336,41 @@ def test_mirror_shows_a_wall():
     np.testing.assert_allclose(image, expected, rtol=ROUNDING)
 
 
+def rough_from_a_light():
+    """Steep terrain, seen from where its light is; the eye, and the rays' directions."""
+    heights, eye = np.random.default_rng(4).normal(0, 1.5, (5, 5)), np.array([-1.0, -2.0, 4.0])
+    camera, d = perspective(eye, (2, 2, 0), fov=50, size=32)
+    return jaxhf.Scene([ground(heights, jaxhf.Matte(1.0))], camera, [jaxhf.Point(eye, 20.0)]), eye, d
+
+
 def test_a_shading_normal_has_a_dark_side():
     """By hand at every pixel, with a light at the eye: also where the triangle faces it, its normals do not."""
-    heights = np.random.default_rng(4).normal(0, 1.5, (5, 5))
-    eye = np.array([-1.0, -2.0, 4.0])
-    camera, d = perspective(eye, (2, 2, 0), fov=50, size=32)
-    scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights, dx=1.0), jaxhf.Matte(1.0))], camera, [jaxhf.Point(eye, 20.0)])
+    scene, eye, d = rough_from_a_light()
     image, aov = jaxhf.render(scene, aovs=("normal", "status", "depth"))
-    _, flat = jaxhf.render(scene, jaxhf.Settings(shading="flat", shadows=False), aovs=("normal",))
     met = np.asarray(aov["status"]) == jaxhf.Status.HIT
-    n, ns = np.asarray(flat["normal"]), np.asarray(aov["normal"])
+    rays = np.broadcast_to(eye, d.shape).reshape(-1, 3), d.reshape(-1, 3)
+    n = oracle.cast(np.asarray(scene.heights, float), 1, 1, 0, 0, *rays).place.n.reshape(d.shape)
     side = -np.sign((n * d).sum(-1))
-    cosine = side * (ns * -d).sum(-1)
+    cosine = side * (np.asarray(aov["normal"]) * -d).sum(-1)
     rounded = np.where(abs(cosine) < 0.01, 25 * (cosine + 0.01) ** 2, np.maximum(cosine, 0))
     with np.errstate(divide="ignore"):
         expected = np.where(met, 20 / np.pi / np.asarray(aov["depth"]) ** 2 * rounded, 0)
-    np.testing.assert_allclose(np.asarray(image), np.broadcast_to(expected[..., None], image.shape), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(image, np.broadcast_to(expected[..., None], image.shape), rtol=1e-4, atol=1e-5)
     assert (met & (cosine < -0.01)).sum() > 10
     assert (side[met] < 0).sum() > 10
-    tangent = np.random.default_rng(5).normal(size=heights.shape)
-    _, change = jax.jvp(lambda heights: jaxhf.render(scene.with_heights(heights)), (scene.heights,), (jnp.asarray(tangent),))
+
+
+@DEEP
+def test_a_dark_side_has_a_finite_derivative():
+    scene, _, _ = rough_from_a_light()
+    tangent = np.random.default_rng(5).normal(size=scene.heights.shape).astype(np.float32)
+    _, change = jax.jvp(lambda z: jaxhf.render(scene.with_heights(z)), (jnp.asarray(scene.heights),), (jnp.asarray(tangent),))
     assert np.isfinite(change).all()
 
 
-@pytest.mark.parametrize(("side", "make"), [(1, jaxhf.Directional), (-1, jaxhf.Directional), (1, jaxhf.Sun)])
+@pytest.mark.parametrize(
+    ("side", "make"), [(1, jaxhf.Directional), (-1, jaxhf.Directional), pytest.param(1, jaxhf.Sun, marks=DEEP)]
+)
 def test_coarse_cells_are_dark_beyond_the_terminator(side, make):
     """Across a round hill radiance falls to zero, and stays there: triangles that still face the light are no bright rim."""
     s = np.linspace(-0.5, 0.5, 33)
