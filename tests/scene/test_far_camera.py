@@ -40,7 +40,7 @@ def by_hand(kind, away=AWAY, heights=HEIGHTS) -> tuple[oracle.OracleHit, np.ndar
     aside = half * ((X / 16 - 1)[:, None] * right + (1 - Y / 16)[:, None] * up)
     o, d = (eye + aside, ahead + 0 * aside) if kind is jaxhf.Orthographic else (eye + 0 * aside, ahead + aside)
     d /= np.linalg.norm(d, axis=1)[:, None]
-    hit = oracle.cast(heights.astype(np.float64), CELL, CELL, *CORNER[:2], o, d)
+    hit = oracle.cast(heights.astype(np.float64), CELL, CELL, float(CORNER[0]), float(CORNER[1]), o, d)
     return hit, d, hit.status == oracle.HIT
 
 
