@@ -64,7 +64,7 @@ def rounding(heights: np.ndarray, dtype: DTypeLike) -> float:
     0 where that is certainly not `WORTH_A_WARNING`, which takes no more than their range; inf where one does not fit.
     """
     kind = np.finfo(dtype)
-    if np.can_cast(heights.dtype, kind.dtype):
+    if not heights.size or np.can_cast(heights.dtype, kind.dtype):
         return 0.0
     low, high = (float(of.reduce(heights, axis=None)) for of in (np.fmin, np.fmax))
     if not math.isfinite(high - low):

@@ -1,14 +1,18 @@
 """What a scene is made of: which values are refused, and in which words; defaults; the normals at vertices."""
 
 import dataclasses
+import functools
 import re
 from typing import Any
 
+import aimed
 import jax
 import jax.numpy as jnp
 import jaxtyping
 import numpy as np
+import oracle
 import pytest
+from compare import heightfield
 
 import jaxhf
 from jaxhf.scene.localise import localise
@@ -30,28 +34,28 @@ def matrix(**entries):
     return values
 
 
-def placed(world):
-    return lambda: ANYTHING.Object(FIELD, None, world)
+def made(kind: str, *arguments, **named):
+    return lambda: getattr(ANYTHING, kind)(*arguments, **named)
 
 
-def field(heights, **arguments):
-    return lambda: ANYTHING.Heightfield(heights, **arguments)
+field, settings, light = (functools.partial(made, kind) for kind in ("Heightfield", "Settings", "Directional"))
+texture, cylinder = (functools.partial(made, kind) for kind in ("ImageTexture", "Cylinder"))
 
 
 def field_of_size(dx):
     return ANYTHING.Heightfield(GRID, dx=dx).heights
 
 
-def settings(**arguments):
-    return lambda: ANYTHING.Settings(**arguments)
+def placed(world):
+    return made("Object", FIELD, None, world)
 
 
-def look_at(*arguments, **more):
-    return lambda: ANYTHING.Perspective.look_at(*arguments, **more)
+def look_at(*arguments):
+    return lambda: ANYTHING.Perspective.look_at(*arguments)
 
 
 def perspective(world=None, **arguments):
-    return lambda: ANYTHING.Perspective(np.eye(4) if world is None else world, **arguments)
+    return made("Perspective", np.eye(4) if world is None else world, **arguments)
 
 
 def intrinsics(fx: Any = 40, fy: Any = 50, cx: Any = 20, cy: Any = 30, **arguments):
@@ -60,130 +64,76 @@ def intrinsics(fx: Any = 40, fy: Any = 50, cx: Any = 20, cy: Any = 30, **argumen
     )
 
 
-def orthographic(world=None, **arguments):
-    return lambda: ANYTHING.Orthographic(np.eye(4) if world is None else world, **arguments)
-
-
 def scene(objects: Any = (OBJECT,), camera: Any = CAMERA, lights: Any = (), **arguments):
-    return lambda: ANYTHING.Scene(objects, camera, lights, **arguments)
-
-
-def directional(*arguments):
-    return lambda: ANYTHING.Directional(*arguments)
+    return made("Scene", objects, camera, lights, **arguments)
 
 
 # What is made, and what the message says: the place, the rule, the value.
 BAD = [
     (field(np.zeros((1, 5))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (1, 5)"),
-    (field(np.zeros((5, 1))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (5, 1)"),
-    (field([]), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (0,)"),
     (field(np.zeros((0, 3))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (0, 3)"),
     (field(np.zeros((2, 2, 2))), "Heightfield: heights must have shape (ny, nx) of at least 2x2, theirs is (2, 2, 2)"),
     (lambda: jax.jit(field_of_size)(1.0), "Heightfield: dx must be known when programs are compiled, it is traced by JAX"),
     (field(GRID, dx=0.0), "Heightfield: dx must be positive and finite, it is 0.0"),
-    (field(GRID, dx=-1.0), "Heightfield: dx must be positive and finite, it is -1.0"),
     (field(GRID, dx=1.0, dy=INF), "Heightfield: dy must be positive and finite, it is inf"),
-    (field(GRID, dx=NAN), "Heightfield: dx must be positive and finite, it is nan"),
     (field(GRID, x0=NAN), "Heightfield: x0 must be finite, it is nan"),
     (field(GRID, y0=-INF), "Heightfield: y0 must be finite, it is -inf"),
     (field(np.zeros((2, 2), bool)), "Heightfield: heights must be an array of real numbers, they are bool"),
-    (field(jnp.zeros((2, 2), bool)), "Heightfield: heights must be an array of real numbers, they are bool"),
-    (field(np.zeros((2, 2), complex)), "Heightfield: heights must be an array of real numbers, they are complex128"),
     (field([[1, 2], [3]]), "Heightfield: heights must be an array of real numbers, they are a list"),
-    (
-        field(jaxhf.Terrain(GRID)),
-        "Heightfield: heights must be an array of real numbers, they are a Terrain: take its .heightfield()",
-    ),
-    (field("high"), "Heightfield: heights must be an array of real numbers, they are a str"),
+    (field(jaxhf.Terrain(GRID)), "Heightfield: heights must be an array of real numbers, they are a Terrain: take its .height"),
     (placed(np.zeros((4, 4))), "Object: world_from_object must be affine (last row 0 0 0 1), its last row is [0.0, 0"),
-    (placed(matrix(m22=0)), "Object: world_from_object must be invertible, it flattens space: "),
     (placed(matrix(m10=2, m11=0, m01=0)), "Object: world_from_object must be invertible, it flattens space: "),
-    (placed(matrix(m11=1e-30)[:, [0, 0, 2, 3]]), "Object: world_from_object must be invertible, it flattens space: "),
-    (placed(matrix(m31=1)), "Object: world_from_object must be affine (last row 0 0 0 1), its last row is [0.0, 1.0"),
     (placed(matrix(m03=NAN)), "Object: world_from_object must be finite, it is "),
     (placed(np.eye(3)), "Object: world_from_object must be a 4x4 matrix, its shape is (3, 3)"),
-    (placed(jnp.eye(3)), "Object: world_from_object must be a 4x4 matrix, its shape is (3, 3)"),
-    (lambda: ANYTHING.Object(GRID), "Object: shape must be a Heightfield, Cylinder or Skirt, it is ndarray"),
-    (lambda: ANYTHING.Object(FIELD, 0.7), "Object: material must be Matte or Mirror, it is float"),
-    (lambda: ANYTHING.Matte([1, 2]), "Matte: albedo must be one number or three, its shape is (2,)"),
-    (lambda: ANYTHING.Matte(NAN), "Matte: albedo must be finite, it is [nan, nan, nan]"),
-    (lambda: ANYTHING.Mirror(np.ones((2, 2))), "Mirror: reflectance must be one number or three, its shape is (2, 2)"),
-    (lambda: ANYTHING.Mirror([0, INF, 0]), "Mirror: reflectance must be finite, it is [ 0., inf,  0.]"),
-    (lambda: ANYTHING.ImageTexture(np.ones(2)), "ImageTexture: texels must have shape (h, w, 3) or (h, w), theirs is (2,)"),
-    (lambda: ANYTHING.ImageTexture(np.ones((2, 2, 4))), "ImageTexture: texels must have shape (h, w, 3) or (h, w), "),
-    (lambda: ANYTHING.ImageTexture(np.ones((0, 2, 3))), "ImageTexture: texels must have shape (h, w, 3) or (h, w), "),
-    (lambda: ANYTHING.ImageTexture(np.ones((2, 2, 3)), wrap="black"), "ImageTexture: wrap must be one of repeat, clamp; it is"),
-    (lambda: ANYTHING.ImageTexture(np.full((2, 2, 3), NAN)), "ImageTexture: texels must be finite"),
-    (directional([0, 0, 0]), "Directional: towards must not be zero, it is [0, 0, 0]"),
-    (directional([0, NAN, 1]), "Directional: towards must be finite, it is [ 0., nan,  1.]"),
-    (directional([1, 2]), "Directional: towards must hold three numbers, its shape is (2,)"),
-    (directional(1), "Directional: towards must hold three numbers, its shape is ()"),
-    (directional([0, 0, 1], [1, 2]), "Directional: irradiance must hold three numbers, its shape is (2,)"),
+    (made("Object", GRID), "Object: shape must be a Heightfield, Cylinder or Skirt, it is ndarray"),
+    (made("Object", FIELD, 0.7), "Object: material must be Matte or Mirror, it is float"),
+    (made("Matte", NAN), "Matte: albedo must be finite, it is [nan, nan, nan]"),
+    (made("Mirror", [0, INF, 0]), "Mirror: reflectance must be finite, it is [ 0., inf,  0.]"),
+    (texture(np.ones(2)), "ImageTexture: texels must have shape (h, w, 3) or (h, w), theirs is (2,)"),
+    (texture(np.ones((2, 2, 3)), wrap="black"), "ImageTexture: wrap must be one of repeat, clamp; it is"),
+    (texture(np.zeros((2, 2, 3), np.uint8)), "ImageTexture: texels must hold linear colours in floats, 1 being white; theirs"),
+    (texture(np.full((2, 2, 3), NAN)), "ImageTexture: texels must be finite"),
+    (light([0, 0, 0]), "Directional: towards must not be zero, it is [0, 0, 0]"),
+    (light([0, NAN, 1]), "Directional: towards must be finite, it is [ 0., nan,  1.]"),
+    (light([0, 0, 1], [1, 2]), "Directional: irradiance must hold three numbers, its shape is (2,)"),
     (lambda: jaxhf.Directional.from_angles(NAN), "Directional: towards must be finite, it is "),
-    (lambda: jaxhf.Point([1, 2]), "Point: p must hold three numbers, its shape is (2,)"),
-    (lambda: jaxhf.Point([1, 2, INF]), "Point: p must be finite, it is [ 1.,  2., inf]"),
-    (lambda: jaxhf.Point([1, 2, 3], [1, 2]), "Point: intensity must hold three numbers, its shape is (2,)"),
-    (lambda: jaxhf.Sky([1, 2, 3, 4]), "Sky: radiance must hold three numbers, its shape is (4,)"),
-    (lambda: jaxhf.Sky(NAN), "Sky: radiance must be finite, it is [nan, nan, nan]"),
-    (perspective(fov=0), "Perspective: fov must lie between 0 and 180 degrees, it is 0.0"),
+    (made("Point", [1, 2, INF]), "Point: p must be finite, it is [ 1.,  2., inf]"),
+    (made("Sky", [1, 2, 3, 4]), "Sky: radiance must hold three numbers, its shape is (4,)"),
     (perspective(fov=180), "Perspective: fov must lie between 0 and 180 degrees, it is 180.0"),
-    (perspective(fov=NAN), "Perspective: fov must lie between 0 and 180 degrees, it is nan"),
     (perspective(fov=[30, 40]), "Perspective: fov must be one number"),
-    (perspective(width=-4), "Perspective: width must be a whole number of pixels from 1 on, it is -4"),
     (perspective(height=0), "Perspective: height must be a whole number of pixels from 1 on, it is 0"),
     (perspective(height=2.5), "Perspective: height must be a whole number of pixels from 1 on, it is 2.5"),
     (perspective(np.eye(3)), "Perspective: world_from_camera must be a 4x4 matrix, its shape is (3, 3)"),
-    (perspective(matrix(m00=NAN)), "Perspective: world_from_camera must be finite, it is "),
     (perspective(matrix(m11=0)), "Perspective: world_from_camera must be invertible, it flattens space: "),
-    (intrinsics(width="a"), "from_intrinsics: width must be a whole number of pixels from 1 on, it is 'a'"),
     (intrinsics(fx=0), "from_intrinsics: fx must be positive, it is 0.0"),
     (intrinsics(cy=NAN), "from_intrinsics: cy must be finite, it is nan"),
     (intrinsics(cx=[1, 2]), "from_intrinsics: cx must be one number, its shape is (2,)"),
     (intrinsics(convention="blender"), "from_intrinsics: convention must be one of opencv, opengl; it is 'blender'"),
-    (intrinsics(world_from_camera=np.eye(3)), "from_intrinsics: world_from_camera must be a 4x4 matrix, its shape is (3, 3)"),
-    (intrinsics(world_from_camera=matrix(m11=2)), "from_intrinsics: world_from_camera must rotate without scaling or"),
     (intrinsics(world_from_camera=matrix(m11=-1)), "from_intrinsics: world_from_camera must rotate without scaling or"),
-    (orthographic(extent=0), "Orthographic: extent must be positive and finite, it is 0.0"),
-    (orthographic(extent=NAN), "Orthographic: extent must be positive and finite, it is nan"),
-    (orthographic(extent=INF), "Orthographic: extent must be positive and finite, it is inf"),
-    (orthographic(width=-1), "Orthographic: width must be a whole number of pixels from 1 on, it is -1"),
+    (made("Orthographic", np.eye(4), extent=INF), "Orthographic: extent must be positive and finite, it is inf"),
     (look_at((1, 2, 3), (1, 2, 3)), "look_at: target must differ from eye, both are [1.0, 2.0, 3.0]"),
     (look_at((0, 0, 5), (0, 0, 0)), "look_at: up must not point along the view, it is [0.0, 0.0, 1.0] for the view"),
-    (look_at((0, 0, 0), (1, 0, 0), (0, 0, 0)), "look_at: up must not point along the view, it is [0.0, 0.0, 0.0]"),
     (look_at((0, NAN, 0), (1, 0, 0)), "look_at: eye must be finite, it is [ 0., nan,  0.]"),
     (look_at((0, 0, 0), (1, 0)), "look_at: target must hold three numbers, its shape is (2,)"),
     (scene(objects=[]), "Scene: objects must hold at least one Object, it is empty"),
-    (scene(objects=[FIELD]), "Scene: objects does not take a Heightfield"),
     (scene(camera="front"), "Scene: camera does not take a str"),
     (scene(lights=[CAMERA]), "Scene: lights does not take a Perspective"),
     (scene(lights=[jaxhf.Sky(1), jaxhf.Sky(2)]), "Scene: lights may hold one Sky, they hold more"),
     (lambda: scene()().with_lights([CAMERA]), "Scene: lights does not take a Perspective"),
     (lambda: scene()().with_camera("front"), "Scene: camera does not take a str"),
-    (scene(samples=0), "Scene: samples must be a whole number from 1 on, it is 0"),
-    (scene(samples=2.0), "Scene: samples must be a whole number from 1 on, it is 2.0"),
     (settings(traversal="fast"), "Settings: traversal must be one of "),
     (settings(shading="gouraud"), "Settings: shading must be one of smooth, flat; it is 'gouraud'"),
     (settings(normals="five"), "Settings: normals must be one of central, four, six, six-angle, six-equal; it is 'five'"),
     (settings(shadows=1), "Settings: shadows must be True or False, it is 1"),
     (settings(early_exit=None), "Settings: early_exit must be True or False, it is None"),
-    (settings(max_steps=0), "Settings: max_steps must be a whole number from 1 on, it is 0"),
     (settings(max_steps=2.0), "Settings: max_steps must be a whole number from 1 on, it is 2.0"),
-    (settings(samples=0), "Settings: samples must be a whole number from 1 on, it is 0"),
     (settings(samples=8), "Settings: samples must be a square number (1, 4, 9, ...), it is 8"),
     (settings(max_depth=-1), "Settings: max_depth must be a whole number from 0 on, it is -1"),
-    (settings(max_depth=True), "Settings: max_depth must be a whole number from 0 on, it is True"),
     (settings(chunk=63), "Settings: chunk must be a whole number from 64 on, it is 63"),
-    (
-        settings(chunk=10**8),
-        "Settings: chunk must be at most 1048576, it is 100000000; with 1024, the default, rays are traced fastest",
-    ),
-    (settings(chunk="1024"), "Settings: chunk must be a whole number from 64 on, it is '1024'"),
-    (lambda: jaxhf.Cylinder(radius=0), "Cylinder: radius must be positive, it is 0.0"),
-    (lambda: jaxhf.Cylinder(radius=INF), "Cylinder: radius must be positive"),
-    (lambda: jaxhf.Cylinder(radius=NAN), "Cylinder: radius must be positive, it is nan"),
-    (lambda: jaxhf.Cylinder(z_min=1, z_max=1), "Cylinder: z_min must lie below z_max, they are 1.0 and 1.0"),
-    (lambda: jaxhf.Cylinder(z_max=NAN), "Cylinder: z_min must lie below z_max, they are -1.0 and nan"),
-    (lambda: jaxhf.Cylinder(z_min=-INF), "Cylinder: z_min must be finite"),
+    (settings(chunk=10**8), "Settings: chunk must be at most 1048576, it is 100000000; with 1024, the default,"),
+    (cylinder(radius=0), "Cylinder: radius must be positive, it is 0.0"),
+    (cylinder(z_min=1, z_max=1), "Cylinder: z_min must lie below z_max, they are 1.0 and 1.0"),
+    (cylinder(z_min=-INF), "Cylinder: z_min must be finite"),
 ]  # fmt: skip
 
 
@@ -209,14 +159,6 @@ def test_the_old_name_of_irradiance(make):
     np.testing.assert_array_equal(dataclasses.replace(light, towards=(0, 1, 0)).irradiance, light.irradiance)
 
 
-def test_settings_are_frozen_and_hashable():
-    one = jaxhf.Settings(shadows=False)
-    assert {one: "found"}[jaxhf.Settings(shadows=False)] == "found"
-    assert one != jaxhf.Settings()
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        one.shadows = True  # pyright: ignore[reportAttributeAccessIssue]
-
-
 @pytest.mark.parametrize(
     ("arguments", "spacing"),
     [({}, (1 / 4, 1 / 2)), ({"dx": 3.0}, (3, 3)), ({"dy": 2.0}, (2, 2)), ({"dx": 3.0, "dy": 2.0}, (3, 2))],
@@ -224,88 +166,57 @@ def test_settings_are_frozen_and_hashable():
 def test_cell_size(arguments, spacing):
     """Nothing given: pbrt's unit square. One of the two alone counts for both."""
     made = jaxhf.Heightfield(np.zeros((3, 5)), **arguments)
-    assert (made.dx, made.dy) == spacing
-    assert (made.x0, made.y0) == (0, 0)
+    assert (made.dx, made.dy, made.x0, made.y0) == (*spacing, 0, 0)
 
 
-def test_precision_of_heights():
-    assert jaxhf.Heightfield([[1, 2], [3, 4]]).heights.dtype == jnp.float32
-    assert jaxhf.Heightfield(np.array([[1, 2], [3, 4]], np.uint8)).heights.dtype == jnp.float32
-    assert jaxhf.Heightfield(np.zeros((2, 2), np.float32)).heights.dtype == jnp.float32
-    assert jaxhf.Heightfield(np.zeros((2, 2))).heights.dtype == jnp.float64
+def test_no_more_cells_than_can_be_traced():
+    """Shapes alone: as many as 2^28, each side rounded up to a power of two, and a few more."""
+
+    def shape_of(ny, nx):
+        heights = jax.ShapeDtypeStruct((ny, nx), jnp.float32)
+        return jax.eval_shape(lambda z: jaxhf.cast(jaxhf.Heightfield(z), (0.5, 0.5, 9.0), (0, 0, -1.0)).t, heights).shape
+
+    for ny, nx in ((11520, 16385), (2, 2**27 + 1)):
+        assert shape_of(ny, nx) == ()
+    for ny, nx, padded in ((11520, 23040, "16384 x 32768"), (2, 2**27 + 2, "2 x 268435456")):
+        message = f"at most 2**28 cells, each side rounded up to a power of two; shape {(ny, nx)}"
+        with pytest.raises(ValueError, match=re.escape(message) + f" makes {padded}\\b"):
+            shape_of(ny, nx)
 
 
-@pytest.mark.parametrize(("ny", "nx", "padded"), [(11520, 23040, "16384 x 32768"), (2, 2**27 + 2, "2 x 268435456")])
-def test_no_more_cells_than_can_be_traced(ny, nx, padded):
-    """Shapes alone: both are fewer than 2^28 heights."""
-    with pytest.raises(
-        ValueError, match=re.escape(f"at most 2**28 cells, each side rounded up to a power of two; shape {(ny, nx)}")
-    ) as error:
-        jax.eval_shape(jaxhf.Heightfield, jax.ShapeDtypeStruct((ny, nx), jnp.float32))
-    assert str(error.value).endswith(f"makes {padded}")
-
-
-@pytest.mark.parametrize(("ny", "nx"), [(11520, 16385), (16384, 16384), (2, 2**27 + 1)])
-def test_as_many_cells_as_can_be_traced(ny, nx):
-    def lowered(heights):
-        return jaxhf.cast(jaxhf.Heightfield(heights), (0.5, 0.5, 9.0), (0, 0, -1.0)).t
-
-    assert jax.eval_shape(lowered, jax.ShapeDtypeStruct((ny, nx), jnp.float32)).shape == ()
-
-
-@pytest.mark.parametrize("dtype", [jnp.int32, jnp.uint8, bool])
-def test_whole_numbers_in_jax_become_floats(dtype):
-    """Whatever moves them later would lose its fractions."""
-    three, square = jnp.array([0, 0, 1], dtype), jnp.eye(4).astype(dtype)
-    leaves: tuple[Any, ...] = (
-        jaxhf.Point(three, three).p, jaxhf.Point(three, three).intensity, jaxhf.Directional(three, three).irradiance,
-        jaxhf.Matte(three).albedo, jaxhf.Matte(jnp.array(1, dtype)).albedo, jaxhf.Cylinder(jnp.array(1, dtype)).radius,
-        jaxhf.Object(FIELD, None, square).world_from_object, jaxhf.Perspective(square).world_from_camera,
-    )  # fmt: skip
-    assert {leaf.dtype for leaf in leaves} == {np.dtype(np.float64)}
-    np.testing.assert_array_equal(leaves[0], (0, 0, 1))
-
-
-def test_a_light_at_whole_numbers_stands_there_beside_a_shifted_grid():
-    """Localised, the grid's corner (0.5, 0.25) is the origin."""
-    made = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(GRID, x0=0.5, y0=0.25))], CAMERA, [jaxhf.Point(jnp.array([0, 0, 5]))])
-    (light,) = localise(made).lights
-    assert isinstance(light, jaxhf.Point)
-    np.testing.assert_array_equal(light.p, (-0.5, -0.25, 5))
-
-
-def test_defaults():
-    assert OBJECT.world_from_object is None
-    assert isinstance(OBJECT.material, jaxhf.Matte)
-    np.testing.assert_array_equal(np.asarray(OBJECT.material.albedo), (0.7, 0.7, 0.7))
-    np.testing.assert_array_equal(jaxhf.Mirror().reflectance, (0.9, 0.9, 0.9))
-    np.testing.assert_array_equal(jaxhf.Matte((1, 2, 3)).albedo, (1, 2, 3))
-    made = jaxhf.Scene([OBJECT], CAMERA)
-    assert (made.lights, made.samples) == ((), 1)
-    assert (CAMERA.fov, CAMERA.width, CAMERA.height) == (45, 512, 512)
+def test_whole_numbers_in_jax_become_floats():
+    """Whatever moves them later would lose its fractions: a light beside a grid whose corner becomes the origin."""
+    for dtype in (jnp.int32, jnp.uint8, bool):
+        three, square = jnp.array([0, 0, 1], dtype), jnp.eye(4).astype(dtype)
+        leaves: tuple[Any, ...] = (
+            jaxhf.Point(three, three).p, jaxhf.Point(three, three).intensity, jaxhf.Directional(three, three).irradiance,
+            jaxhf.Matte(three).albedo, jaxhf.Matte(jnp.array(1, dtype)).albedo, jaxhf.Cylinder(jnp.array(1, dtype)).radius,
+            jaxhf.Object(FIELD, None, square).world_from_object, jaxhf.Perspective(square).world_from_camera,
+        )  # fmt: skip
+        assert {leaf.dtype for leaf in leaves} == {np.dtype(np.float32)}
+        np.testing.assert_array_equal(leaves[0], (0, 0, 1))
+    shifted = jaxhf.Object(jaxhf.Heightfield(GRID, x0=0.5, y0=0.25))
+    (point,) = localise(jaxhf.Scene([shifted], CAMERA, [jaxhf.Point(jnp.array([0, 0, 5]))])).lights
+    assert isinstance(point, jaxhf.Point)
+    np.testing.assert_array_equal(point.p, (-0.5, -0.25, 5))
 
 
 SHOWN = [
-    (
-        jaxhf.Perspective.look_at((4.5e6 + 0.25, 0, 2), (4.5e6 + 0.25, 0, 0), up=(0, 1, 0), width=640, height=480),
-        "Perspective(eye=(4500000.25, 0, 2), looking=(0, 0, -1), fov=45, 640 x 480)",
-    ),
+    (jaxhf.Perspective.look_at((4.5e6 + 0.25, 0, 2), (4.5e6 + 0.25, 0, 0), up=(0, 1, 0), width=640, height=480),
+     "Perspective(eye=(4500000.25, 0, 2), looking=(0, 0, -1), fov=45, 640 x 480)"),
     (jaxhf.Orthographic(np.eye(4), 1 / 63), "Orthographic(eye=(0, 0, 0), looking=(0, 0, 1), extent=0.0159, 512 x 512)"),
     (jaxhf.Directional((0, 0.5, 1)), "Directional(towards=(0, 0.5, 1), irradiance=(3.142, 3.142, 3.142))"),
     (jaxhf.Point(jnp.array([1, 2, 3])), "Point(p=(1, 2, 3), intensity=(1, 1, 1))"),
     (jaxhf.Sky(1e-5), "Sky(radiance=(1e-05, 1e-05, 1e-05))"),
-    (jaxhf.Matte((0.2, 0.3, 0.4)), "Matte(albedo=(0.2, 0.3, 0.4))"),
-    (jaxhf.Matte(jaxhf.ImageTexture(jnp.ones((2, 4, 3)))), "Matte(albedo=ImageTexture(texels=f64[2,4,3]))"),
+    (jaxhf.Matte(jaxhf.ImageTexture(jnp.ones((2, 4, 3)))), "Matte(albedo=ImageTexture(texels=f32[2,4,3]))"),
+    (CAMERA, "Perspective(eye=(0, 0, 0), looking=(0, 0, 1), fov=45, 512 x 512)"),
+    (OBJECT, "Object(Heightfield(2 x 3, dx=0.5, dy=1, x0=0, y0=0, heights 0 .. 0), Matte(albedo=(0.7, 0.7, 0.7)))"),
+    (jaxhf.Mirror(), "Mirror(reflectance=(0.9, 0.9, 0.9))"),
     (jaxhf.Cylinder(), "Cylinder(radius=1, z_min=-1, z_max=1)"),
-    (
-        jaxhf.Heightfield([[300, NAN, 900], [1, 2, 3]], dx=30.0, x0=7.0),
-        "Heightfield(2 x 3, dx=30, dy=30, x0=7, y0=0, heights 1 .. 900)",
-    ),
-    (
-        jaxhf.Heightfield(np.full((2, 2), NAN)),
-        "Heightfield(2 x 2, dx=1, dy=1, x0=0, y0=0, heights nan .. nan)",
-    ),
-]
+    (jaxhf.Heightfield([[300, NAN, 900], [1, 2, 3]], dx=30.0, x0=7.0),
+     "Heightfield(2 x 3, dx=30, dy=30, x0=7, y0=0, heights 1 .. 900)"),
+    (jaxhf.Heightfield(np.full((2, 2), NAN)), "Heightfield(2 x 2, dx=1, dy=1, x0=0, y0=0, heights nan .. nan)"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("part", "text"), SHOWN, ids=[text.partition("(")[0] for _, text in SHOWN])
@@ -313,36 +224,61 @@ def test_parts_print_their_numbers(part, text):
     assert repr(part) == text
 
 
-@pytest.mark.parametrize("convention", ["opencv", "opengl"])
-@pytest.mark.parametrize("size", [(64, 48), (48, 64)])
-def test_cameras_from_intrinsics_project_as_k_r_t(convention, size):
-    """World points by K [R | t] (Hartley and Zisserman 2004, equation 6.8): a pixel's ray passes through them, and back."""
-    rng, (width, height) = np.random.default_rng(4), size
-    k = np.array([[70.0, 0, 27.3], [0, 55, 31.9], [0, 0, 1]])
-    rotation, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-    rotation *= np.linalg.det(rotation)
-    t = np.array([0.3, -0.2, 4.0])
-    points = rng.uniform(-1, 1, (20, 3))
-    seen = points @ rotation.T + t  # x right, y down, z forward
-    pixels = (seen @ k.T)[:, :2] / seen[:, 2:]
-    pose = matrix()
+K = np.array([[70.0, 0, 27.3], [0, 55, 31.9], [0, 0, 1]])  # its principal point is off the middle, its pixels are not square
+
+
+def by_k_r_t(points, rotation, t):
+    """Pixels and depths of world points by K [R | t] (Hartley and Zisserman 2004, equation 6.8): x right, y down, z forward."""
+    seen = points @ rotation.T + t
+    return (seen @ K.T)[..., :2] / seen[..., 2:], seen[..., 2]
+
+
+def calibrated(rotation, t, convention="opencv", width=64, height=48, fx=K[0, 0]):
+    pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ t
     if convention == "opengl":
         pose[:3, 1:3] *= -1
-    made = jaxhf.Perspective.from_intrinsics(
-        k[0, 0], k[1, 1], k[0, 2], k[1, 2], world_from_camera=pose, width=width, height=height, convention=convention
+    return jaxhf.Perspective.from_intrinsics(
+        fx, K[1, 1], K[0, 2], K[1, 2], world_from_camera=pose, width=width, height=height, convention=convention
     )
-    ray = jax.vmap(made.ray)(*pixels.T)
-    np.testing.assert_allclose(ray.o, np.broadcast_to(pose[:3, 3], (20, 3)), atol=1e-14)
-    np.testing.assert_allclose(ray.d, units(points - pose[:3, 3]), atol=1e-14)
-    x, y, w, depth = np.asarray(jax.vmap(made.film_from_world())(jnp.asarray(points))).T
-    np.testing.assert_allclose(np.stack([x, y]) / w, pixels.T, atol=1e-12)
-    np.testing.assert_allclose(depth, seen[:, 2], atol=1e-13)
-    traced = jax.jit(lambda fx: jaxhf.Perspective.from_intrinsics(
-        fx, k[1, 1], k[0, 2], k[1, 2], world_from_camera=pose, width=width, height=height, convention=convention
-    ))(k[0, 0])  # fmt: skip
-    np.testing.assert_allclose(traced.world_from_camera, made.world_from_camera, atol=1e-14)
-    np.testing.assert_allclose(traced.fov, made.fov)
+
+
+@pytest.mark.parametrize("convention", ["opencv", "opengl"])
+@pytest.mark.parametrize("size", [(64, 48), (48, 64)])
+def test_cameras_from_intrinsics_project_as_k_r_t(convention, size):
+    """A pixel's ray passes through the points that are projected to it, and back."""
+    rng = np.random.default_rng(4)
+    rotation, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    rotation *= np.linalg.det(rotation)
+    t, points = np.array([0.3, -0.2, 4.0]), rng.uniform(-1, 1, (20, 3))
+    (pixels, z), eye = by_k_r_t(points, rotation, t), -rotation.T @ t
+    camera = calibrated(rotation, t, convention, *size)
+    ray = jax.vmap(camera.ray)(*pixels.T)
+    np.testing.assert_allclose(ray.o, np.broadcast_to(eye, (20, 3)), atol=1e-6)
+    np.testing.assert_allclose(ray.d, units(points - eye), atol=1e-6)
+    x, y, w, depth = np.asarray(jax.vmap(camera.film_from_world())(jnp.asarray(points))).T
+    np.testing.assert_allclose(np.stack([x, y]) / w, pixels.T, atol=1e-4)  # float32 at 64 has steps of 8e-6
+    np.testing.assert_allclose(depth, z, rtol=1e-6)
+    traced = jax.jit(lambda fx: calibrated(rotation, t, convention, *size, fx=fx))(K[0, 0])
+    np.testing.assert_allclose(traced.world_from_camera, camera.world_from_camera, atol=1e-6)
+    np.testing.assert_allclose(traced.fov, camera.fov, rtol=1e-6)
+
+
+def test_a_picture_through_intrinsics_shows_points_at_their_pixels():
+    """What each pixel of a picture shows, projected by hand, is at the pixel's middle, half a pixel from its corner."""
+    ground = aimed.Ground(aimed.random_heights((17, 17), 0.5, seed=2), dx=0.5, dy=0.5, x0=-4.0, y0=-4.0)
+    a, b = np.radians([35, 200])  # pitched, and turned about the vertical
+    pitch = np.array([[1, 0, 0], [0, -np.sin(a), -np.cos(a)], [0, np.cos(a), -np.sin(a)]])
+    rotation = pitch @ np.array([[np.cos(b), -np.sin(b), 0], [np.sin(b), np.cos(b), 0], [0, 0, 1]])
+    camera = calibrated(rotation, t := np.array([0.3, -0.2, 9.0]))
+    shown = jaxhf.Scene([jaxhf.Object(heightfield(ground, np.float32))], camera, [jaxhf.Directional((0, 0, 1))])
+    _, aovs = jaxhf.render(shown, aovs=("status", "uv", "depth"))
+    met = np.asarray(aovs["status"]) == jaxhf.Status.HIT
+    points = ground.points(*(16 * np.asarray(aovs["uv"], float)[met]).T)
+    middles = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5), axis=-1)[met]
+    np.testing.assert_allclose(by_k_r_t(points, rotation, t)[0], middles, atol=2e-3)
+    np.testing.assert_allclose(aovs["depth"][met], np.linalg.norm(points + rotation.T @ t, axis=1), rtol=1e-5)
+    assert 0.3 < met.mean() < 0.95
 
 
 def test_a_centred_pinhole_is_a_camera_that_looks_at_its_middle():
@@ -350,9 +286,9 @@ def test_a_centred_pinhole_is_a_camera_that_looks_at_its_middle():
     expected = jaxhf.Perspective.look_at((1, 2, 3), (4, 1, 0.5), fov=40.0, width=64, height=48)
     f, pose = 24 / np.tan(np.radians(20)), np.array(expected.world_from_camera)
     pose[:3, 1] *= -1
-    made = jaxhf.Perspective.from_intrinsics(f, f, 32, 24, world_from_camera=pose, width=64, height=48)
-    np.testing.assert_allclose(made.world_from_camera, expected.world_from_camera, atol=1e-15)
-    np.testing.assert_allclose(made.fov, 40)
+    camera = jaxhf.Perspective.from_intrinsics(f, f, 32, 24, world_from_camera=pose, width=64, height=48)
+    np.testing.assert_allclose(camera.world_from_camera, expected.world_from_camera, atol=1e-15)
+    np.testing.assert_allclose(camera.fov, 40)
 
 
 def test_a_scene_prints_whatever_its_leaves_are():
@@ -373,8 +309,8 @@ def test_a_scene_prints_whatever_its_leaves_are():
     for leaf in jax.tree.leaves(deleted):
         leaf.delete()
     seen.append(repr(deleted))
-    assert "Heightfield(f64[2,3], dx=0.5, dy=1, x0=0, y0=0)" in seen[0]
-    assert "Perspective(world_from_camera=f64[4,4], fov=f64[], 512 x 512)" in seen[-1]
+    assert "Heightfield(f32[2,3], dx=0.5, dy=1, x0=0, y0=0)" in seen[0]
+    assert "Perspective(world_from_camera=f32[4,4], fov=f32[], 512 x 512)" in seen[-1]
     assert all(text.startswith("Scene(") for text in seen)
 
 
@@ -392,34 +328,25 @@ def test_positions_keep_double_precision():
     light = jaxhf.Point((5e6 + 0.125, 0, 0))
     assert isinstance(light.p, np.ndarray)
     assert light.p[0] == 5e6 + 0.125
-    single = jaxhf.Point(jnp.ones(3, jnp.float32))
-    assert single.p.dtype == jnp.float32
+    assert jaxhf.Point(jnp.ones(3)).p.dtype == jnp.float32
 
 
 def test_heights_of_a_scene():
     first, second = jaxhf.Heightfield(np.zeros((2, 3))), jaxhf.Heightfield(np.ones((4, 4)), dx=2.0)
     objects = [jaxhf.Object(jaxhf.Cylinder()), jaxhf.Object(first), jaxhf.Object(second)]
-    made = jaxhf.Scene(objects, CAMERA, [jaxhf.Sky(1)], samples=4)
-    assert made.heightfields == (first, second)
-    assert made.heights is first.heights
-    changed = made.with_heights([[1, 2, 3], [4, 5, 6]])
+    given = jaxhf.Scene(objects, CAMERA, [jaxhf.Sky(1)], samples=4)
+    assert given.heightfields == (first, second)
+    assert given.heights is first.heights
+    changed = given.with_heights([[1, 2, 3], [4, 5, 6]])
     np.testing.assert_array_equal(changed.heights, [[1, 2, 3], [4, 5, 6]])
-    assert changed.heights.dtype == jnp.float64
     assert changed.heightfields[1].heights is second.heights
-    assert (changed.lights, changed.samples) == (made.lights, 4)
-    assert not made.heights.any()
-
-
-def test_heights_of_a_scene_without_any():
-    made = jaxhf.Scene([jaxhf.Object(jaxhf.Cylinder())], CAMERA)
-    assert made.heightfields == ()
-    with pytest.raises(ValueError, match="Scene: there is no heightfield among its objects"):
-        _ = made.heights
-    with pytest.raises(ValueError, match="Scene: there is no heightfield among its objects"):
-        made.with_heights(GRID)
-
-
-SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
+    assert (changed.lights, changed.samples) == (given.lights, 4)
+    assert not given.heights.any()
+    without = jaxhf.Scene(objects[:1], CAMERA)
+    assert without.heightfields == ()
+    for asked in (lambda: without.heights, lambda: without.with_heights(GRID)):
+        with pytest.raises(ValueError, match="Scene: there is no heightfield among its objects"):
+            asked()
 
 
 def units(vectors):
@@ -427,52 +354,17 @@ def units(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("shape", [(5, 6), (2, 2)])
-def test_normals_of_a_plane(shape, scheme):
-    """They are the plane's, at the border as well."""
-    y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
-    plane = 3 * 0.5 * x - 2 * 0.25 * y + 1
-    normals = jaxhf.vertex_normals(jnp.asarray(plane), 0.5, 0.25, scheme)
-    expected = np.broadcast_to(np.array([-3, 2, 1]) / np.sqrt(14), (*shape, 3))
-    np.testing.assert_allclose(units(normals), expected, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("scheme", "normal"),
-    [
-        ("central", [-0.5, 0, 1]),
-        ("four", 2 * units([-1, 0, 1]) + [0, 0, 2]),
-        ("six", [-2, 1, 6]),
-        ("six-equal", units([-1, 1, 1]) + units([-1, 0, 1]) + [0, 0, 4]),
-        ("six-angle", 60 * units([-1, 1, 1]) + 90 * units([-1, 0, 1]) + [0, 0, 45 + 90 + 45 + 45]),
-    ],
-)
-def test_normals_by_hand(scheme, normal):
-    """The vertex in the middle of eight, of which only its eastern neighbour is higher, by 1."""
-    heights = jnp.asarray(np.array([[0, 0, 0], [0, 0, 1], [0, 0, 0.0]]))
-    np.testing.assert_allclose(units(jaxhf.vertex_normals(heights, 1.0, 1.0, scheme)[1, 1]), units(normal), atol=1e-15)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("hole", [NAN, INF, -INF])
-def test_holes_take_no_part_in_normals(hole, scheme):
-    y, x = np.mgrid[0:6, 0:7]
-    plane = 0.5 * x - 0.25 * y
-    plane[0, 0] = plane[2, 3] = plane[5, 4] = hole
-    normals = np.asarray(jaxhf.vertex_normals(jnp.asarray(plane), 1.0, 1.0, scheme))
-    assert np.isfinite(normals).all()
-    expected = np.broadcast_to(units([-0.5, 0.25, 1]), normals.shape)
-    present = np.isfinite(plane)
-    np.testing.assert_allclose(units(normals)[present], expected[present], atol=1e-15)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_vertex_alone_points_up(scheme):
-    heights = np.full((3, 3), NAN)
-    heights[1, 1] = 4
-    normals = jaxhf.vertex_normals(jnp.asarray(heights), 1.0, 1.0, scheme)
-    np.testing.assert_array_equal(normals, np.broadcast_to([0, 0, 1], (3, 3, 3)))
+@pytest.mark.parametrize("scheme", ["central", "four", "six", "six-angle", "six-equal"])
+def test_normals_at_vertices_are_the_oracles(scheme):
+    """In the middle and on the border, beside holes of every kind, at a vertex alone among them, and of the smallest field."""
+    heights = np.random.default_rng(3).uniform(0, 1, (9, 11)).astype(np.float32)
+    heights[0, 0], heights[2, 3], heights[4, 9] = NAN, INF, -INF
+    heights[5:8, 1:4][np.arange(9).reshape(3, 3) != 4] = NAN
+    for z in (heights, heights[7:, 6:8]):
+        found = jaxhf.vertex_normals(jnp.asarray(z), 0.5, 2.0, scheme)
+        expected, _ = oracle.vertex_normals(z, 0.5, 2.0, scheme)
+        np.testing.assert_allclose(units(found), units(expected), atol=1e-6)
+        assert np.isfinite(z).sum() in (4, 88)
 
 
 @pytest.mark.parametrize("shape", [(4, 61), (61, 4), (9, 30)])
@@ -490,14 +382,13 @@ def test_a_camera_above_sees_all_of_a_field(shape, size):
         assert (half - middle < half / pixels).all()
 
 
-@pytest.mark.parametrize("kind", [jaxhf.Perspective, jaxhf.Orthographic])
-def test_a_camera_takes_its_size_by_place(kind):
-    assert repr(kind(np.eye(4), 45.0, 8, 6)) == repr(kind(np.eye(4), 45.0, width=8, height=6))
+def test_a_camera_takes_its_size_by_place():
+    for kind in (jaxhf.Perspective, jaxhf.Orthographic):
+        assert repr(kind(np.eye(4), 45.0, 8, 6)) == repr(kind(np.eye(4), 45.0, width=8, height=6))
 
 
 def test_a_traced_up_looks_like_a_known_one():
-    """In single precision, any warning being an error: NumPy's numbers beside it are in double precision."""
+    """Any warning is an error: NumPy's numbers beside it are in double precision."""
     eye, target, up = (0.5, -1.0, 1.0), (0.5, 0.5, 0.0), (0.1, 0.0, 1.0)
-    with jax.enable_x64(False):
-        looking = jax.jit(lambda up: jaxhf.Perspective.look_at(eye, target, up).world_from_camera)(jnp.asarray(up))
+    looking = jax.jit(lambda up: jaxhf.Perspective.look_at(eye, target, up).world_from_camera)(jnp.asarray(up))
     np.testing.assert_allclose(looking, jaxhf.Perspective.look_at(eye, target, up).world_from_camera, atol=1e-6)

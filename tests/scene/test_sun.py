@@ -63,22 +63,14 @@ def test_light_by_date_and_place():
 
 @pytest.mark.parametrize(
     ("make", "message"),
-    [
-        (
-            lambda: jaxhf.sun(NOON.replace(tzinfo=None), 0, 0),
-            "sun: time must have a time zone, as 2026-06-21T12:00:00Z has, it",
-        ),
-        (lambda: jaxhf.sun("2026-06-21", 0, 0), "sun: time must be a datetime or datetime64, it is str"),
-        (lambda: jaxhf.sun(np.datetime64("NaT", "s"), 0, 0), "sun: time must be a time, it is NaT"),
-        (lambda: jaxhf.sun(NOON, 91, 0), "sun: latitude must lie between -90 and 90 degrees, it is 91"),
-        (lambda: jaxhf.sun(NOON, np.nan, 0), "sun: latitude must be finite, it is nan"),
-        (
-            lambda: jaxhf.Directional.at(NOON, 0, 180),
-            "Directional: time must be one at which the sun is up, its altitude is -66.",
-        ),
-        (lambda: jaxhf.Directional.at(NOON, [0, 1], 0), "Directional: time and place must be one of each, they make 2 lights"),
-    ],
-)
+    [(lambda: jaxhf.sun(NOON.replace(tzinfo=None), 0, 0), "sun: time must have a time zone, as 2026-06-21T12:00:00Z has, it"),
+     (lambda: jaxhf.sun("2026-06-21", 0, 0), "sun: time must be a datetime or datetime64, it is str"),
+     (lambda: jaxhf.sun(np.datetime64("NaT", "s"), 0, 0), "sun: time must be a time, it is NaT"),
+     (lambda: jaxhf.sun(NOON, 91, 0), "sun: latitude must lie between -90 and 90 degrees, it is 91"),
+     (lambda: jaxhf.sun(NOON, np.nan, 0), "sun: latitude must be finite, it is nan"),
+     (lambda: jaxhf.Directional.at(NOON, 0, 180), "Directional: time must be one at which the sun is up, its altitude is -6"),
+     (lambda: ANYTHING.Directional.at(NOON, [0, 1], 0), "Directional: time and place must be one of each, they make 2 lights")],
+)  # fmt: skip
 def test_what_is_refused(make, message):
     with pytest.raises(jaxhf.ArgumentError) as error:
         make()

@@ -1,26 +1,31 @@
 """Light on surfaces against closed forms: planes, walls, mirrors and a cylinder whose radiance can be written down by hand.
 
-All grids have 5 x 9 heights and cells of 1 x 1, so the ground is 0..8 by 0..4. Everything runs in float64; where no other
-reason is given, a tolerance of 1e-12 stands for the rounding of some hundred operations.
+Where nothing else is said, grids have 5 x 9 heights and cells of 1 x 1, so the ground is 0..8 by 0..4, and the tolerance
+stands for the rounding of some ten operations in float32.
 """
 
+import aimed
+import crossings
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import pytest
 
 import jaxhf
 from jaxhf.shade.lighting import rounded_clamp
 from jaxhf.shade.radiance import _reflect
 
-ROUNDING = 1e-12
+pytestmark = pytest.mark.unoptimised  # but for shadows, which are as users compile them
+OPTIMISED, DEEP = pytest.mark.unoptimised(False), pytest.mark.deep
+ROUNDING = 4e-6
 ALBEDO = np.array([0.2, 0.5, 0.8])
 RADIANCE = np.array([1.0, 2.0, 3.0])
 Y, X = np.mgrid[0:5, 0:9].astype(float)
 FLAT = np.zeros((5, 9))
 TILTED = 0.3 * X - 0.2 * Y
 TILTED_NORMAL = np.array([-0.3, 0.2, 1.0]) / np.sqrt(1.13)
-STEP = np.where(X < 3.5, 0.0, 1.0)  # a plain, a wall between x = 3 and x = 4, a plateau
+UP = np.array([0, 0, 1])
 
 
 def ground(heights, material=None, **placement):
@@ -71,25 +76,17 @@ def test_plane_under_directional_light(camera_side, light_side):
     np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), rtol=ROUNDING)
 
 
-@pytest.mark.parametrize(
-    ("azimuth", "altitude", "towards"),
-    [
-        (0, 0, (0, 1, 0)),
-        (90, 0, (1, 0, 0)),
-        (180, 0, (0, -1, 0)),
-        (123, 90, (0, 0, 1)),
-        (315, 45, (-0.5, 0.5, np.sqrt(0.5))),
-    ],
-)
-def test_directions_from_azimuth_and_altitude(azimuth, altitude, towards):
-    np.testing.assert_allclose(jaxhf.Directional.from_angles(azimuth, altitude).towards, towards, atol=1e-15)
-    traced = jax.jit(lambda a, h: jaxhf.Directional.from_angles(a, h).towards)(float(azimuth), float(altitude))
-    np.testing.assert_allclose(traced, towards, atol=1e-15)
-
-
-def test_default_light_is_that_of_maps():
-    light, default = jaxhf.Directional.from_angles(315, 45), jaxhf.Directional.from_angles()
-    np.testing.assert_array_equal(default.towards, light.towards)
+def test_directions_from_azimuth_and_altitude():
+    root = np.sqrt(0.5)
+    azimuth, altitude, *towards = np.array(
+        [(0, 0, 0, 1, 0), (90, 0, 1, 0, 0), (180, 0, 0, -1, 0), (123, 90, 0, 0, 1), (315, 45, -0.5, 0.5, root)]
+    ).T
+    made = [jaxhf.Directional.from_angles(*angles).towards for angles in zip(azimuth, altitude, strict=True)]
+    np.testing.assert_allclose(np.transpose(made), towards, atol=1e-15)
+    traced = jax.jit(jax.vmap(lambda a, h: jaxhf.Directional.from_angles(a, h).towards))(azimuth, altitude)
+    np.testing.assert_allclose(traced.T, towards, atol=1e-6)
+    default = jaxhf.Directional.from_angles()  # that of maps
+    np.testing.assert_array_equal(default.towards, made[-1])
     np.testing.assert_array_equal(default.irradiance, np.full(3, np.pi))
 
 
@@ -113,46 +110,84 @@ def test_sky(side):
     assert 0 < met.mean() < 1
 
 
+ROUGH = aimed.Ground(aimed.random_heights((17, 33), 2.0, seed=3))
+WALL = np.where(np.arange(33) < 3.5, 0.0, 1.0) * np.ones((17, 1))  # a plain, a wall between x = 3 and x = 4, a plateau
+
+
+def shadows(heights, camera, light):
+    """A picture of flat triangles, and where it is in shadow; one program for all lights of a kind."""
+    scene = jaxhf.Scene([ground(heights)], camera, [light])
+    image, aov = jaxhf.render(scene, jaxhf.Settings(shading="flat"), aovs=("shadow",))
+    return np.asarray(image), np.asarray(aov["shadow"])[..., 0]
+
+
 # The wall's upper edge is the line x = 4, z = 1. Seen from a light at slope 1/2, or from (6, *, 2), it lies over x = 2, z = 0.
 BEHIND_WALL = {"directional": jaxhf.Directional((1, 0, 0.5)), "point": jaxhf.Point((6, 2.5, 2), 10.0)}
 
 
-@pytest.mark.parametrize("extent", [3.97, 1e-2, 1e-9])
+@OPTIMISED
+@pytest.mark.parametrize("extent", [3.97, 1e-2, pytest.param(1e-9, marks=(pytest.mark.x64, DEEP))])
 @pytest.mark.parametrize("kind", BEHIND_WALL)
 def test_wall_casts_a_shadow(kind, extent):
     light = BEHIND_WALL[kind]
-    scene = jaxhf.Scene([ground(STEP)], vertical(2, 1.99, extent), [light])
-    image, aov = jaxhf.render(scene, aovs=("shadow",))
+    image, shadow = shadows(WALL, vertical(2, 1.99, extent), light)
     x, y = places(2, 1.99, extent)
     lit = x < 2
-    np.testing.assert_array_equal(aov["shadow"][:, :, 0], ~lit)
-    p, n = np.stack([x, y, 0 * x], -1), np.array([0, 0, 1])
+    np.testing.assert_array_equal(shadow, ~lit)
+    p = np.stack([x, y, 0 * x], -1)
     if isinstance(light, jaxhf.Point):
-        expected = ALBEDO / np.pi * from_point(p, n, np.asarray(light.p), np.asarray(light.intensity))
+        expected = ALBEDO / np.pi * from_point(p, UP, np.asarray(light.p), np.asarray(light.intensity))
     else:
         expected = np.broadcast_to(ALBEDO * np.sqrt(0.2), p.shape)
     np.testing.assert_allclose(image, np.where(lit[..., None], expected, 0), rtol=ROUNDING)
 
 
-@pytest.mark.parametrize(
-    "p",
-    [
-        (2.5, 2.0, 0.3),  # most rays to it would go on into the wall
-        (2.999, 2.0, 0.5),  # just before its foot
-        (0.5, 1.0, 3.0),  # above the plain
-    ],
-)
-def test_light_before_the_wall_is_not_blocked(p):
-    scene = jaxhf.Scene([ground(STEP)], vertical(1, 1.7, 1.9), [jaxhf.Point(p, 10.0)])
-    image, aov = jaxhf.render(scene, aovs=("shadow",))
-    assert not aov["shadow"].any()
+@OPTIMISED
+def test_light_before_the_wall_is_not_blocked():
+    """Where most rays to it would go on into the wall; just before the wall's foot; above the plain."""
     x, y = places(1, 1.7, 1.9)
-    expected = ALBEDO / np.pi * from_point(np.stack([x, y, 0 * x], -1), (0, 0, 1), np.array(p), 10.0)
-    np.testing.assert_allclose(image, expected, rtol=ROUNDING)
+    for p in ((2.5, 2.0, 0.3), (2.999, 2.0, 0.5), (0.5, 1.0, 3.0)):
+        image, shadow = shadows(WALL, vertical(1, 1.7, 1.9), jaxhf.Point(p, 10.0))
+        assert not shadow.any()
+        expected = ALBEDO / np.pi * from_point(np.stack([x, y, 0 * x], -1), UP, np.array(p), 10.0)
+        np.testing.assert_allclose(image, expected, rtol=ROUNDING)
+
+
+def hidden(p, d, before):
+    """Whether the terrain is above the line p + t d at a crossing of lines or diagonals before t."""
+    course = crossings.Course(ROUGH, p, d, 1e-9)
+    return crossings.has_changed_sides(course, np.ones(len(p), int), np.zeros(len(p)), np.full(len(p), before))
+
+
+@OPTIMISED
+@pytest.mark.parametrize("kind", [jaxhf.Directional, jaxhf.Point])
+def test_shadows_of_rough_terrain(kind):
+    """At each pixel by hand: the triangle below it, the light's cosine, and all that may stand in the light's way."""
+    at = np.array([-0.8, 0.3, 0.4]) if kind is jaxhf.Directional else np.array([13.0, 8.0, 3.0])
+    image, shadow = shadows(ROUGH.heights, vertical(16.03, 8.01, 15.7), kind(at, 1.0))
+    o = np.stack([*(values.ravel() for values in places(16.03, 8.01, 15.7)), np.full(256, 9.0)], axis=1)
+    below = oracle.cast(*ROUGH, o, np.tile(-UP, (256, 1))).place
+
+    def seen(at):
+        to = at - below.p if kind is jaxhf.Point else at + 0 * below.p
+        return to, hidden(below.p, to, 1 if kind is jaxhf.Point else np.inf)
+
+    (to, dark), lower, higher = (seen(at + dz * UP) for dz in (0, -1e-3, 1e-3))
+    distance = np.linalg.norm(to, axis=1)
+    cosine = (to * below.n).sum(1) / distance
+    facing, sure = cosine > 0.01, lower[1] == higher[1]
+    np.testing.assert_array_equal(shadow.ravel()[facing & sure], dark[facing & sure])
+    irradiance = np.where(dark | (cosine < 0), 0, cosine) / (distance**2 if kind is jaxhf.Point else 1)
+    sure &= facing | (cosine < -0.01)
+    expected = irradiance[sure, None] * ALBEDO / np.pi
+    np.testing.assert_allclose(image.reshape(256, 3)[sure], expected, rtol=1e-4, atol=1e-6)
+    assert min((dark & facing & sure).mean(), (~dark & facing).mean()) > 0.1
+    assert sure.mean() > 0.9
 
 
 @pytest.mark.parametrize("place", [(16, 16), (12, 20), (14.5, 18.25), (14.5, 18), (7.25, 21.5)])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@OPTIMISED
+@aimed.PRECISIONS
 def test_a_light_on_the_ground_is_not_behind_it(place, dtype):
     """In a bowl it lights all but the triangles that it stands on, whose planes it is in; just below the ground, nothing."""
     y, x = np.mgrid[:33, :33] - 16
@@ -200,38 +235,35 @@ def texture_by_hand(texels, u, v, wrap="repeat"):
     return np.einsum("...i,...j,ijc->...c", tents(v, texels.shape[0]), tents(u, texels.shape[1]), texels)
 
 
+TEXELS = 2e-5  # a place in the texture is rounded where it is 7 times its size
+
+
 def test_texture_lookup():
-    texels = np.random.default_rng(0).uniform(size=(3, 4, 3))
+    texels = np.random.default_rng(0).uniform(0.1, 1, (3, 4, 3))
     lookup = jax.vmap(jaxhf.ImageTexture(texels))
     rows, columns = np.mgrid[0:3, 0:4]
     centres = np.stack([(columns + 0.5) / 4, (rows + 0.5) / 3], -1).reshape(-1, 2)  # row 0 is v = 0, u runs along it
-    np.testing.assert_allclose(lookup(jnp.asarray(centres)), texels.reshape(-1, 3), rtol=ROUNDING)
-    np.testing.assert_allclose(lookup(jnp.asarray(centres + np.array([5, -7]))), texels.reshape(-1, 3), rtol=ROUNDING)
+    for moved in ((0, 0), (5, -7)):
+        np.testing.assert_allclose(lookup(jnp.asarray(centres + moved)), texels.reshape(-1, 3), rtol=TEXELS)
     corner = lookup(jnp.zeros((1, 2)))[0]  # between the four corners of the image, as it repeats
-    np.testing.assert_allclose(corner, texels[[0, 0, -1, -1], [0, -1, 0, -1]].mean(0), rtol=ROUNDING)
+    np.testing.assert_allclose(corner, texels[[0, 0, -1, -1], [0, -1, 0, -1]].mean(0), rtol=TEXELS)
     uv = np.random.default_rng(1).uniform(-2, 2, (200, 2))
-    np.testing.assert_allclose(lookup(jnp.asarray(uv)), texture_by_hand(texels, uv[:, 0], uv[:, 1]), rtol=ROUNDING)
+    np.testing.assert_allclose(lookup(jnp.asarray(uv)), texture_by_hand(texels, uv[:, 0], uv[:, 1]), rtol=TEXELS)
+    # One that is clamped ends with its outermost texels; many places are on the border, and in its corners.
+    uv[:100] = uv[:100].clip(0, 1)
+    for shape in ((3, 4, 3), (1, 1, 3), (1, 5, 3)):
+        texels = np.random.default_rng(0).uniform(0.1, 1, shape)
+        found = jax.vmap(jaxhf.ImageTexture(texels, wrap="clamp"))(jnp.asarray(uv))
+        np.testing.assert_allclose(found, texture_by_hand(texels, uv[:, 0], uv[:, 1], "clamp"), rtol=TEXELS)
 
 
-@pytest.mark.parametrize("shape", [(3, 4, 3), (1, 1, 3), (1, 5, 3)])
-def test_a_clamped_texture_ends_with_its_outermost_texels(shape):
-    texels = np.random.default_rng(0).uniform(size=shape)
-    uv = np.random.default_rng(1).uniform(-1, 2, (200, 2))
-    uv[:100] = uv[:100].clip(0, 1)  # many of them on the border, and in its corners
-    lookup = jax.vmap(jaxhf.ImageTexture(texels, wrap="clamp"))
-    np.testing.assert_allclose(lookup(jnp.asarray(uv)), texture_by_hand(texels, uv[:, 0], uv[:, 1], "clamp"), rtol=ROUNDING)
-
-
-@pytest.mark.parametrize("wrap", ["repeat", "clamp"])
+@pytest.mark.parametrize("wrap", ["repeat", pytest.param("clamp", marks=DEEP)])
 def test_texture_lies_on_the_ground(wrap):
     texels = np.random.default_rng(2).uniform(size=(4, 6, 3))
-    scene = jaxhf.Scene(
-        [ground(FLAT, jaxhf.Matte(jaxhf.ImageTexture(texels, wrap=wrap)))],
-        vertical(4, 2, 4, width=32),
-        [jaxhf.Directional((0, 0, 1), np.pi)],
-    )
+    textured = ground(FLAT, jaxhf.Matte(jaxhf.ImageTexture(texels, wrap=wrap)))
+    scene = jaxhf.Scene([textured], vertical(4, 2, 4, width=32), [jaxhf.Directional(UP, np.pi)])
     x, y = places(4, 2, 4, width=32)
-    np.testing.assert_allclose(jaxhf.render(scene), texture_by_hand(texels, x / 8, y / 4, wrap), rtol=ROUNDING)
+    np.testing.assert_allclose(jaxhf.render(scene), texture_by_hand(texels, x / 8, y / 4, wrap), rtol=TEXELS)
 
 
 def test_inside_a_textured_cylinder():
@@ -251,7 +283,7 @@ def test_inside_a_textured_cylinder():
     expected = texture_by_hand(texels, u, v) / np.pi * from_point(p, n, light, RADIANCE)
     np.testing.assert_array_equal(aov["status"], np.where(met, jaxhf.Status.HIT, jaxhf.Status.MISS))
     np.testing.assert_allclose(aov["uv"], np.where(met[..., None], np.stack([u, v], -1), 0), rtol=ROUNDING, atol=ROUNDING)
-    np.testing.assert_allclose(image, np.where(met[..., None], expected, 0), rtol=1e-11)  # rounding of u, times the texels
+    np.testing.assert_allclose(image, np.where(met[..., None], expected, 0), rtol=1e-4)  # rounding of u, times the texels
     assert 0.5 < met.mean() < 1
     assert u[met].min() < 0.1
     assert u[met].max() > 0.9
@@ -262,19 +294,17 @@ LOWER, UPPER = np.array([0.9, 0.8, 0.5]), np.array([0.7, 0.6, 0.3])
 
 def parallel_mirrors(camera):
     """Two horizontal mirrors, at z = 0 and z = 1, that face each other."""
-    return jaxhf.Scene(
-        [ground(FLAT, jaxhf.Mirror(LOWER)), ground(FLAT + 1, jaxhf.Mirror(UPPER))], camera, [jaxhf.Sky(RADIANCE)]
-    )
+    mirrors = [ground(FLAT, jaxhf.Mirror(LOWER)), ground(FLAT + 1, jaxhf.Mirror(UPPER))]
+    return jaxhf.Scene(mirrors, camera, [jaxhf.Sky(RADIANCE)])
 
 
-@pytest.mark.parametrize(("z", "reflectance"), [(2.0, UPPER), (-1.0, LOWER)])
-def test_mirror_under_the_sky(z, reflectance):
-    camera, _ = perspective((4, 1, z), (4, 2, 0.5))
-    image = jaxhf.render(parallel_mirrors(camera))
-    np.testing.assert_allclose(image, np.broadcast_to(reflectance * RADIANCE, image.shape), rtol=ROUNDING)
+def test_mirror_under_the_sky():
+    for z, reflectance in ((2.0, UPPER), (-1.0, LOWER)):
+        image = jaxhf.render(parallel_mirrors(perspective((4, 1, z), (4, 2, 0.5))[0]))
+        np.testing.assert_allclose(image, np.broadcast_to(reflectance * RADIANCE, image.shape), rtol=ROUNDING)
 
 
-@pytest.mark.parametrize("max_depth", [0, 1, 4])
+@pytest.mark.parametrize("max_depth", [pytest.param(0, marks=DEEP), pytest.param(1, marks=DEEP), 4])
 def test_max_depth_ends_what_parallel_mirrors_reflect(max_depth):
     eye = np.array([0.1, 2.0, 0.5])
     camera, d = perspective(eye, (3.0, 2.1, 0.4), fov=80)
@@ -306,31 +336,40 @@ def test_mirror_shows_a_wall():
     np.testing.assert_allclose(image, expected, rtol=ROUNDING)
 
 
+def rough_from_a_light():
+    """Steep terrain, seen from where its light is; the eye, and the rays' directions."""
+    heights, eye = np.random.default_rng(4).normal(0, 1.5, (5, 5)), np.array([-1.0, -2.0, 4.0])
+    camera, d = perspective(eye, (2, 2, 0), fov=50, size=32)
+    return jaxhf.Scene([ground(heights, jaxhf.Matte(1.0))], camera, [jaxhf.Point(eye, 20.0)]), eye, d
+
+
 def test_a_shading_normal_has_a_dark_side():
     """By hand at every pixel, with a light at the eye: also where the triangle faces it, its normals do not."""
-    heights = np.random.default_rng(4).normal(0, 1.5, (5, 5))
-    eye = np.array([-1.0, -2.0, 4.0])
-    camera, d = perspective(eye, (2, 2, 0), fov=50, size=32)
-    scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights, dx=1.0), jaxhf.Matte(1.0))], camera, [jaxhf.Point(eye, 20.0)])
+    scene, eye, d = rough_from_a_light()
     image, aov = jaxhf.render(scene, aovs=("normal", "status", "depth"))
-    _, flat = jaxhf.render(scene, jaxhf.Settings(shading="flat", shadows=False), aovs=("normal",))
     met = np.asarray(aov["status"]) == jaxhf.Status.HIT
-    n, ns = np.asarray(flat["normal"]), np.asarray(aov["normal"])
+    rays = np.broadcast_to(eye, d.shape).reshape(-1, 3), d.reshape(-1, 3)
+    n = oracle.cast(np.asarray(scene.heights, float), 1, 1, 0, 0, *rays).place.n.reshape(d.shape)
     side = -np.sign((n * d).sum(-1))
-    cosine = side * (ns * -d).sum(-1)
+    cosine = side * (np.asarray(aov["normal"]) * -d).sum(-1)
     rounded = np.where(abs(cosine) < 0.01, 25 * (cosine + 0.01) ** 2, np.maximum(cosine, 0))
     with np.errstate(divide="ignore"):
         expected = np.where(met, 20 / np.pi / np.asarray(aov["depth"]) ** 2 * rounded, 0)
-    np.testing.assert_allclose(np.asarray(image), np.broadcast_to(expected[..., None], image.shape), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(image, np.broadcast_to(expected[..., None], image.shape), rtol=1e-4, atol=1e-5)
     assert (met & (cosine < -0.01)).sum() > 10
     assert (side[met] < 0).sum() > 10
-    tangent = np.random.default_rng(5).normal(size=heights.shape)
-    _, change = jax.jvp(lambda heights: jaxhf.render(scene.with_heights(heights)), (scene.heights,), (jnp.asarray(tangent),))
+
+
+@DEEP
+def test_a_dark_side_has_a_finite_derivative():
+    scene, _, _ = rough_from_a_light()
+    tangent = np.random.default_rng(5).normal(size=scene.heights.shape).astype(np.float32)
+    _, change = jax.jvp(lambda z: jaxhf.render(scene.with_heights(z)), (jnp.asarray(scene.heights),), (jnp.asarray(tangent),))
     assert np.isfinite(change).all()
 
 
 @pytest.mark.parametrize(
-    ("side", "make"), [(1, jaxhf.Directional), (-1, jaxhf.Directional), (1, jaxhf.Sun)], ids=["above", "below", "sun"]
+    ("side", "make"), [(1, jaxhf.Directional), (-1, jaxhf.Directional), pytest.param(1, jaxhf.Sun, marks=DEEP)]
 )
 def test_coarse_cells_are_dark_beyond_the_terminator(side, make):
     """Across a round hill radiance falls to zero, and stays there: triangles that still face the light are no bright rim."""
@@ -341,24 +380,18 @@ def test_coarse_cells_are_dark_beyond_the_terminator(side, make):
     image = jaxhf.render(jaxhf.Scene([ground(hill, jaxhf.Matte(1.0), dx=1 / 32)], camera, [light]), jaxhf.Settings(samples=16))
     row = np.asarray(image)[1, ::side, 0]
     assert row[60] > 0.1
-    assert np.diff(row[64:]).max() < 1e-9
+    assert np.diff(row[64:]).max() < 1e-7
     assert row[72] == 0
 
 
 def test_rounded_clamp():
     """max(x, 0) but for |x| < 0.01; there the parabola that continues it in value and in slope, 0.0025 at zero."""
-    slope = jax.vmap(jax.grad(rounded_clamp))
-    x = np.concatenate([np.linspace(-1, 1, 2000), np.linspace(-0.02, 0.02, 2001)])
-    value = np.asarray(jax.vmap(rounded_clamp)(jnp.asarray(x)))
-    beyond = np.abs(x) > 0.01
-    np.testing.assert_array_equal(value[beyond], np.maximum(x, 0)[beyond])
-    np.testing.assert_allclose(value[~beyond], (25 * (x + 0.01) ** 2)[~beyond], rtol=1e-13, atol=1e-30)
-    np.testing.assert_array_equal(slope(jnp.asarray(x[beyond])), x[beyond] > 0)
-    np.testing.assert_allclose(slope(jnp.asarray(x[~beyond])), 50 * (x + 0.01)[~beyond], atol=1e-13)
-    for end, there in ((-0.01, 0.0), (0.01, 1.0)):
-        near = jnp.asarray(end + np.array([-1e-12, 0, 1e-12]))
-        np.testing.assert_allclose(jax.vmap(rounded_clamp)(near), there * 0.01, atol=2e-12)
-        np.testing.assert_allclose(slope(near), there, atol=2e-10)
+    x = np.concatenate([np.linspace(-1, 1, 2000), np.linspace(-0.02, 0.02, 2001)]).astype(np.float32).astype(np.float64)
+    value, slope = (np.asarray(values) for values in jax.vmap(jax.value_and_grad(rounded_clamp))(jnp.asarray(x)))
+    within = np.abs(x) < 0.01
+    np.testing.assert_allclose(value, np.where(within, 25 * (x + 0.01) ** 2, np.maximum(x, 0)), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(slope, np.where(within, 50 * (x + 0.01), x > 0), atol=1e-6)
+    assert value[np.abs(x) > 0.0101].tolist() == np.maximum(x, 0)[np.abs(x) > 0.0101].tolist()
 
 
 def test_mirrored_ray_never_enters_its_triangle():
@@ -372,6 +405,7 @@ def test_mirrored_ray_never_enters_its_triangle():
     d[:100] = np.cross(n[:100], ns[:100])  # grazing
     ns[100:5000] = n[100:5000] + 0.1 * ns[100:5000]  # as most are: near the triangle's own
     ns /= np.linalg.norm(ns, axis=1)[:, None]
+    d, n, ns = (v.astype(np.float32).astype(np.float64) for v in (d, n, ns))
     side = np.where((d * n).sum(1) < 0, 1, -1)
     zero, whole = jnp.zeros(3), jnp.zeros((), jnp.int32)
 
@@ -384,7 +418,7 @@ def test_mirrored_ray_never_enters_its_triangle():
         )  # fmt: skip
         return _reflect(d, hit)
 
-    out = np.asarray(reflected(jnp.asarray(d), jnp.asarray(n), jnp.asarray(ns), jnp.asarray(side)))
+    out = np.asarray(reflected(*map(jnp.asarray, (d, n, ns, side))), np.float64)
     height = side * (out * n).sum(1)
     assert height.min() > 0
     np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1, rtol=ROUNDING)

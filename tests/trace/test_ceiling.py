@@ -18,7 +18,7 @@ from jaxhf.trace.ceiling import clears, make_ceiling
 from jaxhf.trace.grid import make_grid
 from jaxhf.trace.intersect import blocked, intersect
 
-COUNT = 4096
+COUNT = 2048
 UPRIGHT = np.eye(4)
 TILTED = np.array([[0.8, 0.3, 0.2, 5.0], [-0.3, 0.9, 0.1, -3.0], [0.1, -0.4, 1.1, 2.0], [0, 0, 0, 1]])
 ALTITUDES = (-20.0, 0.0, 3.0, 12.0, 35.0, 60.0, 90.0)
@@ -78,12 +78,12 @@ HEIGHTS = {
 }
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@aimed.PRECISIONS
 def test_no_walk_is_spared_that_meets_something(dtype):
     """High and low suns and those below the horizon, along the axes, along diagonals and between."""
     shares = {}
     for name, heights in HEIGHTS.items():
-        for scale in (1e-6, 1.0, 1e6):
+        for scale in (1e-6, 1.0, 1e6) if name in ("rough", "mild") else (1.0,):
             shares[name, scale] = spared(heights * scale, dtype)
         spared(np.where(heights > np.quantile(heights, 0.97), np.nan, heights), dtype)
         spared(heights, dtype, TILTED)
@@ -95,6 +95,7 @@ def test_no_walk_is_spared_that_meets_something(dtype):
     assert np.all(shares["rough", 1e6][4] < 0.5)
 
 
+@pytest.mark.deep
 def test_a_square_terrain_of_many_cells():
     share = spared(fractal([300, 300], seed=5, exponent=2.2, range=(0.0, 0.25)), np.float32, dx=1 / 299, dy=1 / 299)
     assert np.all(share[3:6].mean(1) > (0.3, 0.8, 0.95))

@@ -66,12 +66,13 @@ def assert_none(wrong: np.ndarray, ground: aimed.Ground, o: np.ndarray, d: np.nd
     )
 
 
-def test_no_leak():
-    """Among 2e5 rays and more."""
-    known = np.array([[check(terrain(shape, scale, seed=1), seed=2) for scale in SCALES] for shape in SHAPES])
-    assert known.sum() > 200_000
+@pytest.mark.parametrize("shapes", [SHAPES[:-1], pytest.param(SHAPES[-1:], marks=pytest.mark.deep)], ids=["small", "large"])
+def test_no_leak(shapes):
+    """Among 1e5 rays and more on small grids, and as many as fit on a large one."""
+    known = np.array([[check(terrain(shape, scale, seed=1), seed=2) for scale in SCALES] for shape in shapes])
+    assert known.sum() > (100_000 if len(shapes) > 1 else 40_000)
     # The smallest grids have no vertex or edge but those of the border, where nothing is sure.
-    assert known[SHAPES.index((33, 17))].min() > PER_FAMILY / 3
+    assert known[-1].min() > PER_FAMILY / 3
 
 
 @pytest.mark.slow

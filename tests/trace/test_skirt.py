@@ -25,20 +25,13 @@ def triangles() -> np.ndarray:
     """Of walls and floor, (n, 3, 3), in the object's frame."""
     z, (ny, nx) = HEIGHTS.astype(float), HEIGHTS.shape
     x, y = 1.5 * np.arange(nx), 2.0 * np.arange(ny)
-    sides = [
-        (x, np.zeros(nx), z[0]),
-        (x, np.full(nx, y[-1]), z[-1]),
-        (np.zeros(ny), y, z[:, 0]),
-        (np.full(ny, x[-1]), y, z[:, -1]),
-    ]
     found = []
-    for a, b, top in sides:
-        high, low = np.stack([a, b, top], 1), np.stack([a, b, np.full(len(a), BASE)], 1)
+    for a, b, top in ((x, 0 * x, z[0]), (x, 0 * x + y[-1], z[-1]), (0 * y, y, z[:, 0]), (0 * y + x[-1], y, z[:, -1])):
+        high, low = np.stack([a, b, top], 1), np.stack([a, b, 0 * a + BASE], 1)
         for k in range(len(a) - 1):
             found += [(low[k], low[k + 1], high[k + 1]), (low[k], high[k + 1], high[k])]
-    corners = [np.array([px, py, BASE]) for px, py in ((0, 0), (x[-1], 0), (x[-1], y[-1]), (0, y[-1]))]
-    found += [(corners[0], corners[1], corners[2]), (corners[0], corners[2], corners[3])]
-    return np.array(found)
+    corners = [(px, py, BASE) for px, py in ((0, 0), (x[-1], 0), (x[-1], y[-1]), (0, y[-1]))]
+    return np.array([*found, corners[:3], [corners[0], *corners[2:]]])
 
 
 def nearest(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,6 +49,12 @@ def nearest(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return t.min(1), (np.abs(inside) > 1e-4).all(1)
 
 
+def cast_turned(skirt: jaxhf.Skirt, o: np.ndarray, d: np.ndarray):
+    """Rays in the frame of a skirt that is turned, padded to 3000, as any other number would be compiled anew."""
+    o, d = (np.concatenate([v, np.tile(v[:1], (3000 - len(v), 1))]) @ TURN[:3, :3].T for v in (o, d))
+    return cast(scene(jaxhf.Object(skirt, world_from_object=TURN)), o + TURN[:3, 3], d)
+
+
 def cast(seen: jaxhf.Scene, o: np.ndarray, d: np.ndarray):
     return _cast(*jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (localise(seen), o, d)))
 
@@ -69,9 +68,7 @@ def _cast(seen: jaxhf.Scene, o: jax.Array, d: jax.Array):
 def test_walls_stand_where_their_triangles_do():
     o = RNG.uniform((-6, -6, -5), (18, 16, 6), (3000, 3))
     d = RNG.uniform((0, 0, -1), (12, 10, 2), (3000, 3)) - o
-    skirt = jaxhf.Skirt.of(FIELD, BASE)
-    seen = scene(jaxhf.Object(skirt, world_from_object=TURN))
-    hit = cast(seen, o @ TURN[:3, :3].T + TURN[:3, 3], d @ TURN[:3, :3].T)
+    hit = cast_turned(jaxhf.Skirt.of(FIELD, BASE), o, d)
     t, clear = nearest(o, d)
     assert clear.mean() > 0.95
     np.testing.assert_allclose(
@@ -110,10 +107,9 @@ def test_a_terrain_with_walls_is_closed():
 def test_a_hole_in_the_border_leaves_no_wall():
     z = HEIGHTS.copy()
     z[0, 4] = np.nan
-    seen = scene(jaxhf.Object(jaxhf.Skirt.of(jaxhf.Heightfield(z, 1.5, 2.0), BASE)))
-    x = np.array([1.0, 5.0, 7.0, 11.0])
-    hit = cast(seen, np.stack([x, np.full(4, -3.0), np.full(4, -0.5)], 1), np.tile([0.0, 1.0, 0.0], (4, 1)))
-    np.testing.assert_allclose(hit.t, [3, 13, 13, 3], rtol=3e-6)
+    o = np.array([[x, -3.0, -0.5] for x in (1.0, 5.0, 7.0, 11.0)])
+    hit = cast_turned(jaxhf.Skirt.of(jaxhf.Heightfield(z, 1.5, 2.0), BASE), o, np.tile([0.0, 1.0, 0.0], (4, 1)))
+    np.testing.assert_allclose(hit.t[:4], [3, 13, 13, 3], rtol=3e-6)
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ ARGUMENTS = jnp.linspace(0.3, 1, 8), jnp.asarray(1.7), jnp.linspace(2, 5, 20), j
 
 
 @pytest.mark.parametrize("called", [one_kernel, in_turn])
-@pytest.mark.parametrize("moving", [(0,), (0, 1, 2), (2,)])
+@pytest.mark.parametrize("moving", [(0, 1, 2), *(pytest.param(only, marks=pytest.mark.deep) for only in ((0,), (2,)))])
 def test_derivatives_are_those_of_the_function(called, moving):
     def of(fun):
         def value(*moved):
@@ -137,19 +137,18 @@ def scenes() -> dict[str, tuple[jaxhf.Scene, jaxhf.Settings]]:
     """One with each part of a scene that a tile may trace."""
     field = jaxhf.Heightfield(np.random.default_rng(0).uniform(0, 0.1, (1024, 5)).astype(np.float32), 1.0)
     camera = jaxhf.Perspective.look_at((2, -500, 900), (2, 500, 0), width=40, height=40)
-    terrain, lights = jaxhf.Object(field), [jaxhf.Directional((1, 2, 3)), jaxhf.Sky(0.5)]
-    pictures = np.full((64, 64, 3), 0.5, np.float32)
-    objects = {
-        "skirt": [terrain, jaxhf.Object(jaxhf.Skirt.of(field, -1.0))],
-        "cylinder": [terrain, jaxhf.Object(jaxhf.Cylinder(1.0), jaxhf.Mirror(0.5))],
-        "texture": [jaxhf.Object(field, jaxhf.Matte(jaxhf.ImageTexture(pictures)))],
-        "two": [terrain, jaxhf.Object(field, jaxhf.Mirror(0.5), np.diag([2.0, 2, 2, 1]))],
-    }
-    lit = {
-        "plain": lights,
-        "point": [jaxhf.Point((2, 500, 9), 1e3)],
-        "sun": [jaxhf.Sun((1, 2, 3))],
-        "hidden sky": [jaxhf.Sky(0.5, occlusion=8)],
+    terrain = jaxhf.Object(field)
+    usual = [terrain], [jaxhf.Directional((1, 2, 3)), jaxhf.Sky(0.5)]
+    texture = jaxhf.ImageTexture(np.full((64, 64, 3), 0.5, np.float32))
+    parts = {
+        "plain": usual,
+        "skirt": ([terrain, jaxhf.Object(jaxhf.Skirt.of(field, -1.0))], usual[1]),
+        "cylinder": ([terrain, jaxhf.Object(jaxhf.Cylinder(1.0), jaxhf.Mirror(0.5))], usual[1]),
+        "texture": ([jaxhf.Object(field, jaxhf.Matte(texture))], usual[1]),
+        "two": ([terrain, jaxhf.Object(field, jaxhf.Mirror(0.5), np.diag([2.0, 2, 2, 1]))], usual[1]),
+        "point": ([terrain], [jaxhf.Point((2, 500, 9), 1e3)]),
+        "sun": ([terrain], [jaxhf.Sun((1, 2, 3))]),
+        "hidden sky": ([terrain], [jaxhf.Sky(0.5, occlusion=8)]),
     }
     knobs = {
         "samples": jaxhf.Settings(samples=4),
@@ -157,14 +156,14 @@ def scenes() -> dict[str, tuple[jaxhf.Scene, jaxhf.Settings]]:
         "whole loops": jaxhf.Settings(early_exit=False),
         "large tiles": jaxhf.Settings(chunk=16384),
     }
-    return (
-        {name: (jaxhf.Scene(kind, camera, lights), jaxhf.Settings()) for name, kind in objects.items()}
-        | {name: (jaxhf.Scene([terrain], camera, kind), jaxhf.Settings()) for name, kind in lit.items()}
-        | {name: (jaxhf.Scene([terrain], camera, lights), settings) for name, settings in knobs.items()}
-    )
+    made = {name: (jaxhf.Scene(objects, camera, lights), jaxhf.Settings()) for name, (objects, lights) in parts.items()}
+    return made | {name: (made["plain"][0], settings) for name, settings in knobs.items()}
 
 
-@pytest.mark.parametrize("name", scenes())
+FAST = ("two", "sun")
+
+
+@pytest.mark.parametrize("name", [name if name in FAST else pytest.param(name, marks=pytest.mark.deep) for name in scenes()])
 def test_tiles_of_every_scene_are_kernels(name):
     """In pictures, and as the value within a gradient. Else frames take twice the time, and nobody notices."""
     scene, settings = scenes()[name]

@@ -22,27 +22,25 @@ def scene(heights) -> jaxhf.Scene:
     return jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera, [jaxhf.Directional((1, 0, 0.4))])
 
 
-def outcomes() -> dict[str, Any]:
-    """A picture, derivatives with points on edges both ways, rays, and a fit."""
+def outcomes(every: bool) -> dict[str, Any]:
+    """A picture and rays; if `every`, also derivatives with points on edges both ways, a batch, and a fit."""
     heights, up = jnp.asarray(HEIGHTS), np.array([0.1, 0.2, 1], np.float32)
 
     def picture(heights):
         return jaxhf.render(scene(heights), EDGES)
 
-    def loss(heights):
-        return (picture(heights) ** 2).sum()
-
-    image, tangent = jax.jvp(picture, (heights,), (heights**2,))
     places = np.random.default_rng(1).random((20, 2), np.float32)
     hits = jaxhf.cast(scene(heights).heightfields[0], np.c_[places, np.ones((20, 1), np.float32)], -up)
-    known = scene(0.9 * HEIGHTS)
-    target = np.asarray(jaxhf.render(scene(HEIGHTS)))
+    found = {"t": jnp.where(hits.t < 9, hits.t, 0), "normals": hits.ns, "image": jaxhf.render(scene(heights))}
+    if not every:
+        return found
+    known, target = scene(0.9 * HEIGHTS), np.asarray(jaxhf.render(scene(HEIGHTS)))
     fitted = jaxhf.fit([known], [target], noise=0.01, prior=known.heights, prior_std=0.02, max_steps=3)
     both = jax.vmap(lambda heights: jaxhf.render(scene(heights)))(jnp.stack([heights, 2 * heights]))
-    return {
-        "image": image, "tangent": tangent, "gradient": jax.grad(loss)(heights), "within": jax.jit(picture)(heights),
-        "both": both, "t": jnp.where(hits.t < 9, hits.t, 0), "normals": hits.ns, "fitted": fitted.heights,
-    }  # fmt: skip
+    _, tangent = jax.jvp(picture, (heights,), (heights**2,))
+    gradient = jax.grad(lambda heights: (picture(heights) ** 2).sum())(heights)
+    more = {"tangent": tangent, "gradient": gradient, "both": both, "fitted": fitted.heights}
+    return {**found, **more, "within": jax.jit(picture)(heights)}
 
 
 def in_another_process(script: str, *arguments: str, **environment: str) -> str:
@@ -53,18 +51,21 @@ def in_another_process(script: str, *arguments: str, **environment: str) -> str:
     return done.stderr
 
 
-def test_plain_mode_gives_the_same(tmp_path):
-    script = (
-        "import jax, numpy as np, sys, test_plain\n"
-        "np.savez(sys.argv[1], **test_plain.outcomes())\n"
-        "gradient = jax.grad(lambda heights: test_plain.jaxhf.render(test_plain.scene(heights)).sum())\n"
-        "text = jax.jit(gradient).lower(test_plain.HEIGHTS).as_text()\n"
-        "plain = [test_plain.jaxhf.compiler_options() is None, 'small_call' not in text, 'inlineable' not in text]\n"
-        "assert plain == [len(sys.argv) == 3] * 3, plain\n"
-    )
-    assert not in_another_process(script, str(tmp_path / "usual.npz"))
-    assert not in_another_process(script, str(tmp_path / "plain.npz"), "plain", JAXHF_PLAIN="1")
-    usual, plain = np.load(tmp_path / "usual.npz"), np.load(tmp_path / "plain.npz")
+def is_plain(every: bool) -> bool:
+    def total(heights):
+        return jaxhf.render(scene(heights)).sum()
+
+    text = jax.jit(jax.grad(total) if every else total).lower(HEIGHTS).as_text()
+    (answer,) = {jaxhf.compiler_options() is None, "small_call" not in text, *(["inlineable" not in text] if every else [])}
+    return answer
+
+
+@pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.deep)])
+def test_plain_mode_gives_the_same(every, tmp_path):
+    script = f"import numpy, sys, test_plain as t; numpy.savez(sys.argv[1], **t.outcomes({every})); assert t.is_plain({every})"
+    assert not in_another_process(script, str(tmp_path / "plain.npz"), JAXHF_PLAIN="1")
+    assert not is_plain(every)
+    usual, plain = outcomes(every), np.load(tmp_path / "plain.npz")
     for name in plain.files:
         size = np.abs(plain[name]).max()
         assert size > 0
@@ -80,7 +81,7 @@ BREAKS = {
 }
 
 
-@pytest.mark.parametrize("name", BREAKS)
+@pytest.mark.parametrize("name", ["a lowering", *(pytest.param(n, marks=pytest.mark.deep) for n in ("an import", "a rule"))])
 def test_what_jax_does_not_take_is_done_without(name):
     """With one warning, which names the version."""
     script = (

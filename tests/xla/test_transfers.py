@@ -23,7 +23,10 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("name", CALLS)
+FURTHER = ("prepare", "cast into what is prepared")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.deep) if name in FURTHER else name for name in CALLS])
 def test_numbers_that_are_given_are_no_mistake(name):
     with jax.transfer_guard("disallow"):
         guarded = CALLS[name]()
