@@ -1,7 +1,6 @@
 """A fit that is cut short goes on from its checkpoint, to the same bits."""
 
 import contextlib
-import inspect
 import signal
 import subprocess
 import sys
@@ -13,11 +12,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_fits import fit_options
 
 import jaxhf
 from jaxhf.fitting import fit as _fit, known as _known, loop as _loop
 from jaxhf.fitting.fingerprint import fingerprint as fit_fingerprint
-from jaxhf.fitting.options import FitOptions
 from jaxhf.fitting.problem import make_problem
 from jaxhf.fitting.solvers import Outcome
 
@@ -52,7 +51,14 @@ def agree(found: jaxhf.Fit, whole: jaxhf.Fit) -> None:
     assert [step._replace(seconds=0.0) for step in found.history] == [step._replace(seconds=0.0) for step in whole.history]
 
 
-@pytest.mark.parametrize("last", [1, 4, 7])
+def resumed(path: Path, whole: jaxhf.Fit, **options) -> list[jaxhf.Step]:
+    """The steps that are taken once more, after which all is as if nothing had happened."""
+    again = []
+    agree(jaxhf.fit(*problem(), **{**OPTIONS, **options}, checkpoint=path, resume=True, progress=again.append), whole)
+    return again
+
+
+@pytest.mark.parametrize("last", [4, *(pytest.param(step, marks=pytest.mark.deep) for step in (1, 7))])
 def test_after_ctrl_c_it_goes_on_to_the_same_bits(tmp_path, whole, last):
     def interrupt(step: Any) -> None:
         if step.step == last:
@@ -61,9 +67,7 @@ def test_after_ctrl_c_it_goes_on_to_the_same_bits(tmp_path, whole, last):
     path = tmp_path / "fit.checkpoint"
     with pytest.raises(KeyboardInterrupt):
         jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, progress=interrupt)
-    again = []
-    agree(jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True, progress=again.append), whole)
-    assert again[0].step == last + 1
+    assert resumed(path, whole)[0].step == last + 1
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
@@ -95,58 +99,43 @@ def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
             yield
 
 
+# Which function is interrupted in which of its calls, whether its result is being waited for, and the step that comes next.
+CTRL_C = [
+    ("pictures_and_influence", 1, False, 1),  # before the first level
+    ("advance", 1, True, 1),
+    ("save_checkpoint", 1, False, 3),
+    ("advance", 5, True, 5),
+    ("pictures_and_influence", 11, False, 10),  # the first of those that measure the loss's curvature, as the level changes
+    ("reset_state", 3, False, 19),
+]
+MORE = [
+    ("init_state", 1, False, 1), ("advance", 1, False, 1), ("advance", 2, True, 2), ("pictures_and_influence", 10, False, 10),
+    ("reset_state", 2, False, 10), ("pictures_and_influence", 19, False, 19),
+]  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    ("name", "call", "waiting", "kept"),
-    [
-        ("init_state", 1, False, False),
-        ("pictures_and_influence", 1, False, False),  # before the first level
-        ("advance", 1, False, True),
-        ("advance", 1, True, True),
-        ("save_checkpoint", 1, False, True),
-    ],
+    ("name", "call", "waiting", "step"), [*CTRL_C, *(pytest.param(*case, marks=pytest.mark.deep) for case in MORE)]
 )
-def test_ctrl_c_about_the_first_step_leaves_nothing_half_made(tmp_path, monkeypatch, whole, name, call, waiting, kept):
+def test_ctrl_c_leaves_nothing_half_made(tmp_path, monkeypatch, whole, name, call, waiting, step):
     path = tmp_path / "fit.checkpoint"
     with ctrl_c(monkeypatch, name, call, waiting):
         jaxhf.fit(*problem(), **OPTIONS, checkpoint=path)
-    assert [file.name for file in tmp_path.iterdir()] == ([path.name] if kept else [])
-    again = []
-    agree(jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True, progress=again.append), whole)
-    assert again[0].step == (3 if name == "save_checkpoint" else 1)
+    began = (name, call) not in (("init_state", 1), ("pictures_and_influence", 1))
+    assert [file.name for file in tmp_path.iterdir()] == ([path.name] if began else [])
+    assert resumed(path, whole)[0].step == step
 
 
-# The first accepted step of a line search is the 18th.
-@pytest.mark.parametrize(("solver", "step"), [("lm", 2), ("lm", 5), ("bfgs", 21), ("lbfgs", 21), ("adam", 5)])
-def test_ctrl_c_while_a_step_is_computed_keeps_the_one_before(tmp_path, monkeypatch, whole, solver, step):
-    path, options = tmp_path / "fit.checkpoint", OPTIONS
-    if solver != "lm":
-        options = {**OPTIONS, "solver": solver, "levels": [1.0], "noise": 0.01}
-        whole = jaxhf.fit(*problem(), **options)
-        assert whole.history[step - 1].accepted
+# The first accepted step of a line search is the 16th.
+@pytest.mark.deep
+@pytest.mark.parametrize(("solver", "step"), [("bfgs", 21), ("lbfgs", 21), ("adam", 5)])
+def test_ctrl_c_keeps_the_step_before_of_other_solvers(tmp_path, monkeypatch, solver, step):
+    path, options = tmp_path / "fit.checkpoint", {**OPTIONS, "solver": solver, "levels": [1.0], "noise": 0.01}
+    whole = jaxhf.fit(*problem(), **options)
+    assert whole.history[step - 1].accepted
     with ctrl_c(monkeypatch, "advance", step, waiting=True):
         jaxhf.fit(*problem(), **options, checkpoint=path)
-    again = []
-    agree(jaxhf.fit(*problem(), **options, checkpoint=path, resume=True, progress=again.append), whole)
-    assert again[0].step == step
-
-
-@pytest.mark.parametrize(
-    ("name", "call", "step"),
-    [
-        ("pictures_and_influence", 10, 10),
-        ("pictures_and_influence", 11, 10),  # the first of those that measure the loss's curvature
-        ("reset_state", 2, 10),
-        ("pictures_and_influence", 19, 19),
-        ("reset_state", 3, 19),
-    ],
-)
-def test_ctrl_c_while_a_stage_changes_keeps_the_end_of_the_one_before(tmp_path, monkeypatch, whole, name, call, step):
-    path = tmp_path / "fit.checkpoint"
-    with ctrl_c(monkeypatch, name, call):
-        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path)
-    again = []
-    agree(jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True, progress=again.append), whole)
-    assert again[0].step == step
+    assert resumed(path, whole, **options)[0].step == step
 
 
 def test_ctrl_c_after_the_last_step_keeps_them_all(tmp_path, monkeypatch, whole):
@@ -158,9 +147,7 @@ def test_ctrl_c_after_the_last_step_keeps_them_all(tmp_path, monkeypatch, whole)
         patched.setattr(_fit, "standard_deviations", interrupt)
         with pytest.raises(KeyboardInterrupt):
             jaxhf.fit(*problem(), **options, uncertainty="exact", checkpoint=path)
-    again = []
-    agree(jaxhf.fit(*problem(), **options, checkpoint=path, resume=True, progress=again.append), whole)
-    assert again == []
+    assert resumed(path, whole, **options) == []
 
 
 def test_a_checkpoint_that_cannot_be_kept_is_refused_first(tmp_path, monkeypatch):
@@ -196,17 +183,21 @@ def without_pictures(setattr: Callable[..., None]) -> None:
     setattr(_loop, "pictures_and_influence", pictures)
 
 
+def run_python(program: str, *arguments: str) -> subprocess.Popen:
+    """Another process, in which this module's names are there."""
+    here = Path(__file__).parent
+    start = f"import sys; sys.path[:0] = {[str(here.parents[1]), str(here)]!r}\n"
+    return subprocess.Popen([sys.executable, "-c", start + program, *arguments], stdout=subprocess.PIPE, text=True)
+
+
 def test_a_killed_process_loses_at_most_one_interval(tmp_path, monkeypatch):
     path, options = tmp_path / "fit.checkpoint", {**OPTIONS, "max_steps": 12}
-    script = (
-        "import sys, jax; jax.config.update('jax_enable_x64', True); sys.path[:0] = sys.argv[1:3]\n"
+    program = (
         "import time; from test_fit_checkpoint import *; without_pictures(setattr)\n"
         "def progress(step):\n    print(step.step, flush=True)\n    time.sleep(0.2)\n"
-        "jaxhf.fit(*problem(), **{**OPTIONS, 'max_steps': 12}, checkpoint=sys.argv[3], progress=progress)"
+        "jaxhf.fit(*problem(), **{**OPTIONS, 'max_steps': 12}, checkpoint=sys.argv[1], progress=progress)"
     )
-    here = Path(__file__).parent
-    command = [sys.executable, "-c", script, str(here.parents[1]), str(here), str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with run_python(program, str(path)) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if int(line) == 5:
@@ -214,10 +205,28 @@ def test_a_killed_process_loses_at_most_one_interval(tmp_path, monkeypatch):
                 break
     assert process.returncode == -signal.SIGKILL
     without_pictures(monkeypatch.setattr)
-    again, whole = [], jaxhf.fit(*problem(), **options)
-    agree(jaxhf.fit(*problem(), **options, checkpoint=path, resume=True, progress=again.append), whole)
+    whole = jaxhf.fit(*problem(), **options)
     assert len(whole.history) == 12
-    assert 4 <= again[0].step - 1 <= 5  # kept after 4, or a step later than it was told
+    assert 4 <= resumed(path, whole, **options)[0].step - 1 <= 5  # kept after 4, or a step later than it was told
+
+
+@pytest.mark.slow
+def test_steps_are_compiled_once_on_two_devices():
+    """Where a step's results lay elsewhere than its arguments, two thirds of the compilation came after the first step."""
+    program = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)  # before it is first used
+from test_fit_checkpoint import *
+spent, by_then = [], []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda event, seconds, **_: spent.append(seconds) if event.startswith("/jax/core/compile/") else None
+)
+jaxhf.fit(*problem(), **OPTIONS, progress=lambda step: by_then.append(sum(spent)))
+print(len(jax.devices()), by_then[0], by_then[-1])
+"""
+    devices, first, last = map(float, run_python(program).communicate()[0].split())
+    assert devices == 2
+    assert last < 1.2 * first
 
 
 def fingerprint(size=(4, 6), material: jaxhf.Matte | jaxhf.Mirror | None = None, samples: int = 1, **options) -> str:
@@ -226,29 +235,18 @@ def fingerprint(size=(4, 6), material: jaxhf.Matte | jaxhf.Mirror | None = None,
     camera = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.0, width=width, height=height)
     terrain = jaxhf.Object(jaxhf.Heightfield(np.zeros((3, 3))), material or jaxhf.Matte(0.5))
     scene = jaxhf.Scene([terrain], camera, [jaxhf.Directional((1, 2, 3))], samples=samples)
-    defaults = {name: option.default for name, option in list(inspect.signature(jaxhf.fit).parameters.items())[2:]}
-    chosen = FitOptions(**{**defaults, "settings": jaxhf.Settings(), **options})
+    chosen = fit_options(**options)
     return fit_fingerprint(*make_problem([scene], [np.zeros(size)], chosen), chosen)
 
 
 def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():
     """Pictures of 4 x 6 and 6 x 4 zeros, a reflected share of 0.5, ...: the bytes of all arrays are the same."""
-    found = [
-        fingerprint(),
-        fingerprint(samples=4),
-        fingerprint(material=jaxhf.Mirror(0.5)),
-        fingerprint(size=(6, 4)),
-        fingerprint(settings=jaxhf.Settings(samples=9)),
-        fingerprint(solver="adam"),
-        fingerprint(levels=[0.5, 1.0]),
-        fingerprint(inner_steps=50),
-        fingerprint(tolerance=1e-5),
-        fingerprint(exposures=True),
-        fingerprint(offsets=True),
-        fingerprint(albedo="constant"),
-        fingerprint(loss="cauchy"),
-        fingerprint(loss="huber"),
-    ]
+    options: list[dict[str, Any]] = [
+        {}, {"samples": 4}, {"material": jaxhf.Mirror(0.5)}, {"size": (6, 4)}, {"settings": jaxhf.Settings(samples=9)},
+        {"solver": "adam"}, {"levels": [0.5, 1.0]}, {"inner_steps": 50}, {"tolerance": 1e-5}, {"exposures": True},
+        {"offsets": True}, {"albedo": "constant"}, {"loss": "cauchy"}, {"loss": "huber"},
+    ]  # fmt: skip
+    found = [fingerprint(**given) for given in options]
     assert len(set(found)) == len(found)
     # What is chosen at first may be what another fit is given: 1 % of the brightness, 2048 points.
     assert fingerprint(noise=0.01) != found[0]
@@ -256,15 +254,11 @@ def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():
     assert fingerprint(max_steps=7, checkpoint_every=3, uncertainty=5) == found[0]  # what does not decide on the steps
 
 
+@pytest.mark.deep  # a killed process has left one, too
 def test_another_process_finds_the_same_fingerprint():
-    script = (
-        "import sys, jax; jax.config.update('jax_enable_x64', True); sys.path[:0] = sys.argv[1:]\n"
-        "from test_fit_checkpoint import *; print(fingerprint(albedo='map', loss='geman', levels=[0.5, 1.0]))"
-    )
-    here = Path(__file__).parent
-    command = [sys.executable, "-c", script, str(here.parents[1]), str(here)]
-    found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
-    assert found.stdout.strip() == fingerprint(albedo="map", loss="geman", levels=[0.5, 1.0])
+    program = "from test_fit_checkpoint import *; print(fingerprint(albedo='map', loss='geman', levels=[0.5, 1.0]))"
+    found, _ = run_python(program).communicate(timeout=120)
+    assert found.strip() == fingerprint(albedo="map", loss="geman", levels=[0.5, 1.0])
 
 
 def test_a_damaged_checkpoint_and_that_of_another_fit_are_refused(tmp_path, monkeypatch):

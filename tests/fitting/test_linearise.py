@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_fits import rms
 
 import jaxhf
 from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
@@ -33,7 +34,11 @@ def waves(ny: int, nx: int, height: float) -> np.ndarray:
     return height * (np.sin(5 * x + 2 * y) + np.cos(3 * x - 6 * y + 1))
 
 
-def terrains(which: str, material: jaxhf.Matte | jaxhf.Mirror = jaxhf.Matte((0.3, 0.5, 0.7))) -> jaxhf.Scene:
+SUN = (jaxhf.Sky(0.1), jaxhf.Directional((0.3, -0.4, 0.5)))
+LAMP = (jaxhf.Point((0.1, 0.3, 0.9), (0.9, 0.8, 0.7)),)
+
+
+def terrains(which: str, material: jaxhf.Matte | jaxhf.Mirror = jaxhf.Matte((0.3, 0.5, 0.7)), lights=LAMP) -> jaxhf.Scene:
     """A turned heightfield with a hole; with "all", after a cylinder and another heightfield."""
     texels = np.random.default_rng(1).uniform(0.2, 0.9, (3, 4, 3))
     painted = jaxhf.Matte(jaxhf.ImageTexture(texels))
@@ -43,61 +48,78 @@ def terrains(which: str, material: jaxhf.Matte | jaxhf.Mirror = jaxhf.Matte((0.3
     if which == "all":
         tube = jaxhf.Cylinder(radius=0.15, z_min=-0.3, z_max=0.3)
         objects = [jaxhf.Object(tube, painted), jaxhf.Object(jaxhf.Heightfield(waves(12, 10, 0.08)), painted), *objects]
-    return jaxhf.Scene(objects, CAMERA, [jaxhf.Point((0.1, 0.3, 0.9), (0.9, 0.8, 0.7))])
+    return jaxhf.Scene(objects, CAMERA, lights)
 
 
 def pictures(scene: jaxhf.Scene, settings: jaxhf.Settings, channels: int):
-    """Functions of all heights: the linearised picture, the picture by it, and the picture by `render`."""
+    """Functions of all heights and of a view: the linearised picture, the picture by it, and the picture by `render`."""
     scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], localise(scene))
 
-    def change(heights):
+    def change(unknowns):
+        heights, view = unknowns
+
         def changed(scene):
             for k, new in enumerate(heights):
                 scene = eqx.tree_at(lambda scene, k=k: scene.heightfields[k].heights, scene, new)
-            return scene
+            lights, camera = moved(scene.lights, scene.camera, view)
+            return dataclasses.replace(scene, lights=lights, camera=camera)
 
         return changed
 
-    def known(heights):
-        return linearise_each(scenes, change(heights), settings, local_mesh(), channels)
+    def known(unknowns):
+        still = jax.tree.map(jnp.zeros_like, unknowns[1])
+        return linearise_each(scenes, change(unknowns), settings, local_mesh(), channels, still)
 
-    def by_matrix(known, heights):
-        return picture_each(known, scenes, change(heights), settings, local_mesh())[0]
+    def by_matrix(known, unknowns):
+        return picture_each(known, scenes, change(unknowns), settings, local_mesh())[0]
 
-    def by_render(heights):
-        image = jaxhf.render(change(heights)(scene), settings)
+    def by_render(unknowns):
+        image = jaxhf.render(change(unknowns)(localise(scene)), settings)
         return image if channels == 3 else image.mean(-1, keepdims=True)
 
     return known, by_matrix, by_render
 
 
+# A light and a camera that were turned already.
+TURNED = {"light": np.array([0.02, -0.01]), "camera": np.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.03])}
+SMOOTH = jaxhf.Settings(samples=1, chunk=64, edge_samples=300)
+FLAT = jaxhf.Settings(samples=1, chunk=64, shading="flat")
+DOUBLE = [pytest.mark.x64, pytest.mark.deep]  # leaves no room for an error that rounding would hide
+
+
 @pytest.mark.parametrize(
-    ("which", "settings", "channels", "derivative"),
+    ("which", "lights", "view", "settings", "channels", "derivative", "rounding"),
     [
-        ("one", jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3, "jvp"),
-        ("all", jaxhf.Settings(samples=1, chunk=64, shading="flat"), 1, "vjp"),
+        ("one", SUN, TURNED, SMOOTH, 1, "jvp", 1e-4),
+        ("all", LAMP, {}, FLAT, 1, "vjp", 1e-4),
+        pytest.param("all", SUN, TURNED, SMOOTH, 1, "jvp", 1e-10, marks=DOUBLE),
+        pytest.param("one", LAMP, {}, jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3, "jvp", 1e-10, marks=DOUBLE),
+        pytest.param("all", LAMP, {}, FLAT, 1, "vjp", 1e-10, marks=DOUBLE),
     ],
-    ids=["smooth with edges", "flat, several objects"],
+    ids=["edges", "flat", "all, double", "colour, double", "flat, double"],
 )
-def test_matrix_is_the_derivative_of_render(which, settings, channels, derivative, monkeypatch):
-    """In every pixel, or in every height, to rounding; in the other mode by the inner product.
+def test_matrix_is_the_derivative_of_render(which, lights, view, settings, channels, derivative, rounding, monkeypatch):
+    """In every pixel, or in every unknown, to rounding; in the other mode by the inner product.
 
     (The forward derivative of `render` compiles sooner.) The picture itself is `render`'s but where pixels are resampled.
     """
     monkeypatch.setattr(_linearise, "_POINTS_PER_PIXEL", 64)  # then as many are resampled as by `render`
-    scene = terrains(which)
+    scene = terrains(which, lights=lights)
     heights = tuple(jnp.asarray(field.heights) for field in scene.heightfields)
+    unknowns = heights, View(**jax.tree.map(jnp.asarray, view))
     cotangent = jax.random.normal(jax.random.key(1), (22, 37, channels), heights[0].dtype)
-    tangent = tuple(jax.random.normal(jax.random.key(2 + k), field.shape, field.dtype) for k, field in enumerate(heights))
+    leaves, tree = jax.tree.flatten(unknowns)
+    drawn = [jax.random.normal(jax.random.key(2 + k), leaf.shape, leaf.dtype) for k, leaf in enumerate(leaves)]
+    tangent = jax.tree.unflatten(tree, drawn)
 
     def both(picture):
         if derivative == "jvp":
-            return jax.jvp(picture, (heights,), (tangent,))
-        image, vjp = jax.vjp(picture, heights)
+            return jax.jvp(picture, (unknowns,), (tangent,))
+        image, vjp = jax.vjp(picture, unknowns)
         return image, vjp(cotangent)[0]
 
     known, by_matrix, by_render = pictures(scene, settings, channels)
-    linear = jax.jit(known)(heights)
+    linear = jax.jit(known)(unknowns)
     found = jax.jit(lambda linear: both(functools.partial(by_matrix, linear)))(linear)
     expected = jax.jit(lambda: both(by_render))()
     if linear.edges is not None:
@@ -108,24 +130,25 @@ def test_matrix_is_the_derivative_of_render(which, settings, channels, derivativ
         expected = (picture.reshape(22, 37, channels), *expected[1:])
     for mine, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert np.nanmax(np.abs(theirs)) > 1e-3
-        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-11 * np.nanmax(np.abs(theirs)))
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=rounding * np.nanmax(np.abs(theirs)))
 
-    still = (tangent[0], *(jnp.zeros_like(other) for other in tangent[1:]))
+    still = jax.tree.unflatten(tree, [drawn[0], *(jnp.zeros_like(other) for other in drawn[1:])])
 
     @jax.jit
     def products(linear):
         picture = functools.partial(by_matrix, linear)
-        forward, first = (jax.jvp(picture, (heights,), (change,))[1] for change in (tangent, still))
-        return forward, first, jax.vjp(picture, heights)[1](cotangent)[0]
+        forward, first = (jax.jvp(picture, (unknowns,), (change,))[1] for change in (tangent, still))
+        return forward, first, jax.vjp(picture, unknowns)[1](cotangent)[0]
 
     forward, first, reverse = products(linear)
-    backwards = sum(np.nansum(np.asarray(a) * np.asarray(b)) for a, b in zip(reverse, tangent, strict=True))
-    np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=1e-9)
+    backwards = sum(np.nansum(np.asarray(a) * np.asarray(b)) for a, b in zip(jax.tree.leaves(reverse), drawn, strict=True))
+    np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=10 * rounding)
 
     @jax.jit
     def vertices(heights):
         def values(new):
-            changed = eqx.tree_at(lambda scene: scene.heightfields[0].heights, localise(scene), new)
+            known = jax.tree.map(jnp.asarray, localise(scene))
+            changed = eqx.tree_at(lambda scene: scene.heightfields[0].heights, known, new)
             return vertex_values(make_world(changed, settings))
 
         return vertex_slopes(values, heights)
@@ -136,52 +159,8 @@ def test_matrix_is_the_derivative_of_render(which, settings, channels, derivativ
     rows = picture_by_vertices(one, samples, channels - 1, of_heights.shape[0]) @ of_heights
     expected = np.ravel(first[..., -1])
     np.testing.assert_allclose(
-        rows @ np.nan_to_num(np.ravel(tangent[0])), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
+        rows @ np.nan_to_num(np.ravel(drawn[0])), expected, rtol=0, atol=rounding * np.abs(expected).max()
     )
-
-
-def test_matrix_is_the_derivative_in_light_and_camera(monkeypatch):
-    """In every pixel, about a light and a camera that were turned already; and back, by the inner product."""
-    monkeypatch.setattr(_linearise, "_POINTS_PER_PIXEL", 64)  # as many pixels are resampled as by `render`
-    settings = jaxhf.Settings(samples=1, chunk=64, shading="flat", edge_samples=300)
-    lights = [jaxhf.Sky(0.1), jaxhf.Directional((0.3, -0.4, 0.5))]
-    scene = localise(terrains("one").with_lights(lights))
-    scenes = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
-    start = View(jnp.array([0.02, -0.01]), jnp.array([0.01, -0.02, 0.03, 0.02, 0.01, -0.03]))
-    tangent = jax.tree.map(lambda leaf: jax.random.normal(jax.random.key(leaf.size), leaf.shape, leaf.dtype), start)
-    cotangent = jax.random.normal(jax.random.key(1), (22, 37, 1), jnp.float64)
-
-    def change(view):
-        def changed(scene):
-            lights, camera = moved(scene.lights, scene.camera, view)
-            return dataclasses.replace(scene, lights=lights, camera=camera)
-
-        return changed
-
-    @jax.jit
-    def products():
-        still = jax.tree.map(jnp.zeros_like, start)
-        known = linearise_each(scenes, change(start), settings, local_mesh(), 1, still)
-
-        def picture(view):
-            return picture_each(known, scenes, change(view), settings, local_mesh())[0]
-
-        products = *jax.jvp(picture, (start,), (tangent,)), jax.vjp(picture, start)[1](cotangent)[0]
-        assert known.edges is not None
-        return *products, known.edges.resampled[0]
-
-    image, forward, reverse, resampled = products()
-
-    def rendered(view):
-        return jaxhf.render(change(view)(scene), settings).mean(-1, keepdims=True)
-
-    expected = jax.jit(lambda: jax.jvp(rendered, (start,), (tangent,)))()
-    expected = (expected[0].reshape(-1, 1).at[resampled].set(image.reshape(-1, 1)[resampled]).reshape(image.shape), expected[1])
-    for mine, theirs in zip((image, forward), expected, strict=True):
-        assert np.abs(theirs).max() > 1e-3
-        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-10 * np.abs(theirs).max())
-    backwards = sum(np.vdot(a, b) for a, b in zip(jax.tree.leaves(reverse), jax.tree.leaves(tangent), strict=True))
-    np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -221,14 +200,14 @@ def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(derivatives, 
     )  # fmt: skip
     expected, found = derivatives(point)
     assert np.count_nonzero(expected) == 10
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
 
 
 def test_normals_that_are_known_as_the_program_runs_are_those_of_the_settings():
     scene = terrains("one")
     for by_angle, settings in ((True, jaxhf.Settings(normals="six-angle")), (False, jaxhf.Settings(normals="six"))):
         found = vertex_values(make_world(scene, jaxhf.Settings(), jnp.asarray(by_angle)))
-        np.testing.assert_allclose(found, vertex_values(make_world(scene, settings)), rtol=1e-14)
+        np.testing.assert_allclose(found, vertex_values(make_world(scene, settings)), rtol=1e-6, atol=1e-6)
 
 
 def test_what_a_mirror_shows_has_no_such_matrix():
@@ -241,7 +220,7 @@ def test_what_a_mirror_shows_has_no_such_matrix():
 def samples_of(picture, side: int, pixels: int = 24) -> np.ndarray:
     """A picture's regular samples, row by row; x to the right, y down, a pixel is 1 wide."""
     y, x = (np.mgrid[0 : pixels * side, 0 : pixels * side] + 0.5) / side
-    return picture(x, y)[..., None].astype(np.float64)
+    return picture(x, y)[..., None].astype(np.float32)
 
 
 @pytest.mark.parametrize("side", [2, 4, 8])
@@ -262,13 +241,9 @@ def test_errors_of_few_samples_are_known(picture, least, most, side):
     assert rms((few - fine)[~told]) <= 0.02
 
 
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values.size else 0.0
-
-
 def test_slopes_and_boundaries_between_pixels_make_no_error():
     tilted = samples_of(lambda x, y: 3 * x - 2 * y, 4)
-    np.testing.assert_allclose(_linearise._sampling_error(jnp.asarray(tilted), 4)[1:-1, 1:-1], 0, atol=1e-12)
+    np.testing.assert_allclose(_linearise._sampling_error(jnp.asarray(tilted), 4)[1:-1, 1:-1], 0, atol=1e-5)
     step = samples_of(lambda x, y: np.where(x < 11, 1.0, 0.0), 2)
     np.testing.assert_array_equal(_linearise._sampling_error(jnp.asarray(step), 2), 0)
     within = samples_of(lambda x, y: np.where(x < 11.5, 1.0, 0.0), 2)

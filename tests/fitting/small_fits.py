@@ -1,0 +1,48 @@
+"""A small terrain in three lights, which the tests of fits share: the same sizes, and so the same programs."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+
+import jaxhf
+from jaxhf.fitting.options import FitOptions
+from jaxhf.io.procedural import fractal
+
+# No shadows, and a frame that ends inside the terrain: so the interior derivative is that of the picture.
+SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024, edge_samples=0)
+LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6))
+SIZE = 24
+CAMERA = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.6, width=SIZE, height=SIZE)
+HALF = jaxhf.Perspective.look_at((0.25, 0.5, 3), (0.25, 0.5, 0), up=(0, 1, 0), fov=7.6, width=SIZE, height=SIZE)
+# One tolerance, as a number that stands in the compiled step of some solvers.
+OPTIONS: dict[str, Any] = {"settings": SETTINGS, "tolerance": 1e-6, "noise": 0.01, "loss": "squares"}
+TRUTH = fractal([12, 12], seed=3, exponent=3.0, range=(0.0, 0.1))
+
+
+def scenes(heights=None, albedo: Any = 0.7, camera: jaxhf.Perspective | jaxhf.Orthographic = CAMERA) -> list[jaxhf.Scene]:
+    heights = np.full_like(TRUTH, 0.05) if heights is None else heights
+    field = jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(albedo))
+    return [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]
+
+
+def pictures(**options) -> list[np.ndarray]:
+    return [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in scenes(TRUTH, **options)]
+
+
+def fit_options(**given) -> FitOptions:
+    """With `fit`'s defaults."""
+    known = {
+        name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items() if item.default is not item.empty
+    }
+    return FitOptions(**{**known, "settings": jaxhf.Settings(), **given})
+
+
+def rms(values: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if np.size(values) else 0.0
+
+
+def off_in_shape(heights: Any) -> float:
+    """Of the heights but for their mean, over the truth's range, root mean square."""
+    error = np.asarray(heights) - TRUTH
+    return rms(error - error.mean()) / float(np.ptp(TRUTH))
