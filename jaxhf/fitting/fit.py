@@ -272,6 +272,7 @@ def _in_shape(image: Float[np.ndarray, "h w c"], shape: tuple[int, ...]) -> np.n
     return np.broadcast_to(image, (*image.shape[:2], *shape[2:])).copy() if len(shape) == 3 else image[..., 0]
 
 
+@np.errstate(over="ignore")  # of a fit that ended as not finite
 def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Sequence[Any]) -> Fit:
     problem, unknowns, options = loop.problem, loop.unknowns, loop.options
     images: list[np.ndarray] = [np.zeros(())] * problem.count
@@ -289,9 +290,8 @@ def _report(loop: FitLoop, result: Stop, scenes: Sequence[Scene], targets: Seque
     in_noise = [picture.residual for picture in left]
     counts = [picture.informing | (np.abs(picture.residual) > _OFF) for picture in left]
     counted = np.concatenate([values[which] for values, which in zip(in_noise, counts, strict=True)]).astype(np.float64)
-    with np.errstate(over="ignore"):
-        regions, where = worst_regions(in_noise), where_residuals_are(in_noise, boundary_places(problem))
-        chi2, free = chi_squared(problem, counted, [int(which.sum()) for which in counts], loop.freedom)
+    regions, where = worst_regions(in_noise), where_residuals_are(in_noise, boundary_places(problem))
+    chi2, free = chi_squared(problem, counted, [int(which.sum()) for which in counts], loop.freedom)
     seen = influence != 0
     std, scaled, draws, displaced = None, None, None, None
     if options.uncertainty is not None and result is not Stop.NON_FINITE:
