@@ -41,13 +41,15 @@ def refuse(reason: str) -> NoReturn:
 def have(name: str) -> bool:
     """Whether there is a package or a program of this name."""
     with contextlib.suppress(ModuleNotFoundError):  # of the package around it
-        return importlib.util.find_spec(name) is not None or shutil.which(name) is not None
-    return False
+        found = importlib.util.find_spec(name)
+        if found is not None and found.origin is not None:  # a folder that happens to have this name, as in tests/, has none
+            return True
+    return shutil.which(name) is not None
 
 
 def need(*names: str) -> None:
     if missing := [f"{name} ({SOURCES[name]})" for name in names if not have(name)]:
-        refuse(f"it needs {' and '.join(missing)}, which is not installed")
+        refuse(f"it needs {' and '.join(missing)}, not installed here")
 
 
 need("jaxhf")  # this module is imported before all that stands on jaxhf
