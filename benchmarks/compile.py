@@ -4,7 +4,6 @@ Each program is made in a process of its own, without a cache. The scene is one 
 directional light, with shadows and smooth normals, 512 x 512 pixels (for the fit 128 x 128).
 """
 
-import argparse
 import inspect
 import json
 import subprocess
@@ -13,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import benchmark
 import numpy as np
 
 PROGRAMS = {
@@ -94,7 +94,7 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
 
         scene, mesh = make_scene(heights, 512), local_mesh(1)
         resolved, local = resolve_settings(jaxhf.Settings(), scene), on_every_device(localise(scene), mesh)
-        return arrays_only(render._trace_all, local, resolved, (), mesh, None, True)
+        return arrays_only(render._trace_all, local, resolved, (), mesh, None)
     settings = {
         "inside": jaxhf.Settings(),
         "gradient": jaxhf.Settings(samples=4),
@@ -133,28 +133,24 @@ def measure(name: str, size: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    run = benchmark.Run(__doc__)
+    parser = run.parser
     parser.add_argument("--heights", type=int, default=256, help="a side (256)")
     parser.add_argument("--repeats", type=int, default=3, help="processes for each program, of which the median is told (3)")
     parser.add_argument("programs", nargs="*", help=f"out of {', '.join(PROGRAMS)} (all)")
-    parser.add_argument("--child", help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    parser.add_argument("--child", help=benchmark.HIDDEN)
+    options = run.parse()
     if options.child:
         print(json.dumps(measure(options.child, options.heights)))
         return
-    print(f"{'program':12} {'equations':>10} {'lines':>8} {'CPU s':>8} = {'trace':>7} {'lower':>7} {'compile':>8}", flush=True)
     for name in options.programs or PROGRAMS:
-        runs = []
-        for _ in range(options.repeats):
-            command = [sys.executable, __file__, "--child", name, "--heights", str(options.heights)]
-            runs.append(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
-        total = float(np.median([sum(run[stage] for stage in STAGES) for run in runs]))
-        stages = [float(np.median([run[stage] for run in runs])) for stage in STAGES]
-        print(
-            f"{name:12} {runs[0]['equations']:10} {runs[0]['lines']:8} {total:8.2f} = "
-            f"{stages[0]:7.2f} {stages[1]:7.2f} {stages[2]:8.2f}   {PROGRAMS[name]}",
-            flush=True,
-        )
+        command = [sys.executable, __file__, "--child", name, "--heights", str(options.heights)]
+        runs = [json.loads(subprocess.check_output(command, text=True)) for _ in range(options.repeats)]
+        stages = {stage: float(np.median([made[stage] for made in runs])) for stage in STAGES}
+        total = float(np.median([sum(made[stage] for stage in STAGES) for made in runs]))
+        counts = {"equations": runs[0]["equations"], "lines of StableHLO": runs[0]["lines"]}
+        run.row(PROGRAMS[name], counts | stages | {"together, CPU s": total})
+    run.end()
 
 
 if __name__ == "__main__":

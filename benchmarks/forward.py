@@ -4,12 +4,10 @@
 
 The variants are run in turn, several times and each time in another order, so that neither a machine whose speed drifts nor
 what one leaves to the next favours one, and each twice in a row, as frame after frame: the second counts. Medians are
-printed, and the ratio to the first variant, pair by pair. With
-`--mitsuba` (pip install mitsuba; it needs LLVM's library, see DRJIT_LIBLLVM_PATH) the same terrain is also rendered by
-Mitsuba 3's `direct` integrator, with `--embree` (pip install embreex) by Embree and NumPy, with `--povray` by POV-Ray.
+printed, and the ratio to the first variant, pair by pair. With `--mitsuba` the same terrain is also rendered by Mitsuba 3's
+`direct` integrator, with `--embree` by Embree and NumPy, with `--povray` by POV-Ray.
 """
 
-import argparse
 import os
 import tempfile
 import time
@@ -17,10 +15,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import benchmark
 import jax
 import jax.numpy as jnp
 import numpy as np
-from peers import embree_frame, mitsuba_scene, povray_seconds
+from peers import embree_frame, mitsuba_scene, need_fast_mitsuba, povray_seconds
 
 import jaxhf
 from jaxhf.core.vector import dot, unit
@@ -36,6 +35,8 @@ CAMERAS = {  # eye, target, field of view: a fifth of the picture covered, all o
 }
 LIGHTS = {"A": (0.5, -0.3, 0.6), "B": (0.8, 0.1, 0.3)}
 PIXELS = 512
+# Ratios of docs/measurements/mitsuba.csv over both cameras, and a third more: of new heights, and of a frame.
+MITSUBA = {64: (0.95, 1.4), 256: (0.35, 1.4), 1024: (0.14, 0.7)}
 
 
 def terrain(size: int) -> np.ndarray:
@@ -108,7 +109,7 @@ def shadow_rays(heights: np.ndarray, camera: str) -> tuple[float, float]:
 
 
 def mitsuba(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]:
-    dr, mi, loaded, parameters, positions = made = mitsuba_scene(heights, CAMERAS[camera], LIGHTS[camera], PIXELS, "direct")
+    dr, mi, loaded, parameters, positions = made = mitsuba_scene(heights, CAMERAS[camera], LIGHTS[camera], PIXELS)
 
     def frame():
         dr.eval(mi.render(loaded, spp=1))
@@ -133,7 +134,13 @@ def embree(heights: np.ndarray, camera: str) -> dict[str, Callable[[], object]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    run = benchmark.Run(
+        __doc__,
+        needs="a package or program for each of --mitsuba (with LLVM's library, see DRJIT_LIBLLVM_PATH), --embree, --povray",
+        claims="at 1024² heights that normals and bounds at hand halve a frame, and that the pyramid is no slower than dda; "
+        "with --mitsuba at most a third more of its time than docs/measurements/mitsuba.csv has",
+    )
+    parser = run.parser
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 256, 1024], help="vertices a side")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)), help="cores that share the work")
@@ -142,7 +149,10 @@ def main() -> None:
     parser.add_argument("--mitsuba", action="store_true")
     parser.add_argument("--embree", action="store_true", help="with embreex, and shading in NumPy")
     parser.add_argument("--povray", action="store_true", help="what povray says of itself, after the others")
-    options = parser.parse_args()
+    options = run.parse()
+    if options.mitsuba:
+        need_fast_mitsuba()
+    benchmark.need(*(name for name, wanted in (("embreex", options.embree), ("povray", options.povray)) if wanted))
     jax.config.update("jax_num_cpu_devices", options.devices)
     for size in options.sizes:
         for camera in CAMERAS:
@@ -163,19 +173,29 @@ def main() -> None:
                 variants |= mitsuba(heights, camera)
             if options.embree:
                 variants |= embree(heights, camera)
-            report(f"{size}² heights, camera {camera}", variants, options.repeats)
+            title = f"{size}² heights, camera {camera}"
+            ratios = report(run, title, variants, options.repeats)
+            if size == 1024:
+                run.claim(ratios["pyramid, prepared"] < 0.5, f"{title}: prepared {ratios['pyramid, prepared']:.2f}, below 0.5")
+                run.claim(ratios["dda"] > 0.9, f"{title}: dda {ratios['dda']:.2f} of the pyramid's time, above 0.9")
+            if options.mitsuba and size in MITSUBA:
+                new, frame = 1 / ratios["mitsuba, new heights"], ratios["pyramid, prepared"] / ratios["mitsuba"]
+                for name, ratio, most in zip(("new heights", "frame"), (new, frame), MITSUBA[size], strict=True):
+                    run.claim(ratio <= most, f"{title}, {name}: {ratio:.2f} of Mitsuba's time, at most {most}")
             rays, tiles = shadow_rays(heights, camera)
-            print(f"  shadow rays that walk: {rays:.1%}, in {tiles:.0%} of the tiles that have shadow rays", flush=True)
+            run.row(f"{title}, shadow rays that walk", {"share": rays, "of the tiles": tiles})
             if options.povray:
                 with tempfile.TemporaryDirectory() as folder:
                     said = [
                         povray_seconds(heights, CAMERAS[camera], LIGHTS[camera], PIXELS, Path(folder))
                         for _ in range(options.repeats)
                     ]
-                print(f"  {'povray':28s} {1e3 * np.median(said):8.1f} ms")
+                run.row(f"{title}, povray", {"ms": 1e3 * np.median(said)})
+    run.end()
 
 
-def report(title: str, variants: dict[str, Callable[[], object]], repeats: int) -> None:
+def report(run: benchmark.Run, title: str, variants: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """A row a variant; its median time as a ratio to the first."""
     times: dict[str, list[float]] = {name: [] for name in variants}
     for variant in variants.values():
         variant()
@@ -186,11 +206,11 @@ def report(title: str, variants: dict[str, Callable[[], object]], repeats: int) 
             begin = time.perf_counter()
             variants[name]()
             times[name].append(time.perf_counter() - begin)
-    print(title)
     first = np.array(next(iter(times.values())))
+    ratios = {name: float(np.median(np.array(seconds) / first)) for name, seconds in times.items()}
     for name, seconds in times.items():
-        ratio = np.median(np.array(seconds) / first)
-        print(f"  {name:28s} {1e3 * np.median(seconds):8.1f} ms   {ratio:6.2f} of the first", flush=True)
+        run.row(f"{title}, {name}", {"ms": 1e3 * np.median(seconds), "of the first": ratios[name]})
+    return ratios
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""How time and memory grow with heights, pixels, samples, pictures and devices: one table, one page of plots, the exponents.
+"""How time and memory grow with heights, pixels, samples, pictures and devices: figures, one page of plots, the exponents.
 
 Each point is a process of its own, so that its peak of memory is its own. One quantity varies, the others stay at 1024 x 1024
 heights, 512 x 512 pixels, one sample, one picture, all cores, in the view of camera B of forward.py. All heights have as
@@ -8,26 +8,23 @@ normals and bounds at hand; several pictures are seen from several places. An ex
 quantity ** e: the slope of the logarithms over the upper half of the points.
 """
 
-import argparse
 import json
 import math
 import os
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
+import benchmark
 import numpy as np
 
 from jaxhf.study.worker import Answers, MeasurementError, Worker, timed
 from jaxhf.xla.machine import available_bytes, peak_mb
 
+COSTS = ("frame", "prepared", "peak_mb")
 BASE = {"heights": 1024, "pixels": 512, "samples": 1, "images": 1}
 UNITS = {"heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores"}
 # At the peak, for each device, which has the scene to itself: 54 to 63 measured with one, 107 with two.
 BYTES_A_HEIGHT = 66
-# Measured on two cores: what all points of a quantity take besides their repeats, and what one repeat of all takes.
-SECONDS = {"heights": (150, 30), "pixels": (120, 45), "samples": (60, 15), "images": (70, 7), "devices": (30, 1)}
 
 
 def waves(size: int, count: int = 48) -> np.ndarray:
@@ -111,22 +108,6 @@ def exponent(points: list[dict[str, Any]], cost: str) -> float:
     return float(slope)
 
 
-def table(points: list[dict[str, Any]]) -> str:
-    lines = ["| | cores | frame, s | prepared, s | peak, MiB |", "|---|---|---|---|---|"]
-    for quantity in dict.fromkeys(point["quantity"] for point in points):
-        mine = [point for point in points if point["quantity"] == quantity]
-        for point in mine:
-            name = f"{point['value']}²" if quantity in ("heights", "pixels") else str(point["value"])
-            lines.append(
-                f"| {name} {UNITS[quantity]} | {point['devices']} | {point['frame']:.3g} | {point['prepared']:.3g} | "
-                f"{point['peak_mb']:.0f} |"
-            )
-        if len(mine) > 1:
-            slopes = " | ".join(f"**{exponent(mine, cost):.2f}**" for cost in ("frame", "prepared", "peak_mb"))
-            lines.append(f"| **exponent of {UNITS[quantity]}** | | {slopes} |")
-    return "\n".join(lines)
-
-
 def plot(points: list[dict[str, Any]], path: Path) -> None:
     import matplotlib
 
@@ -159,12 +140,15 @@ def whole_decades(values: list[float]) -> tuple[float, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    claims = "of what has five points exponents below 1.2, below 0.5 of a prepared frame over heights"
+    run = benchmark.Run(__doc__, needs="matplotlib for its plot", claims=claims)
+    parser = run.parser
     parser.add_argument("-o", "--output", type=Path, default=Path("growth"), help="growth.json and growth.png go here")
     parser.add_argument("--quantities", nargs="+", default=list(UNITS), choices=UNITS)
     parser.add_argument("--largest", type=int, default=16384, help="heights a side, at most")
     parser.add_argument("--repeats", type=int, default=5)
-    options = parser.parse_args()
+    options = run.parse()
+    benchmark.need("matplotlib")
     cores = sorted(os.sched_getaffinity(0))
     values = {
         "heights": [2**k for k in range(6, 15) if 2**k <= options.largest],
@@ -173,8 +157,7 @@ def main() -> None:
         "images": [1, 2, 4, 8, 16],
         "devices": [n for n in (1, 2, 4, 8, 16) if n <= len(cores)],
     }
-    seconds = sum(SECONDS[quantity][0] + options.repeats * SECONDS[quantity][1] for quantity in options.quantities)
-    print(f"about {math.ceil(seconds / 60)} minutes on two free cores", flush=True)
+    print("about three minutes a quantity on two free cores", flush=True)
     options.output.mkdir(parents=True, exist_ok=True)
     points: list[dict[str, Any]] = []
     for quantity in options.quantities:
@@ -186,17 +169,24 @@ def main() -> None:
             used = cores[: min(len(cores), int(copies / largest**2))]
             print(f"heights up to {largest}², on {len(used)} cores: as many as memory holds copies for", flush=True)
         for value in values[quantity]:
-            begin = time.perf_counter()
             try:
                 points.append(measure(quantity, value, used, options.repeats))
                 (options.output / "growth.json").write_text(json.dumps(points, indent=1))
             except MeasurementError as error:
                 print(f"{quantity} {value}: {error}", flush=True)
-                continue
-            if sys.stderr.isatty():
-                print(f"{quantity} {value}: {time.perf_counter() - begin:.0f} s", file=sys.stderr)
     plot(points, options.output / "growth.png")
-    print(table(points))
+    for quantity in dict.fromkeys(point["quantity"] for point in points):
+        mine = [point for point in points if point["quantity"] == quantity]
+        for point in mine:
+            name = f"{point['value']}²" if quantity in ("heights", "pixels") else point["value"]
+            run.row(f"{name} {UNITS[quantity]}", {key: point[key] for key in ("devices", *COSTS)})
+        slopes = {cost: exponent(mine, cost) for cost in COSTS} if len(mine) > 1 else {}
+        run.row(f"exponent of {UNITS[quantity]}", slopes)
+        most = dict.fromkeys(COSTS, 1.2) | ({"prepared": 0.5} if quantity == "heights" else {})
+        for cost, slope in slopes.items():
+            if len(mine) > 4:
+                run.claim(slope < most[cost], f"{cost} grows as {quantity} ** {slope:.2f}, below {most[cost]}")
+    run.end()
 
 
 if __name__ == "__main__":

@@ -1,22 +1,18 @@
 """Times hillshades, slopes, aspects, tints and shadows beside GDAL's gdaldem, and counts the bytes in which they differ.
 
-    python benchmarks/maps.py [--sides 41 1024 4096] [--repeats 3]
-
 Times are seconds of arrays in, arrays out; gdaldem's are of the whole command, with a file in and out, on a RAM disk where
-there is one. Without gdaldem only our own are there.
+there is one.
 """
 
-import argparse
 import itertools
 import os
 import resource
-import shutil
 import subprocess
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import benchmark
 import numpy as np
 
 import jaxhf
@@ -106,8 +102,8 @@ def pairs(
         yield "color-relief", tints, gdal("color-relief", "-alpha", *words)
 
 
-def compare(folder: Path) -> None:
-    total, apart = 0, 0
+def compare(run: benchmark.Run, folder: Path) -> None:
+    total = np.zeros((2, 2), int)
     for name, (heights, dx, dy, scale) in grids().items():
         found: dict[str, list[int]] = {}
         for kind, ours, theirs in pairs(heights, dx, dy, scale, Gdal(folder, heights, dx, dy)):
@@ -115,21 +111,15 @@ def compare(folder: Path) -> None:
             counts = found.setdefault(kind, [0, 0])
             counts[0], counts[1] = counts[0] + differ.size, counts[1] + int(differ.sum())
         shape = f"{heights.shape[0]} x {heights.shape[1]}"
-        print(f"{name} ({shape}): " + ", ".join(f"{kind} {wrong}/{size}" for kind, (size, wrong) in found.items()), flush=True)
-        total, apart = total + sum(size for size, _ in found.values()), apart + sum(wrong for _, wrong in found.values())
-    print(f"{apart} of {total} values differ\n")
+        run.row(f"{name} ({shape})", {kind: f"{wrong}/{size}" for kind, (size, wrong) in found.items()})
+        for kind, counts in found.items():
+            total[int(kind.startswith("hillshade"))] += counts
+    (others, wrong), (hillshades, ties) = total.tolist()
+    run.claim(wrong == 0, f"{wrong} of {others} values of slopes, aspects and tints differ from GDAL's, none")
+    run.claim(ties <= 1e-6 * hillshades, f"{ties} of {hillshades} bytes of hillshades differ from GDAL's, at most 1e-6 of them")
 
 
-def best(run: Callable[[], object], repeats: int) -> float:
-    def seconds() -> float:
-        begin = time.perf_counter()
-        run()
-        return time.perf_counter() - begin
-
-    return min(seconds() for _ in range(repeats))
-
-
-def clock(side: int, folder: Path, repeats: int, gdal_there: bool) -> None:
+def clock(run: benchmark.Run, side: int, folder: Path, repeats: int) -> None:
     heights = terrain(side, side).astype(np.float32)
     gdal = Gdal(folder, heights, 10.0, 10.0)
     rows: list[tuple[str, Callable[[], object], tuple[object, ...] | None]] = [
@@ -146,28 +136,25 @@ def clock(side: int, folder: Path, repeats: int, gdal_there: bool) -> None:
             for h in (45.0, 20.0, 5.0)
         ),
     ]
-    for name, run, words in rows:
-        theirs = f"{best(lambda words=words: gdal(*map(str, words)), repeats):8.3f}" if words and gdal_there else "       -"
-        print(f"{side:5d}  {name:28s} {best(run, repeats):8.3f} {theirs}", flush=True)
+    for name, work, words in rows:
+        theirs = {"gdaldem": min(benchmark.seconds(lambda words=words: gdal(*map(str, words)), repeats))} if words else {}
+        run.row(f"{side}², {name}", {"jaxhf, s": min(benchmark.seconds(work, repeats))} | theirs)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sides", type=int, nargs="*", default=[41, 1024, 4096])
-    parser.add_argument("--repeats", type=int, default=3)
-    options = parser.parse_args()
-    there = shutil.which("gdaldem") is not None
-    fast = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
-    with tempfile.TemporaryDirectory(dir=fast) as folder:
-        if there:
-            print(subprocess.run(["gdaldem", "--version"], capture_output=True, text=True).stdout.splitlines()[0])
-            compare(Path(folder))
-        else:
-            print("gdaldem is not installed (Debian: gdal-bin): nothing to compare with")
-        print(" side  map                             jaxhf  gdaldem (seconds)")
+    claims = "that slopes, aspects and tints have GDAL's bytes, and all but a millionth of the hillshades"
+    run = benchmark.Run(__doc__, needs="matplotlib (Jacksboro's heights), and GDAL's program gdaldem", claims=claims)
+    run.parser.add_argument("--sides", type=int, nargs="*", default=[41, 1024, 4096])
+    run.parser.add_argument("--repeats", type=int, default=3)
+    options = run.parse()
+    benchmark.need("matplotlib", "gdaldem")
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None) as folder:
+        print(subprocess.run(["gdaldem", "--version"], capture_output=True, text=True).stdout.splitlines()[0])
+        compare(run, Path(folder))
         for side in options.sides:
-            clock(side, Path(folder), options.repeats, there)
-    print(f"peak memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
+            clock(run, side, Path(folder), options.repeats)
+    run.row("peak memory", {"GB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6})
+    run.end()
 
 
 if __name__ == "__main__":

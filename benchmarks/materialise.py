@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import benchmark
 import jax
 from forward import report, scene, terrain
 
@@ -41,6 +42,8 @@ def compiled(base: jaxhf.Scene, settings: jaxhf.Settings, form: Callable) -> tup
 
 
 def main() -> None:
+    run = benchmark.Run(__doc__, claims="that with it kernels hold fewer instructions than with nothing in its place")
+    run.parse()
     landsea = jaxhf.load_scene(Path(__file__).parents[1] / "scenes" / "landsea.toml")
     cases = {
         "landsea without mirrors": (landsea, jaxhf.Settings(samples=1, max_depth=0)),
@@ -49,7 +52,10 @@ def main() -> None:
     }
     for title, (base, settings) in cases.items():
         programs = {name: compiled(base, settings, form) for name, form in FORMS.items()}
-        report(title, {f"{name}, {count}": frame for name, (frame, count) in programs.items()}, repeats=5)
+        report(run, title, {f"{name}, {count}": frame for name, (frame, count) in programs.items()}, repeats=5)
+        ours, without = programs["materialise"][1], programs["nothing"][1]
+        run.claim(ours < without, f"{title}: {ours} fused instructions, fewer than {without}")
+    run.end()
 
 
 if __name__ == "__main__":

@@ -1,14 +1,17 @@
 """What is measured against: the common work of a folder of peers' measurements, and the same terrain in other renderers."""
 
+import functools
 import importlib
 import importlib.util
 import re
 import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from benchmark import need, refuse
 
 
 def common_work(peers: Path) -> Any:
@@ -36,9 +39,7 @@ View = tuple[Sequence[float], Sequence[float], float]
 
 
 class MitsubaScene(NamedTuple):
-    """A terrain in Mitsuba 3 (pip install mitsuba; it needs LLVM's library, see DRJIT_LIBLLVM_PATH).
-
-    Dr.Jit 1.5 with LLVM 15 ends in "Cannot select: fminimum" on x86; LLVM 22 does not.
+    """A terrain in Mitsuba 3 (pip install mitsuba).
 
     Attributes:
       dr, mi: its modules; they are in none of our extras.
@@ -56,49 +57,81 @@ class MitsubaScene(NamedTuple):
     place = "terrain.vertex_positions"
 
 
+@functools.cache
+def mitsuba_variant() -> str:
+    """The quickest variant of Mitsuba that runs here: the first needs LLVM's library (see DRJIT_LIBLLVM_PATH).
+
+    A process of its own tries it: Dr.Jit 1.5 with LLVM 15 aborts with "Cannot select: fminimum" on x86; LLVM 22 does not.
+    """
+    probe = "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); mi.render(mi.load_dict(mi.cornell_box()), spp=1).numpy()"
+    tried = subprocess.run([sys.executable, "-c", probe], capture_output=True)
+    return "scalar_rgb" if tried.returncode else "llvm_ad_rgb"
+
+
+def need_fast_mitsuba() -> None:
+    """Ends where Mitsuba cannot be timed or differentiated."""
+    need("mitsuba")
+    if mitsuba_variant() == "scalar_rgb":
+        refuse("it needs Mitsuba with a library of LLVM that works with it, 16 or newer, which DRJIT_LIBLLVM_PATH names")
+
+
 def mitsuba_scene(
     heights: np.ndarray,
     view: View,
     towards: Sequence[float],
-    pixels: int,
-    integrator: str,
+    pixels: int | tuple[int, int],
+    integrator: str = "direct",
     samples: int = 1,
-    albedo: float | None = None,
+    albedo: float | np.ndarray | None = None,
     extent: tuple[float, float] = (1.0, 1.0),
+    orthographic: bool = False,
 ) -> MitsubaScene:
     """Heights over a footprint of this extent in x and y, under one directional light.
 
     Args:
+      view: eye, target and field of view; if `orthographic`, in place of that what the shorter side of the picture shows.
       towards: the light.
-      albedo: of a surface with two sides; None: Mitsuba's default.
+      pixels: a side, or width and height.
+      albedo: of a surface with two sides: a number, or texels (ny, nx, 3), row 0 in the south; None: Mitsuba's default.
     """
     dr, mi = importlib.import_module("drjit"), importlib.import_module("mitsuba")
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(mitsuba_variant())
     mi.set_log_level(mi.LogLevel.Error)  # it warns of every picture without mirrored silhouettes
     vertices, faces = mesh_of(heights, extent)
-    mesh = mi.Mesh("terrain", len(vertices), len(faces), has_vertex_normals=True)
+    textured = isinstance(albedo, np.ndarray)
+    mesh = mi.Mesh("terrain", len(vertices), len(faces), has_vertex_normals=True, has_vertex_texcoords=textured)
     parameters = mi.traverse(mesh)
     positions = vertices.ravel()
     parameters["faces"] = faces.astype(np.uint32).ravel()
     parameters["vertex_positions"] = positions
+    reflectance: Any = albedo
+    if textured:
+        parameters["vertex_texcoords"] = mesh_of(0 * heights)[0][:, :2].ravel()
+        bitmap = mi.Bitmap(np.ascontiguousarray(albedo, np.float32))
+        reflectance = {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
     parameters.update()
     if albedo is not None:
-        mesh.set_bsdf(mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": albedo}}))
-    eye, target, fov = view
+        mesh.set_bsdf(mi.load_dict({"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": reflectance}}))
+    eye, target, shown = view
+    width, height = pixels if isinstance(pixels, tuple) else (pixels, pixels)
     distance = float(np.linalg.norm(np.subtract(target, eye)))
+    pose = mi.ScalarTransform4f().look_at(origin=list(eye), target=list(target), up=[0, 0, 1])
+    if orthographic:
+        half = shown / 2 * width / min(width, height)
+        kind = {"type": "orthographic", "to_world": pose @ mi.ScalarTransform4f().scale([half, half, 1])}
+    else:
+        kind = {"type": "perspective", "fov": shown, "fov_axis": "smaller", "to_world": pose}
     scene = mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": integrator},
             "terrain": mesh,
             "light": {"type": "directional", "direction": [-float(v) for v in towards], "irradiance": np.pi},
-            "sensor": {
-                "type": "perspective",
-                "fov": fov,
+            "sensor": kind
+            | {
                 "near_clip": 0.01 * distance,  # its defaults, 0.01 and 1e4, cut off terrains in metres
                 "far_clip": 100 * distance,
-                "to_world": mi.ScalarTransform4f().look_at(origin=list(eye), target=list(target), up=[0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}},
+                "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
                 "sampler": {"type": "independent", "sample_count": samples},
             },
         }
@@ -106,18 +139,10 @@ def mitsuba_scene(
     return MitsubaScene(dr, mi, scene, mi.traverse(scene), positions)
 
 
-def mitsuba_picture(
-    heights: np.ndarray,
-    view: View,
-    towards: Sequence[float],
-    pixels: int,
-    samples: int,
-    albedo: float,
-    extent: tuple[float, float] = (1.0, 1.0),
-) -> np.ndarray:
-    """A grey picture (pixels, pixels) of the heights of `mitsuba_scene`."""
-    made = mitsuba_scene(heights, view, towards, pixels, "direct", samples, albedo, extent)
-    return np.array(made.mi.render(made.scene))[..., 0]
+def mitsuba_picture(heights: np.ndarray, view: View, towards: Sequence[float], pixels: Any, **options: Any) -> np.ndarray:
+    """A picture (h, w, 3) of the heights and options of `mitsuba_scene`."""
+    made = mitsuba_scene(heights, view, towards, pixels, **options)
+    return np.array(made.mi.render(made.scene))[..., :3]
 
 
 def camera_rays(view: View, pixels: int) -> np.ndarray:

@@ -4,13 +4,14 @@ Each scene is swept by the command `tradeoff` over these two knobs alone, the de
 samples; what was measured before is not measured again.
 """
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+import benchmark
+
 import jaxhf
 from jaxhf.study.plan import Configuration, Sweep, plan
-from jaxhf.study.sweep import run
+from jaxhf.study.sweep import run as run_sweep
 
 SCENES = ("jacksboro", "landsea", "texture", "debug4x4")
 PRESETS = {"draft": jaxhf.Settings.draft(), "balanced": jaxhf.Settings.balanced(), "exact": jaxhf.Settings.exact()}
@@ -20,35 +21,8 @@ def by_samples(measured: Sequence[Configuration]) -> dict[int, dict[str, float]]
     return dict(sorted((row.settings.samples or 0, row.figures) for row in measured))
 
 
-def table(found: dict[str, dict[int, dict[str, float]]]) -> str:
-    lines = ["| scene | samples | RMSE | 99.9 % | wrong hits | time, of 4 samples | |", "|---|---|---|---|---|---|---|"]
-    names = {settings.samples: name for name, settings in PRESETS.items()}
-    for scene, rows in found.items():
-        for samples, figures in rows.items():
-            lines.append(
-                f"| {scene} | {samples} | {figures['rmse']:.4f} | {figures['p999']:.3f} | {figures['wrong_hits']:.1e} | "
-                f"{figures['against_base']:.2f} | {names.get(samples, '')} |"
-            )
-    return "\n".join(lines)
-
-
 def by_points(measured: Sequence[Configuration]) -> dict[int, dict[str, float]]:
     return dict(sorted((row.settings.edge_samples or 0, row.figures) for row in measured if row.task == "derivative"))
-
-
-def derivative_table(found: dict[str, dict[int, dict[str, float]]]) -> str:
-    lines = [
-        "| scene | edge points | cosine | relative error | spread | time, of 10 000 points | |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    names = {settings.edge_samples: name for name, settings in PRESETS.items()}
-    for scene, rows in found.items():
-        for points, figures in rows.items():
-            lines.append(
-                f"| {scene} | {points} | {figures['cosine']:.3f} | {figures['relative_error']:.2f} | {figures['spread']:.2f} | "
-                f"{figures['seconds'] / rows[10_000]['seconds']:.2f} | {names.get(points, '')} |"
-            )
-    return "\n".join(lines)
 
 
 def plot(
@@ -88,26 +62,41 @@ def plot(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    claims = "that each preset's picture is nearer than the one before it, 'balanced' off by less than 0.02, 'exact' by 0.005"
+    run = benchmark.Run(__doc__, needs="matplotlib (Jacksboro's heights, the plot)", claims=claims)
+    parser = run.parser
     parser.add_argument("-o", "--output", type=Path, default=Path("presets"), help="folder of the sweeps and of presets.png")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
     parser.add_argument("--width", type=int, default=240)
     parser.add_argument("--repeats", type=int, default=5)
-    options = parser.parse_args()
+    options = run.parse()
+    benchmark.need("matplotlib")
     print("eight sweeps, about 17 minutes on two free cores", flush=True)
     scenes = Path(__file__).parents[1] / "scenes"
     found, derivatives = {}, {}
 
     def swept(name: str, knob: str) -> list[Configuration]:
         sweep: Sweep = plan(scenes / f"{name}.toml", options.output / name, width=options.width, knobs=(knob,))
-        failures = run(sweep, options.repeats, lambda line: print(line, flush=True), lambda done, total, what: None)
+        failures = run_sweep(sweep, options.repeats, lambda line: print(line, flush=True), lambda done, total, what: None)
         assert not failures, failures
         return sweep.measured()
 
-    for name in SCENES:
+    for name in options.scenes:
         found[name] = by_samples(swept(name, "samples"))
         derivatives[name] = by_points(swept(name, "edge_samples"))
     plot(found, derivatives, options.output / "presets.png")
-    print(table(found), derivative_table(derivatives), sep="\n\n")
+    for by, tables in (("samples", found), ("edge_samples", derivatives)):
+        presets = {getattr(settings, by): preset for preset, settings in PRESETS.items()}
+        for scene, rows in tables.items():
+            for count, figures in rows.items():
+                run.row(f"{scene}, {by} {count}", {"preset": presets.get(count, "")} | figures)
+    for scene, rows in found.items():
+        draft, balanced, exact = (rows[settings.samples or 0]["rmse"] for settings in PRESETS.values())
+        nearer = draft > balanced > exact and balanced < 0.02 and exact < 0.005
+        run.claim(
+            nearer, f"{scene}: RMSE of draft {draft:.4f} > balanced {balanced:.4f}, below 0.02 > exact {exact:.4f}, below 0.005"
+        )
+    run.end()
 
 
 if __name__ == "__main__":

@@ -1,12 +1,8 @@
 """Rays on MuJoCo's height fields beside MuJoCo's own: what they meet, how many a second, and how that moves.
 
-    python benchmarks/robots.py [parity] [speed] [gradient] [mjx] [--rays 100000] [--robots 4096] [--steps 500]
-
-Without a part all but mjx are run, which needs `pip install mujoco-mjx`. Times are of the machine as it is: MuJoCo's and
-ours alternate, and the best of each counts.
+Without a part all but mjx are run. Times are of the machine as it is: MuJoCo's and ours alternate, and the best of each counts.
 """
 
-import argparse
 import functools
 import importlib
 import resource
@@ -17,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import benchmark
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,10 +22,9 @@ import jaxhf
 from jaxhf.mujoco import HField, grid_pattern, height_scan, ray
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-hfields: Any = importlib.import_module("hfields")
-KINDS, Reference, heights, rays, mujoco = hfields.KINDS, hfields.Reference, hfields.heights, hfields.rays, hfields.mujoco
-KINDS = *KINDS, *hfields.HELD_OUT
+hfields: Any = importlib.import_module("hfields") if benchmark.have("mujoco") else None  # `main` says so
 
+PARTS = ("parity", "speed", "gradient", "mjx")
 # Rows, columns, size, and where: geom and body. The last two took no part while `ray` was made.
 CASES = {
     "square": (64, 64, (4, 4, 1, 0.5), "", ""),
@@ -41,14 +37,15 @@ CASES = {
 }
 
 
-def parity(count: int) -> None:
+def parity(run: benchmark.Run, count: int) -> None:
     """Differences of distances, over the half diagonal of the footprint, and of normals."""
+    every = *hfields.KINDS, *hfields.HELD_OUT
     for name, (nrow, ncol, size, geom, body) in CASES.items():
-        data, extent = heights(nrow, ncol, seed=nrow), np.array(size, np.float64)
-        reference = Reference(data, extent, geom, body)
+        data, extent = hfields.heights(nrow, ncol, seed=nrow), np.array(size, np.float64)
+        reference = hfields.Reference(data, extent, geom, body)
         field = HField.from_model(reference.model, "ground")
-        parts = [rays(kind, data, extent, count // len(KINDS), seed) for seed, kind in enumerate(KINDS)]
-        kinds = np.repeat(KINDS, count // len(KINDS))
+        parts = [hfields.rays(kind, data, extent, count // len(every), seed) for seed, kind in enumerate(every)]
+        kinds = np.repeat(every, count // len(every))
         o, d = reference.in_world(*(np.concatenate(part) for part in zip(*parts, strict=True)))
         # With numbers that single precision can hold too.
         o, d = (value.astype(np.float32).astype(np.float64) for value in (o, d))
@@ -67,21 +64,25 @@ def parity(count: int) -> None:
             beside = np.array([reference(o[where] + by, d[where])[0] for by in shift]) if len(where) else np.zeros((1, 0))
             close = 1e4 * tolerance * np.maximum(1, length[where])
             like_ours, like_theirs = ((np.abs(beside - value[where]) <= close).any(0).sum() for value in (ours, t))
-            counts = {str(kind): int(np.sum(apart & (kinds == kind))) for kind in KINDS if np.any(apart & (kinds == kind))}
-            print(
-                f"{name} {nrow}x{ncol}, {np.dtype(dtype)}: {len(t)} rays, {np.mean(t >= 0):.0%} hit; largest difference",
-                f"along the ray {off[~apart].max():.1e}, across {across[~apart].max():.1e}; beyond {tolerance:g}:",
-                f"{counts or 0}, normals of another triangle {turned.sum()}; of these {len(where)} rays a hair beside",
-                f"answer as ours {like_ours}, as MuJoCo's {like_theirs}",
-                flush=True,
-            )
+            counts = {str(kind): int(np.sum(apart & (kinds == kind))) for kind in every if np.any(apart & (kinds == kind))}
+            title, rays = f"{name} {nrow}x{ncol}, {np.dtype(dtype)}", len(where)
+            run.row(title, {
+                "rays": len(t), "hit": np.mean(t >= 0), "largest difference along the ray": off[~apart].max(),
+                "across": across[~apart].max(), f"beyond {tolerance:g}": str(counts or 0),
+                "normals of another triangle": turned.sum(), "of these": rays,
+                "a hair beside as ours": like_ours, "as MuJoCo's": like_theirs,
+            })  # fmt: skip
+            most = len(t) // (5_000 if dtype == np.float64 else 50)
+            run.claim(apart.sum() <= most, f"{title}: {apart.sum()} rays beyond {tolerance:g}, at most {most}")
+            ties = min(like_ours, like_theirs) >= 0.99 * rays - 3
+            run.claim(ties, f"{title}: of {rays} rays apart {like_ours} have neighbours as ours, {like_theirs} as MuJoCo's")
 
 
-def closed_forms(count: int) -> None:
+def closed_forms(run: benchmark.Run, count: int) -> None:
     """Rays whose answer is known, in numbers that are exact: whom it is that MuJoCo's misses, and ours."""
     random, extent = np.random.default_rng(0), np.array([2.0, 2.0, 1.0, 0.5])
-    data = np.round(heights(9, 9) * 64) / 64
-    reference, field = Reference(data, extent), HField(data.astype(np.float64), extent)
+    data = np.round(hfields.heights(9, 9) * 64) / 64
+    reference, field = hfields.Reference(data, extent), HField(data.astype(np.float64), extent)
     # In the plane of the wall x = 2, whose rim is a line of eight pieces: the first of them that is met from above.
     o = np.column_stack([np.full(count, 2.0), random.uniform(-2, 2, count), np.full(count, 1.5)])
     end = np.column_stack([np.full(count, 2.0), random.uniform(-2, 2, count), np.zeros(count)])
@@ -93,29 +94,19 @@ def closed_forms(count: int) -> None:
     on_it = (at >= y[:-1] - 1e-12) & (at <= y[1:] + 1e-12) & (along >= 0)
     walls = o, d, np.where(on_it, along, np.inf).min(1)
     # Steep at vertices from above, where no other part of so flat a surface stands before them: t = 1.
-    low, size = heights(9, 6, 3) * 0.02, np.array([3.0, 5.0, 0.7, 0.2])
+    low, size = hfields.heights(9, 6, 3) * 0.02, np.array([3.0, 5.0, 0.7, 0.2])
     r, c = random.integers(1, 8, count), random.integers(1, 5, count)
     end = np.column_stack([size[0] * (2 * c / 5 - 1), size[1] * (2 * r / 8 - 1), low[r, c] * size[2]])
     by = random.uniform([-0.02, -0.02, 1], [0.02, 0.02, 2], (count, 3))
     vertices = end + by, -by, np.ones(count)
     sets = {
         "along a wall": (field, reference, walls),
-        "at vertices": (HField(low.astype(np.float64), size), Reference(low, size), vertices),
+        "at vertices": (HField(low.astype(np.float64), size), hfields.Reference(low, size), vertices),
     }
     for name, (ours, theirs, (o, d, t)) in sets.items():
         wrong = [np.abs(found - t) > 1e-9 for found in (np.asarray(ray(ours, o, d)[0]), theirs(o, d)[0])]
-        print(f"closed form, {name}: of {count} rays ours misses {wrong[0].sum()}, MuJoCo's {wrong[1].sum()}", flush=True)
-
-
-def rate(run: Callable[[], Any], count: int, repeats: int = 7) -> float:
-    """The most results a second."""
-    jax.block_until_ready(run())
-    best = np.inf
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        jax.block_until_ready(run())
-        best = min(best, time.perf_counter() - begin)
-    return count / best
+        run.row(f"closed form, {name}", {"rays": count, "ours misses": wrong[0].sum(), "MuJoCo's": wrong[1].sum()})
+        run.claim(not wrong[0].any(), f"closed form, {name}: ours misses {wrong[0].sum()} rays of {count}, none")
 
 
 def threads(work: Callable[[int], None], many: int) -> None:
@@ -126,7 +117,7 @@ def threads(work: Callable[[int], None], many: int) -> None:
         thread.join()
 
 
-def speed(robots: int, cores: int = 2) -> None:
+def speed(run: benchmark.Run, robots: int, cores: int = 2) -> None:
     """Height scans of robots on height fields of their own, and slanted rays, in millions of rays a second."""
     random, places, size = np.random.default_rng(0), grid_pattern(), (4, 4, 0.3, 0.5)
     data = jnp.asarray(random.uniform(size=(robots, 64, 64)), jnp.float32)
@@ -134,24 +125,24 @@ def speed(robots: int, cores: int = 2) -> None:
     pos = jnp.asarray(random.uniform([-3, -3, 0.4], [3, 3, 0.8], (robots, 3)), jnp.float32)
     quat = jnp.asarray(random.normal(size=(robots, 4)) * [1, 0.1, 0.1, 1], jnp.float32)
 
-    references = [Reference(np.asarray(data[k]), np.array(size, np.float64)) for k in range(cores)]
+    references = [hfields.Reference(np.asarray(data[k]), np.array(size, np.float64)) for k in range(cores)]
     o = random.uniform([-3, -3, 20], [3, 3, 20.5], (20_000, 3))
     down, fan = np.array([0.0, 0.0, -1.0]), np.column_stack([places, np.full(len(places), -20.0)]).ravel()
 
     def one_by_one(k: int) -> None:
         model, state = references[k].model, references[k].data
         for start in o:
-            mujoco.mj_ray(model, state, start, down, None, 1, -1, None)
+            hfields.mujoco.mj_ray(model, state, start, down, None, 1, -1, None)
 
     def from_a_point(k: int) -> None:
         model, state = references[k].model, references[k].data
         number, dist = np.zeros(len(places), np.int32), np.zeros(len(places))
         for start in o[:500]:
-            mujoco.mj_multiRay(model, state, start, fan, None, 1, -1, number, dist, None, len(places), 1e10)
+            hfields.mujoco.mj_multiRay(model, state, start, fan, None, 1, -1, number, dist, None, len(places), 1e10)
 
     begin = time.perf_counter()
     jax.block_until_ready(height_scan(fields, pos, quat))
-    print(f"{robots} x {len(places)} rays, heights 64x64 of each robot's own; first call {time.perf_counter() - begin:.1f} s")
+    run.row(f"{robots} x {len(places)} rays, heights 64x64 of each robot's own", {"first call, s": time.perf_counter() - begin})
     results = {}
     heights_only = jax.jit(lambda fields, pos, quat: height_scan(fields, pos, quat).heights)
     aimed = jnp.asarray(random.normal(size=(robots, len(places), 3)) * [1, 1, 0.3] - [0, 0, 0.3], jnp.float32)
@@ -172,27 +163,29 @@ def speed(robots: int, cores: int = 2) -> None:
         "ray, slanted, all on one, prepared": (lambda: ray(one_ready, starts.reshape(-1, 3), aimed.reshape(-1, 3)), many),
     }  # fmt: skip
     for _ in range(2):
-        for name, (run, count) in runs.items():
-            results[name] = max(results.get(name, 0), rate(run, count, 5))
-    base = results[f"mj_ray, {cores} threads"]
+        for name, (work, count) in runs.items():
+            results[name] = max(results.get(name, 0), count / min(benchmark.seconds(work, 5)))
+    base = results["mj_ray, one thread"]
     for name, value in results.items():
-        print(f"{value / 1e6:8.2f} million rays a second, {value / base:6.1f} times mj_ray's in threads: {name}")
+        run.row(name, {"million rays a second": value / 1e6, "times mj_ray's in one thread": value / base})
+    scans = results["height_scan: places, normals, distances, mask"] / base
+    run.claim(scans > 20, f"height_scan is {scans:.0f} times as fast as mj_ray in one thread, more than 20")
 
-    walks = {name: run for name, (run, _) in runs.items() if name.startswith("ray, ")}
+    walks = {name: work for name, (work, _) in runs.items() if name.startswith("ray, ")}
     seconds = {name: [] for name in walks}
     for _ in range(9):
-        for name, run in walks.items():
+        for name, work in walks.items():
             begin = time.process_time()
-            jax.block_until_ready(run())
+            jax.block_until_ready(work())
             seconds[name].append(time.process_time() - begin)
     for name, times in seconds.items():
-        print(f"{np.median(times):6.3f} s of processor time, median of {len(times)}: {name}")
+        run.row(name, {"processor time, s": np.median(times)})
 
     compiled = jax.jit(height_scan).lower(fields, pos, quat).compile().memory_analysis()
     assert compiled is not None
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
-    results_mib, further = compiled.output_size_in_bytes / 2**20, compiled.temp_size_in_bytes / 2**20
-    print(f"MiB: heights {data.nbytes / 2**20:.0f}, results {results_mib:.0f}, further {further:.0f}; the process {most:.0f}")
+    mib = {"results, MiB": compiled.output_size_in_bytes, "further": compiled.temp_size_in_bytes, "heights": data.nbytes}
+    run.row("memory", {name: size / 2**20 for name, size in mib.items()} | {"the process": most})
     events = []
     jax.monitoring.register_event_duration_secs_listener(
         lambda event, duration_secs, **_: events.append(event) if event.startswith("/jax/core/compile/backend") else None
@@ -200,10 +193,10 @@ def speed(robots: int, cores: int = 2) -> None:
     for k in range(3):
         other = HField(jnp.asarray(random.uniform(size=data.shape), jnp.float32), size, (0, 0, k))
         jax.block_until_ready((height_scan(other, pos, quat), ray(other, starts, aimed)))
-    print(f"programs compiled for three times other heights: {len(events)}")
+    run.claim(not events, f"{len(events)} programs were compiled for three times other heights, none")
 
 
-def gradient() -> None:
+def gradient(run: benchmark.Run) -> None:
     """Derivatives of a height scan along random directions against differences, one ray at a time."""
     random = np.random.default_rng(0)
     data, size = random.uniform(size=(16, 64, 64)), (4.0, 4.0, 0.3, 0.5)
@@ -239,11 +232,10 @@ def gradient() -> None:
             back = jax.jit(jax.grad(lambda numbers, weights: jnp.vdot(weights, values(numbers))))(numbers, weights)
             along = sum(float(jnp.vdot(slope, tangent)) for slope, tangent in zip(back, tangents, strict=True))
             both = abs(along - float(jnp.vdot(weights, exact))) / abs(along)
-            print(
-                f"{align}, {name}: {whole.sum()} of {whole.size} rays, largest derivative {np.abs(exact).max():.3g}, largest "
-                f"difference {error:.1e} of it; reverse against forward {both:.1e}",
-                flush=True,
-            )
+            row = {"rays": whole.sum(), "largest derivative": np.abs(exact).max(), "largest difference, of it": error}
+            run.row(f"{align}, {name}", row | {"reverse against forward": both})
+            right = error < 1e-7 and both < 1e-10
+            run.claim(right, f"{align}, {name}: off by {error:.1e} and {both:.1e}, at most 1e-7 and 1e-10")
 
 
 @functools.cache
@@ -260,7 +252,7 @@ def _mjx_model(path: str | None, side: int):
         terrain = np.asarray(jaxhf.load_image(path)).mean(-1)[::-1]
     terrain = (terrain - terrain.min()) / np.ptp(terrain)
     (nrow, ncol), height = terrain.shape, 1.0 if path is None else 0.05  # as in playground's scenes of rough terrain
-    model = mujoco.MjModel.from_xml_string(
+    model = hfields.mujoco.MjModel.from_xml_string(
         f"""<mujoco><option timestep="0.004" iterations="4" ls_iterations="6"/>
         <asset><hfield name="h" nrow="{nrow}" ncol="{ncol}" size="10 10 {height} 1"/></asset>
         <worldbody><geom name="ground" type="hfield" hfield="h"/>
@@ -270,12 +262,11 @@ def _mjx_model(path: str | None, side: int):
     return model, mjx
 
 
-def in_mjx(path: str | None, steps: int, robots: int) -> None:
+def in_mjx(run: benchmark.Run, path: str | None, steps: int, robots: int) -> None:
     """Steps a second of balls on a terrain, with a height scan in every step and without."""
     model, mjx = _mjx_model(path, 32)
     ground = HField.from_model(model, "ground")
     on_device = mjx.put_model(model)
-    print(f"terrain {ground.data.shape}, {robots} balls, {steps} steps")
 
     def rolled(scans: bool, data, ground):
         def step(carry, _):
@@ -297,37 +288,46 @@ def in_mjx(path: str | None, steps: int, robots: int) -> None:
     found = {}
     for scans in (False, True, False, True):
         program = found.setdefault(scans, [jax.jit(functools.partial(rolled, scans)), 0.0])
-        found[scans][1] = max(found[scans][1], rate(lambda program=program: program[0](data, ground), steps * robots, 5))
+        best = min(benchmark.seconds(lambda program=program: program[0](data, ground), 5))
+        found[scans][1] = max(found[scans][1], steps * robots / best)
     state, total = found[True][0](data, ground)
-    print(f"without scans {found[False][1]:.0f} steps a second, with 187 rays in each {found[True][1]:.0f}")
     here = height_scan(ground, state.qpos[:, :3], state.qpos[:, 3:7], np.zeros((1, 2))).heights[:, 0]
     above = np.asarray(state.qpos[:, 2] - here)
-    print(f"mean clearance {float(total) / steps:.3f} m; balls of 0.15 m end {above.min():.3f} to {above.max():.3f} m high")
+    rates = {"steps a second": found[False][1], "with 187 rays in each": found[True][1]}
+    ends = {"mean clearance, m": float(total) / steps, "lowest end": above.min(), "highest": above.max()}
+    run.row(f"{robots} balls, {steps} steps, terrain {ground.data.shape}", rates | ends)
+    near = above.min() > 0.1 and above.max() < 0.25
+    run.claim(near, f"balls of 0.15 m end {above.min():.3f} to {above.max():.3f} m above what scans say, within 0.1 and 0.25")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="*", help="parity, speed, gradient, mjx")
+    run = benchmark.Run(
+        __doc__,
+        needs="mujoco, for mjx mujoco-mjx",
+        claims="that rays apart from MuJoCo's are few and ties, that none misses where closed forms know, that height_scan is "
+        "20 times as fast as mj_ray, that other heights compile nothing, derivatives are right, and balls stay on the ground",
+    )
+    parser = run.parser
+    parser.add_argument("parts", nargs="*", default=[*PARTS[:3]], choices=PARTS)
     parser.add_argument("--rays", type=int, default=100_000, help="of each case of parity")
     parser.add_argument("--robots", type=int, default=4096, help="of speed")
     parser.add_argument("--steps", type=int, default=100, help="of mjx")
     parser.add_argument("--balls", type=int, default=16, help="of mjx")
     parser.add_argument("--terrain", help="a picture for mjx, as MuJoCo playground's hfield.png; else one of 32 x 32 is made")
-    given = parser.parse_args()
-    parts = given.parts or ["parity", "speed", "gradient"]
-    for part in parts:
+    given = run.parse()
+    benchmark.need("mujoco", *(["mujoco.mjx"] if "mjx" in given.parts else []))
+    for part in given.parts:
         jax.config.update("jax_enable_x64", part in ("parity", "gradient"))
         if part == "parity":
-            parity(given.rays)
-            closed_forms(given.rays // 10)
+            parity(run, given.rays)
+            closed_forms(run, given.rays // 10)
         elif part == "speed":
-            speed(given.robots)
+            speed(run, given.robots)
         elif part == "gradient":
-            gradient()
-        elif part == "mjx":
-            in_mjx(given.terrain, given.steps, given.balls)
+            gradient(run)
         else:
-            parser.error(f"unknown part {part}")
+            in_mjx(run, given.terrain, given.steps, given.balls)
+    run.end()
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ rendering phase, without reading the scene and building its hierarchy; ours is a
 the heights in it. Ours is also shown with what comes before the first frame: reading and compiling.
 """
 
-import argparse
 import math
 import os
 import re
@@ -16,20 +15,10 @@ import tempfile
 import time
 from pathlib import Path
 
+import benchmark
 import numpy as np
 
 SCENES = ("hftest", "landsea-0", "landsea-1", "landsea-2", "texture", "landsea-big", "landsea-big64")
-# Seconds of pbrt-v2's rendering phase: stock on one core, a course's walk over cells without bounds and with bounds for each
-# cell on one core, stock on two. Taken on two cores like those of docs/measurements/speed.md, busy at the time, and handed down
-# with the scenes; nothing was measured for landsea-big64.
-PUBLISHED = {
-    "hftest": (0.10, 0.11, 0.10, 0.10),
-    "landsea-0": (0.60, 1.75, 0.66, 0.32),
-    "landsea-1": (0.70, 1.50, 0.64, 0.35),
-    "landsea-2": (0.57, 1.12, 0.57, 0.35),
-    "texture": (0.46, 0.92, 0.44, 0.24),
-    "landsea-big": (1.49, 38.4, 1.36, 0.79),
-}
 
 
 def serve(folder: Path, name: str, devices: int) -> None:
@@ -64,38 +53,27 @@ def pbrt(program: str, scene: Path, cores: set[int]) -> float:
     return float(said[-1])
 
 
-def markdown(rows: dict[str, list[float]]) -> str:
-    """One line a scene: ours on one core and on all, then pbrt-v2's where it ran in turn with ours, else as published."""
-    heads = ("scene", "one core: first", "frame", "all cores: first", "frame", "pbrt-v2, one core", "all cores")
-    heads += ("published: stock, one core", "no bounds", "bounds", "stock, two cores")
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    for name, row in rows.items():
-        first, frame, *theirs = row[: len(row) // 2]
-        first_all, frame_all, *theirs_all = row[len(row) // 2 :]
-        measured = [f"{seconds:.1f}" for seconds in (*theirs, *theirs_all)] or ["-"] * 2
-        published = [f"{seconds:.2f}" for seconds in PUBLISHED.get(name, ())] or ["-"] * 4
-        ours = (f"{first:.1f}", f"{frame:.3f}", f"{first_all:.1f}", f"{frame_all:.3f}")
-        lines.append(f"| {' | '.join((name, *ours, *measured, *published))} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    claims = "with --pbrt that a frame takes less than half of pbrt-v2's time"
+    run = benchmark.Run(__doc__, needs="a folder of the seed scenes, for --pbrt its program", claims=claims)
+    parser = run.parser
     parser.add_argument("folder", type=Path, help="where the .pbrt scenes lie")
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--pbrt", help="the program of pbrt-v2")
-    parser.add_argument("--markdown", action="store_true", help="print a table at the end, with published figures beside ours")
-    parser.add_argument("--serve", metavar="SCENE", help=argparse.SUPPRESS)
-    parser.add_argument("--devices", type=int, default=1, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    parser.add_argument("--serve", metavar="SCENE", help=benchmark.HIDDEN)
+    parser.add_argument("--devices", type=int, default=1, help=benchmark.HIDDEN)
+    options = run.parse()
     if options.serve:
         serve(options.folder, options.serve, options.devices)
         return
+    if missing := [name for name in options.scenes if not (options.folder / f"{name}.pbrt").is_file()]:
+        benchmark.refuse(f"{options.folder} has no {missing[0]}.pbrt")
+    if options.pbrt and not benchmark.have(options.pbrt):
+        benchmark.refuse(f"{options.pbrt}: there is no such program for --pbrt")
     everything = os.sched_getaffinity(0)
     minutes = math.ceil(len(options.scenes) * (35 + 2 * options.repeats * (2 if options.pbrt else 1)) / 60)
     print(f"about {minutes} minutes on two free cores", flush=True)
-    rows: dict[str, list[float]] = {}
     for name in options.scenes:
         for cores in ({min(everything)}, everything):
             command = [sys.executable, __file__, str(options.folder), "--serve", name, "--devices", str(len(cores))]
@@ -112,14 +90,12 @@ def main() -> None:
                     if options.pbrt:
                         theirs.append(pbrt(options.pbrt, options.folder / f"{name}.pbrt", cores))
                 ours.stdin.close()
-            line = f"{name:12s} {len(cores)} cores   first {first:5.1f} s   frame {np.median(times):6.3f} s"
+            row: dict[str, float] = {"first, s": first, "frame": float(np.median(times))}
             if theirs:
-                ratio = np.median(np.array(times) / np.array(theirs))
-                line += f"   pbrt-v2 {np.median(theirs):5.2f} s   ratio {ratio:5.2f}"
-            print(line, flush=True)
-            rows.setdefault(name, []).extend([first, float(np.median(times)), *([float(np.median(theirs))] if theirs else [])])
-    if options.markdown:
-        print(markdown(rows))
+                row |= {"pbrt-v2": float(np.median(theirs)), "ratio": float(np.median(np.array(times) / np.array(theirs)))}
+                run.claim(row["ratio"] < 0.5, f"{name}: {row['ratio']:.2f} of pbrt-v2's time, below 0.5")
+            run.row(f"{name}, {len(cores)} cores", row)
+    run.end()
 
 
 if __name__ == "__main__":

@@ -7,14 +7,12 @@ of 10 pixels unless told otherwise; jaxhf has none. It runs in the Python that -
 for Python 3.11.
 """
 
-import argparse
 import json
 import subprocess
-import sys
 import tempfile
-import time
 from pathlib import Path
 
+import benchmark
 import jax
 import numpy as np
 from scipy.ndimage import zoom
@@ -44,66 +42,65 @@ def terrain(size: int) -> tuple[np.ndarray, float]:
     return np.asarray(heights, np.float32), whole.dx * nx / size
 
 
-def least(repeats: int, fun) -> float:
-    """Seconds of the quickest run, after one that compiles."""
-    jax.block_until_ready(fun())
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        jax.block_until_ready(fun())
-        times.append(time.perf_counter() - begin)
-    return min(times)
-
-
-def errors() -> None:
+def errors(run: benchmark.Run) -> None:
     """The largest error of a slope, and of a sky-view factor, at 1025 x 1025 vertices of which the middle one is at 0, 0."""
     y, x = np.mgrid[-512:513, -512:513].astype(float)
     turns = np.deg2rad(np.arange(AZIMUTHS) * 360 / AZIMUTHS)
     r = np.hypot(x, y)
 
-    def report(name: str, z: np.ndarray, at: tuple[int, int], slopes: np.ndarray) -> None:
+    def report(name: str, z: np.ndarray, at: tuple[int, int], slopes: np.ndarray, most: tuple[float, float]) -> None:
         row, column = 512 + at[1], 512 + at[0]
         found = np.tan(np.deg2rad(np.asarray(jaxhf.horizon(z.astype(np.float32), AZIMUTHS, dx=1.0))[:, row, column]))
         seen = float(jaxhf.sky_view(z.astype(np.float32), AZIMUTHS, dx=1.0)[row, column])
         slopes = np.fmax(slopes, 0)
         share = np.mean(1 - slopes / np.hypot(1, slopes))
-        print(f"| {name} | {np.abs(found - slopes).max():.1e} | {abs(seen - share):.1e} |", flush=True)
+        off = float(np.abs(found - slopes).max()), float(abs(seen - share))
+        run.row(name, {"largest error of a slope": off[0], "of the sky-view factor": off[1]})
+        run.claim(off[0] <= most[0] and off[1] <= most[1], f"{name}: errors {off[0]:.1e}, {off[1]:.1e}, at most {most}")
 
-    print("| surface | largest error of a slope | of the sky-view factor |\n|---|---|---|")
-    report("plane", 0.3 * x + 0.2 * y, (37, -120), 0.3 * np.sin(turns) + 0.2 * np.cos(turns))
-    report("V-shaped valley, from its bottom", 0.7 * np.abs(x), (0, 33), 0.7 * np.abs(np.sin(turns)))
-    report("cone, from its flank", -0.4 * r, (300, 0), 0.4 * -np.sin(turns))
-    report("round pit with conical walls, from its middle", 0.5 * np.clip(r - 100, 0, 300), (0, 0), np.full(AZIMUTHS, 0.375))
+    # At most: docs/measurements/sky-error.csv and a half more, or some roundings.
+    report("plane", 0.3 * x + 0.2 * y, (37, -120), 0.3 * np.sin(turns) + 0.2 * np.cos(turns), (3e-7, 1e-7))
+    report("V-shaped valley, from its bottom", 0.7 * np.abs(x), (0, 33), 0.7 * np.abs(np.sin(turns)), (3e-7, 1e-7))
+    report("cone, from its flank", -0.4 * r, (300, 0), 0.4 * -np.sin(turns), (1e-3, 2.7e-4))
+    pit, walls = 0.5 * np.clip(r - 100, 0, 300), np.full(AZIMUTHS, 0.375)
+    report("round pit with conical walls, from its middle", pit, (0, 0), walls, (3.2e-4, 1.7e-4))
     off = 150 * -np.sin(turns) + np.sqrt(400**2 - (150 * np.cos(turns)) ** 2)  # from (150, 0) to the rim
-    report("round pit with a flat floor and a wall, off its middle", 80.0 * (r >= 400), (150, 0), 80 / off)
+    pit = 80.0 * (r >= 400)
+    report("round pit with a flat floor and a wall, off its middle", pit, (150, 0), 80 / off, (1.2e-3, 3.8e-4))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    claims = "errors of half more, at most, than docs/measurements/sky-error.csv has"
+    run = benchmark.Run(__doc__, needs="matplotlib (Jacksboro's heights), for --peer rvt-py", claims=claims)
+    parser = run.parser
     parser.add_argument("--sizes", type=int, nargs="*", default=[41, 1024, 4096])
     parser.add_argument("--devices", type=int, default=default_devices(), help="cores of jaxhf's [all]")
     parser.add_argument("--peer", help="a Python in which rvt-py is installed")
-    options = parser.parse_args()
+    options = run.parse()
+    benchmark.need("matplotlib")
+    if options.peer and subprocess.run([options.peer, "-c", "import rvt.vis"], capture_output=True).returncode:
+        benchmark.refuse(f"{options.peer} has no rvt-py: pip install --no-deps rvt-py")
     jax.config.update("jax_num_cpu_devices", options.devices)
-    errors()
-    print(f"\nSeconds, {AZIMUTHS} directions, {options.devices} cores for jaxhf, one for rvt-py.\n")
-    print("| heights | jaxhf.horizon | jaxhf.sky_view | rvt-py, radius 10 | rvt-py, radius 100 |\n|---|---|---|---|---|")
+    errors(run)
+    print(f"Seconds, {AZIMUTHS} directions, {options.devices} cores for jaxhf, one for rvt-py.")
     for size in options.sizes:
         z, cell = terrain(size)
         repeats = 3 if size < 2000 else 1
-        row = [least(repeats, lambda z=z, cell=cell: jaxhf.horizon(z, AZIMUTHS, dx=cell)) if size < 2000 else None]
-        row.append(least(repeats, lambda z=z, cell=cell: jaxhf.sky_view(z, AZIMUTHS, dx=cell)))
+        row = {}
+        if size < 2000:
+            row["jaxhf.horizon"] = min(benchmark.seconds(lambda z=z, cell=cell: jaxhf.horizon(z, AZIMUTHS, dx=cell), repeats))
+        row["jaxhf.sky_view"] = min(benchmark.seconds(lambda z=z, cell=cell: jaxhf.sky_view(z, AZIMUTHS, dx=cell), repeats))
         for radius in (10, 100) if options.peer else ():
             if size * radius > 200_000:
-                row.append(None)
                 continue
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "z.npy"
                 np.save(path, z)
                 command = [options.peer, "-c", PEER, str(path), str(cell), str(radius), str(repeats)]
-                row.append(json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout))
-        print(f"| {size} x {size} | " + " | ".join("—" if t is None else f"{t:.3g}" for t in row) + " |", flush=True)
+                row[f"rvt-py, radius {radius}"] = json.loads(subprocess.check_output(command))
+        run.row(f"{size} x {size}", row)
+    run.end()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

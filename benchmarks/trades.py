@@ -7,13 +7,13 @@ here, in a process of their own. Every variant is a process; frames take turns w
 medians of pairs. "difference" is the RMSE of the picture to the first variant's, over its mean.
 """
 
-import argparse
 import json
 import os
 import tempfile
 from pathlib import Path
 from typing import Any
 
+import benchmark
 import numpy as np
 from seeds import SCENES
 
@@ -150,31 +150,20 @@ def measure(scene: Path, cores: list[int], repeats: int, names: list[str]) -> li
     return rows
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    lines = [
-        "| scene | variant | time, of the first | seconds | held, MiB | peak, MiB | difference |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {row['scene']} | {row['variant']} | {row['ratio']:.2f} | {row['seconds']:.3g} | {row['held_mb']:.1f} | "
-        f"{row['peak_mb']:.0f} | {row['difference']:.2g} |"
-        for row in rows
-    ]
-    return "\n".join(lines)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    claims = "that walks and stored triangles change no picture by a bit"
+    run = benchmark.Run(__doc__, needs="a folder of the seed scenes", claims=claims)
+    parser = run.parser
     parser.add_argument("folder", type=Path, help="where the .pbrt scenes lie")
     parser.add_argument("--scenes", nargs="+", default=[name for name in SCENES if name != "landsea-big64"])
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--cores", type=int, default=1, help="that share the work; one by default, as in the reports")
     parser.add_argument("-o", "--output", type=Path, help="keep the figures in this .json")
-    options = parser.parse_args()
+    options = run.parse()
     for name in options.scenes:
         if not (options.folder / f"{name}.pbrt").is_file():
-            parser.error(f"{options.folder / name}.pbrt: there is no such file")
+            benchmark.refuse(f"{options.folder / name}.pbrt: there is no such file")
     cores = sorted(os.sched_getaffinity(0))[: options.cores]
     print(f"about {len(options.scenes) * len(options.variants) / 4:.0f} minutes", flush=True)
     rows: list[dict[str, Any]] = []
@@ -182,7 +171,12 @@ def main() -> None:
         rows += measure(options.folder / f"{name}.pbrt", cores, options.repeats, options.variants)
         if options.output:
             options.output.write_text(json.dumps(rows, indent=1))
-    print(table(rows))
+    for row in rows:
+        title, variant = f"{row.pop('scene')}, {row['variant']}", VARIANTS[row.pop("variant")].get("settings", {})
+        run.row(title, row)
+        if set(variant) <= {"traversal"}:
+            run.claim(row["difference"] == 0, f"{title}: another picture, by {row['difference']:.2g}")
+    run.end()
 
 
 if __name__ == "__main__":
