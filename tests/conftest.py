@@ -77,7 +77,7 @@ def unload_programs() -> Iterator[None]:
     """A compiled program holds some hundred and fifty mappings of memory, and Linux allows a process 65530: it aborts there."""
     yield
     mappings = Path("/proc/self/maps")
-    if not mappings.exists() or mappings.read_bytes().count(b"\n") > 30_000:
+    if not mappings.exists() or mappings.read_bytes().count(b"\n") > 15_000:
         jax.clear_caches()
 
 

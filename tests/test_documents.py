@@ -36,6 +36,7 @@ SLOW = {"docs/gallery.md"}  # minutes
 LARGE = {"README.md", "docs/tutorials/photographs.md"}  # whose time goes into pictures or steps, not into compilation
 DEEP = {  # over four seconds of a processor
     "docs/coming-from/gdal.md",
+    "docs/index.md",
     *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/sun-and-sky")),
     *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "photographs", "robots")),
 }
@@ -147,6 +148,7 @@ def test_a_misspelt_key_is_refused_in_every_part_of_a_scene(reader):
     assert refused > 40
 
 
+@pytest.mark.deep  # test_fit_truth.py has a fit of another's pictures
 def test_the_photographs_show_what_is_found_in_them(reader):
     """The page's own command, and its parts of the case; scenes/recover/case.toml says of which hills the pictures are.
 

@@ -264,6 +264,7 @@ OUTLINES = {
 }
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("name", OUTLINES)
 def test_outline_of_a_skirt(name):
     """Each surface is of one radiance, so nothing but the outline changes the picture."""
@@ -284,6 +285,7 @@ def test_boundary_pixels_are_looked_at_again():
     assert np.abs(finer - jaxhf.render(scene, INTERIOR)[..., 0] / 0.7).max() > 0.1 * LIT
 
 
+@pytest.mark.deep  # each agrees with a truth: here forwards, in rendering/test_users.py in reverse
 def test_forward_and_reverse_agree():
     scene = shadow_scene()
     rng = np.random.default_rng(0)

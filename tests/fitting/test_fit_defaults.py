@@ -95,6 +95,7 @@ def test_a_fit_takes_the_normals_that_explain_rough_terrain(tmp_path, monkeypatc
     assert rms(chosen.heights - rough) < 0.5 * rms(given.heights - rough)
 
 
+@pytest.mark.deep
 def test_evidence_for_other_normals_is_in_the_pictures():
     """Many deviations where they are by angle, none where they are by area."""
     found = {}

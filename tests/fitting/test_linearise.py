@@ -91,7 +91,7 @@ DOUBLE = [pytest.mark.x64, pytest.mark.deep]  # leaves no room for an error that
     ("which", "lights", "view", "settings", "channels", "derivative", "rounding"),
     [
         ("one", SUN, TURNED, SMOOTH, 1, "jvp", 1e-4),
-        ("all", LAMP, {}, FLAT, 1, "vjp", 1e-4),
+        pytest.param("all", LAMP, {}, FLAT, 1, "vjp", 1e-4, marks=pytest.mark.deep),
         pytest.param("all", SUN, TURNED, SMOOTH, 1, "jvp", 1e-10, marks=DOUBLE),
         pytest.param("one", LAMP, {}, jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3, "jvp", 1e-10, marks=DOUBLE),
         pytest.param("all", LAMP, {}, FLAT, 1, "vjp", 1e-10, marks=DOUBLE),

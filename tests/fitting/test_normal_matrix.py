@@ -81,6 +81,7 @@ def test_a_step_solves_the_damped_equations_of_the_loss_itself(rounding):
     assert predicted > 0
 
 
+@pytest.mark.deep  # draws hold the truth in test_fit.py
 def test_draws_have_its_inverse_as_their_covariance(monkeypatch):
     """In the half that pictures show, and in the other, which only the prior knows; and by LSMR, where J is not sparse."""
     known = {"prior": TRUTH, "prior_std": 0.05, "prior_length": 0.1, "noise": 0.005}

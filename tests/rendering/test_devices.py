@@ -122,7 +122,8 @@ def test_pictures_have_the_same_bits_on_any_number_of_devices(found, name):
     assert one["image none"].std() > 0.05
 
 
-@pytest.mark.parametrize("name", ["four", pytest.param("two processes", marks=pytest.mark.deep)])
+@pytest.mark.deep
+@pytest.mark.parametrize("name", ["four", "two processes"])
 def test_derivatives_agree(found, name):
     """Their sums are taken in another order, in single precision."""
     slope = found("one")[0]["slope"]

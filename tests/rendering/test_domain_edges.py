@@ -144,6 +144,7 @@ def brightness(scene: jaxhf.Scene, edge_samples: int = 0) -> jax.Array:
     return jnp.sum(image * jnp.asarray(weights(), image.dtype)) / 100
 
 
+@pytest.mark.deep  # the same rules as of rays below, in some thirty programs
 @pytest.mark.parametrize("kind", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
 def test_pictures(kind):
     for change in PICTURES.values():
@@ -159,6 +160,7 @@ def test_pictures_of_rays_beside_an_axis_or_a_plane():
             assert_right(brightness, scene_with(level(across, z), 0 * HEIGHTS + 0.1))
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("edge_samples", [0, pytest.param(64, marks=pytest.mark.slow)])
 def test_pictures_of_what_no_precision_can_tell(edge_samples):
     """Finite, that is: with points on edges, and where a horizon cuts a sun that is smaller than its rounding."""
@@ -248,7 +250,7 @@ def skies(heights: jax.Array, cell: float, weighting: Any) -> jax.Array:
     ("fun", "kinds"),
     [
         (directions, ("central", "four", "six", "six-angle", "six-equal")),
-        (skies, ("solid-angle", "horizontal", "slope", "degrees")),
+        pytest.param(skies, ("solid-angle", "horizontal", "slope", "degrees"), marks=pytest.mark.deep),
     ],
 )
 def test_maps_in_any_unit(fun, kinds):

@@ -31,8 +31,8 @@ def mirrors(heights) -> jaxhf.Scene:
     ("scene", "aovs", "knobs"),
     [
         (terrain, AOVS, {"traversal": "pyramid"}),
-        (terrain, AOVS, {"traversal": "dda", "max_steps": 5}),
-        (mirrors, (), {"max_depth": 1}),
+        pytest.param(terrain, AOVS, {"traversal": "dda", "max_steps": 5}, marks=pytest.mark.deep),
+        pytest.param(mirrors, (), {"max_depth": 1}, marks=pytest.mark.deep),
     ],
 )
 def test_a_fixed_number_of_steps_gives_the_same_picture(scene, aovs, knobs):

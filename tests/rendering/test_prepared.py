@@ -134,6 +134,7 @@ def test_a_change_that_no_picture_would_show_is_refused():
     assert not any(leaf is ready.scene.heights for leaf in jax.tree.leaves(ready))
 
 
+@pytest.mark.deep
 def test_derivatives_by_what_is_prepared_are_those_by_the_scene():
     found = eqx.filter_grad(lambda ready: jaxhf.render(ready).mean())(jaxhf.prepare(placed(), FLAT))
     of_albedo, of_fov = jax.grad(lambda *values: jaxhf.render(placed(*values), FLAT).mean(), (0, 1))(0.5, 40.0)

@@ -139,6 +139,7 @@ def test_light_agrees_with_mitsuba(name, which):
     assert off <= 2e-5
 
 
+@pytest.mark.deep
 def test_mirrored_shadows_agree_with_mitsuba():
     """Turned land with a texture, a sea that mirrors, a dome with the same texture: half of what the sea shows is dark.
 

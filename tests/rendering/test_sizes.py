@@ -83,6 +83,7 @@ def test_rays_and_maps(shape):
     np.testing.assert_array_equal(np.isnan(maps[4]), np.isnan(z))
 
 
+@pytest.mark.deep  # they call the same pictures and maps
 @pytest.mark.parametrize("shape", SIZES)
 def test_commands(shape, tmp_path, monkeypatch):
     """`view` of 1024 x 1024 heights and more ended in a traceback, for a sum of XLA's library within a kernel."""

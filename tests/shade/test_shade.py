@@ -185,7 +185,9 @@ def test_shadows_of_rough_terrain(kind):
     assert sure.mean() > 0.9
 
 
-@pytest.mark.parametrize("place", [(16, 16), (12, 20), (14.5, 18.25), (14.5, 18), (7.25, 21.5)])
+@pytest.mark.parametrize(
+    "place", [(16, 16), (14.5, 18.25), *(pytest.param(place, marks=DEEP) for place in ((12, 20), (14.5, 18), (7.25, 21.5)))]
+)
 @OPTIMISED
 @aimed.PRECISIONS
 def test_a_light_on_the_ground_is_not_behind_it(place, dtype):

@@ -232,6 +232,7 @@ def test_a_gradient_of_zero_points_nowhere(monkeypatch):
     assert errors == {"cosine": 0.0, "relative_error": 1.0, "spread": 0.0}
 
 
+@pytest.mark.deep
 def test_small_fits_are_measured_on_any_shape(sweep):
     """The side that is short already stays as it is; there need be no reference."""
     heights = np.random.default_rng(0).uniform(0, 0.1, (3, 40)).astype(np.float32)
