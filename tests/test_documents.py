@@ -32,13 +32,13 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
-SLOW = {"docs/gallery.md"}  # minutes
+SLOW = {"docs/gallery.md", "docs/tutorials/photographs.md"}  # minutes; what the latter finds has a test of its own
 LARGE = {"README.md", "docs/tutorials/photographs.md"}  # whose time goes into pictures or steps, not into compilation
 DEEP = {  # over four seconds of a processor
     "docs/coming-from/gdal.md",
     "docs/index.md",
     *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/sun-and-sky")),
-    *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "photographs", "robots")),
+    *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "robots")),
 }
 FOREIGN = {"gdaldem", "gdalinfo", "gdal_translate"}  # programs that may not be here
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]

@@ -92,7 +92,7 @@ DOUBLE = [pytest.mark.x64, pytest.mark.deep]  # leaves no room for an error that
     [
         ("one", SUN, TURNED, SMOOTH, 1, "jvp", 1e-4),
         pytest.param("all", LAMP, {}, FLAT, 1, "vjp", 1e-4, marks=pytest.mark.deep),
-        pytest.param("all", SUN, TURNED, SMOOTH, 1, "jvp", 1e-10, marks=DOUBLE),
+        pytest.param("all", SUN, TURNED, SMOOTH, 1, "jvp", 1e-10, marks=[pytest.mark.x64, pytest.mark.slow]),
         pytest.param("one", LAMP, {}, jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3, "jvp", 1e-10, marks=DOUBLE),
         pytest.param("all", LAMP, {}, FLAT, 1, "vjp", 1e-10, marks=DOUBLE),
     ],

@@ -106,7 +106,7 @@ def found(tmp_path_factory) -> Found:
     return run
 
 
-FURTHER = [pytest.param(name, marks=pytest.mark.deep) for name in ("some of four", "two processes")]
+FURTHER = [pytest.param("some of four", marks=pytest.mark.slow), pytest.param("two processes", marks=pytest.mark.deep)]
 
 
 @pytest.mark.parametrize("name", ["four", *FURTHER])
@@ -122,8 +122,9 @@ def test_pictures_have_the_same_bits_on_any_number_of_devices(found, name):
     assert one["image none"].std() > 0.05
 
 
-@pytest.mark.deep
-@pytest.mark.parametrize("name", ["four", "two processes"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("four", marks=pytest.mark.slow), pytest.param("two processes", marks=pytest.mark.deep)]
+)
 def test_derivatives_agree(found, name):
     """Their sums are taken in another order, in single precision."""
     slope = found("one")[0]["slope"]

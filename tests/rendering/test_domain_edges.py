@@ -151,7 +151,7 @@ def test_pictures(kind):
         assert_right(brightness, change(scene_with(CAMERAS[kind])))
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_pictures_of_rays_beside_an_axis_or_a_plane():
     """Beside the cylinder's axis, and in the planes of walls and of flat terrain."""
     for across in (0.0, *TINY):
@@ -221,7 +221,7 @@ def on_sensors(data: jax.Array, pos: jax.Array, quat: jax.Array) -> jax.Array:
     return total + jnp.sum(mujoco.depth_image(field, pos, quat, 4, 4)[0])
 
 
-@pytest.mark.deep  # their rays are those above
+@pytest.mark.slow  # their rays are those above
 def test_sensors():
     """Upright; turned by right angles, of which one leaves no heading; and not turned by a number at all."""
     pos, half = np.array([[0.3, 0.2, 2.0]]), np.sqrt(0.5)

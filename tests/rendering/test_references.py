@@ -22,7 +22,8 @@ from jaxhf.rendering.cast import cast_camera
 FOLDER = Path(__file__).parents[1] / "references"
 CYLINDER, MATTE, MIRROR = 1, 2, 3
 TERRAINS = ["rays-hills", pytest.param("rays-valley", marks=pytest.mark.deep)]
-LARGER = [pytest.param(name, marks=pytest.mark.deep) for name in ("landsea-0", "landsea-1", "texture", "landsea-big")]
+LARGER = [pytest.param(name, marks=pytest.mark.deep) for name in ("landsea-0", "landsea-1", "texture")]
+LARGER += [pytest.param("landsea-big", marks=pytest.mark.slow)]
 LIT_BY_COLOUR = ["hftest", *(case for case in LARGER if case.values != ("texture",))]
 
 

@@ -87,7 +87,9 @@ def test_depth_and_its_derivative_where_heights_are_traced(kind):
 
 @pytest.mark.deep
 @pytest.mark.x64  # as its truth is `cast` in double precision
-@pytest.mark.parametrize(("kind", "tall"), [(KINDS[0], 30.0), (KINDS[0], 3e6), (KINDS[1], 1e5)])
+@pytest.mark.parametrize(
+    ("kind", "tall"), [pytest.param(KINDS[0], 30.0, marks=pytest.mark.slow), (KINDS[0], 3e6), (KINDS[1], 1e5)]
+)
 def test_nothing_is_lost_in_front_of_the_ground(kind, tall):
     """Peaks that reach towards the camera, and beyond it; walls; a second terrain on the way, which is turned and larger."""
     heights = HEIGHTS.astype(np.float64)
