@@ -105,9 +105,9 @@ def maps() -> Named:
 
 def results(out: Path) -> None:
     """All of them, computed by the package that this process imports."""
-    np.savez(
-        out, **{name: np.asarray(values) for part in (pictures, settings, derivatives, rays, maps) for name, values in part()}
-    )
+    parts = (pictures, settings, derivatives, rays, maps)
+    named: dict[str, Any] = {name: np.asarray(values) for part in parts for name, values in part()}
+    np.savez(out, **named)
 
 
 def main() -> None:

@@ -5,6 +5,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -39,7 +40,7 @@ def _programs(config: pytest.Config) -> Path:
         temporary = tempfile.TemporaryDirectory(prefix="jaxhf-tests-", ignore_cleanup_errors=True)
         config.add_cleanup(temporary.cleanup)
         return Path(temporary.name)
-    folder = config.cache.mkdir(f"programs-{jax.lib.__version__}")
+    folder = config.cache.mkdir(f"programs-{version('jaxlib')}")
     for path in folder.iterdir():
         used = path.stat()
         if time.time() - max(used.st_atime, used.st_mtime) > 14 * 86400:
