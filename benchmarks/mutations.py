@@ -49,7 +49,7 @@ cameras: scene/camera.py -> scene/test_scene.py scene/test_framing.py scene/test
 cameras: scene/framing.py -> scene/test_framing.py scene/test_projections.py scene/test_scene.py
 lights: scene/sun.py -> scene/test_sun.py
 lights: scene/light.py -> scene/test_scene.py scene/test_sun.py shade/test_shade.py
-lights: shade/lighting.py -> shade/test_shade.py shade/test_hidden_sky.py shade/test_penumbra.py
+lights: shade/lighting.py -> shade/test_shade.py shade/test_hidden_sky.py shade/test_penumbra.py rendering/test_gradient.py
 tiles: rendering/tiles.py rendering/samples.py -> rendering/test_render.py rendering/test_bits.py
 tiles: rendering/chunks.py -> rendering/test_cast.py rendering/test_bits.py
 maps: maps/hillshade.py maps/slope.py maps/surface.py maps/choices.py -> maps/test_maps.py
