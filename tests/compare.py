@@ -14,7 +14,6 @@ import oracle
 
 import jaxhf
 
-DTYPES = [np.float32, np.float64]
 SLACK = {np.float32: 8 * 2.0**-24, np.float64: 8 * 2.0**-53}
 DOWN = np.array([0.0, 0.0, -1.0])
 # One size of field and of batch for many tests: each other one is compiled anew.

@@ -33,7 +33,7 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 SLOW = {"docs/gallery.md", "docs/tutorials/photographs.md"}  # minutes; what the latter finds has a test of its own
-LARGE = {"README.md", "docs/tutorials/photographs.md"}  # whose time goes into pictures or steps, not into compilation
+LARGE = {"README.md"}  # whose time goes into pictures or steps, not into compilation
 DEEP = {  # over four seconds of a processor
     "docs/coming-from/gdal.md",
     "docs/index.md",
