@@ -32,12 +32,6 @@ from mutants import OPERATORS, WithoutDerivative, counts
 
 ROOT = Path(__file__).parents[1]
 TABLE = ROOT / "docs" / "measurements" / "mutations.csv"
-# Most of the time goes into compilation of changed programs, which no cache holds. A test that says otherwise keeps its word.
-PLUGIN = """import pytest
-def pytest_collection_modifyitems(items):
-    for item in items:
-        item.add_marker(pytest.mark.unoptimised)
-"""
 DERIVED = re.compile("trace/(normals|intersect)|scene/camera|shade|boundary/(term|sample)")  # where derivatives may go missing
 
 # Room: modules -> pytest's arguments for the tests aimed at them, those first that fail soonest.
@@ -56,8 +50,8 @@ maps: maps/hillshade.py maps/slope.py maps/surface.py maps/choices.py -> maps/te
 maps: maps/ramp.py maps/relief.py -> maps/test_maps.py maps/test_tint_values.py cli/test_hillshade.py '-k=tint or colour'
 maps: maps/shadows.py -> maps/test_shadows.py
 maps: maps/skyview.py maps/windows.py -> maps/test_skyview.py
-mujoco: mujoco/[hprs]*[dreys].py -> mujoco/test_sensors.py mujoco/test_ray.py -pno:unoptimised
-mujoco: mujoco/scan.py -> mujoco/test_scan.py mujoco/test_scan_beneath.py -pno:unoptimised
+mujoco: mujoco/[hprs]*[dreys].py -> mujoco/test_sensors.py mujoco/test_ray.py --optimised
+mujoco: mujoco/scan.py -> mujoco/test_scan.py mujoco/test_scan_beneath.py --optimised
 io: io/images.py io/files.py io/films.py io/png.py -> io/test_images.py io/test_files.py io/test_full_disk.py
 io: io/procedural.py -> io/test_procedural.py
 io: io/pbrt/*.py -> io/test_pbrt.py
@@ -125,13 +119,12 @@ class Tree:
         for part in ("jaxhf", "tests", "scenes", "docs"):
             shutil.copytree(ROOT / part, self.root / part)
         shutil.copy(ROOT / "pyproject.toml", self.root)
-        (self.root / "unoptimised.py").write_text(PLUGIN)
         (folder / "shared").symlink_to(ROOT.parent / "shared")  # scenes that are not part of the project
 
     def run(self, tests: str, limit: float = 3600) -> tuple[str, str]:
         """What became of a change, in so many seconds of processor time; and the test that failed, with its error."""
         names = [part if part.startswith("-") else f"tests/{part}" for part in shlex.split(tests)]
-        command = [sys.executable, "-m", "pytest", "-xqrfE", "--tb=no", "-p", "no:cacheprovider", "-p", "unoptimised"]
+        command = [sys.executable, "-m", "pytest", "-xqrfE", "--tb=no", "-p", "no:cacheprovider"]
         command += ["-m", "not slow and not deep", *names]
         programs = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(self.root / "programs"))
         changed = {"PYTHONPATH": str(self.root), "JAX_COMPILATION_CACHE_DIR": programs, "COLUMNS": "400"}

@@ -1,4 +1,8 @@
-"""Every test runs as users run it, single precision and no flags, but that types and ranks do not promote by themselves."""
+"""Tests run as users run jaxhf, in single precision and without flags, but for two things.
+
+Types and ranks do not promote by themselves; and programs are compiled without most optimisations, in half the time. What
+needs the bits or the speed of users' programs is marked `optimised`; `--optimised` compiles them all so.
+"""
 
 import gc
 import os
@@ -21,6 +25,7 @@ SEEDS = Path(__file__).parents[2] / "shared" / "pbrt"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--optimised", action="store_true", help="compile every test's programs as users do")
     parser.addoption("--no-skips", action="store_true", help="fail where a test was skipped")
 
 
@@ -55,22 +60,19 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A file's tests share compiled programs, so they stay on one worker; pages have groups of their own."""
-    for item in items:
-        if item.get_closest_marker("xdist_group") is None:
-            item.add_marker(pytest.mark.xdist_group(str(item.path)))
-
-
 @pytest.hookimpl(tryfirst=True)  # before what fixtures compile
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """What `x64` and `unoptimised` ask for, the latter in processes that a test starts, too; `(False)` excepts a test."""
+    """What `x64`, `optimised` and `slow` ask for; how programs are compiled goes to processes that a test starts, too.
+
+    Most of the time goes into compilation, and most checks hold whatever a compiler does with rounding.
+    """
     x64 = item.get_closest_marker("x64")
     jax.config.update("jax_enable_x64", x64 is not None and x64.args != (False,))
-    marker = item.get_closest_marker("unoptimised")
-    unoptimised = marker is not None and marker.args != (False,)
-    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(unoptimised)
-    jax.config.update("jax_disable_most_optimizations", unoptimised)
+    optimised = item.config.option.optimised or any(map(item.get_closest_marker, ("optimised", "slow")))
+    if jax.config.read("jax_disable_most_optimizations") == optimised:
+        jax.clear_caches()  # which do not know how their programs were compiled
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(not optimised)
+    jax.config.update("jax_disable_most_optimizations", not optimised)
 
 
 @pytest.fixture(autouse=True, scope="module")

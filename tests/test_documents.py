@@ -33,7 +33,6 @@ DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 SLOW = {"docs/gallery.md", "docs/tutorials/photographs.md"}  # minutes; what the latter finds has a test of its own
-LARGE = {"README.md"}  # whose time goes into pictures or steps, not into compilation
 DEEP = {  # over four seconds of a processor
     "docs/coming-from/gdal.md",
     "docs/index.md",
@@ -119,10 +118,10 @@ def reader(tmp_path, monkeypatch) -> Iterator[None]:
 
 
 def page(name: str) -> Any:
-    """Cheap ones compile sooner, to slower programs."""
+    """README's blocks as users run them; the others compile sooner, to slower programs."""
     tier = [pytest.mark.slow] if name in SLOW else [pytest.mark.deep] if name in DEEP else []
-    how = [] if name in SLOW | LARGE else [pytest.mark.unoptimised]
-    return pytest.param(name, marks=[*tier, *how, pytest.mark.xdist_group(name)])
+    how = [pytest.mark.optimised] if name == "README.md" else []
+    return pytest.param(name, marks=[*tier, *how])
 
 
 @pytest.mark.parametrize("name", [page(name) for name in NAMES])

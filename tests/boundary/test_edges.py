@@ -24,7 +24,6 @@ from jaxhf.boundary.silhouette import STEPS
 from jaxhf.scene.localise import localise
 from jaxhf.trace.world import make_world, resolve_settings
 
-pytestmark = pytest.mark.unoptimised
 EDGES = jaxhf.Settings(samples=16, edge_samples=4000)
 INTERIOR = jaxhf.Settings(samples=16)
 KEY = jax.random.key(0)  # that of a render without one

@@ -27,7 +27,6 @@ from jaxhf.io.toml.fit import load_case
 if sys.platform != "win32":
     import pty
 
-pytestmark = pytest.mark.unoptimised
 
 CASE = """
 camera = { type = "perspective", eye = [500120, 4100120, 720], target = [500120, 4100120, 0], up = [0, 1, 0], fov = 18 }

@@ -16,8 +16,6 @@ from jaxhf.io.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.terrain import Terrain
 from jaxhf.rendering import render as _render, view as looks
 
-pytestmark = pytest.mark.unoptimised
-
 SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
 MORNING, EVENING = "2026-06-21T05:00:00Z", "2026-06-21T18:00+01:00"
 

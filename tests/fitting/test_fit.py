@@ -17,8 +17,6 @@ from jaxhf.fitting.basis import make_basis
 from jaxhf.fitting.solvers import Outcome
 from jaxhf.fitting.view import differences
 
-pytestmark = pytest.mark.unoptimised
-
 
 @pytest.fixture(scope="module")
 def targets() -> list[np.ndarray]:
@@ -69,6 +67,7 @@ def test_robust_losses_let_wild_pixels_go(targets):
     assert 10 * max(off["huber"], off["cauchy"], off["geman"]) < off["squares"], off
 
 
+@pytest.mark.deep  # each alone, and wild pixels, are in other tests
 def test_exposures_and_the_albedo_come_back_in_spite_of_outliers(targets):
     """As a product. A twentieth of the pixels is wild."""
     rng, truth = np.random.default_rng(1), np.array([1.0, 1.2, 0.9])
@@ -219,6 +218,7 @@ def test_what_no_picture_shows_is_marked():
     assert np.isfinite(found.std[found.seen]).all()
 
 
+@pytest.mark.deep  # no fit takes them by itself
 @pytest.mark.parametrize("solver", ["bfgs", "lbfgs", "adam"])
 def test_other_solvers_come_near(targets, solver):
     found = jaxhf.fit(scenes(), targets, settings=SETTINGS, noise=0.01, loss="squares", solver=solver, max_steps=80)

@@ -20,8 +20,6 @@ from jaxhf.fitting.fingerprint import fingerprint as fit_fingerprint
 from jaxhf.fitting.problem import make_problem
 from jaxhf.fitting.solvers import Outcome
 
-pytestmark = pytest.mark.unoptimised
-
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256, edge_samples=0)
 # Two levels, steps 1 to 9 and 10 to 18; then the loss becomes as sharp as it is to be.
 OPTIONS = {

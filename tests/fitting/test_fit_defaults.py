@@ -26,8 +26,6 @@ from jaxhf.fitting.residuals import linearised, picture_residuals
 from jaxhf.fitting.uncertainty import with_unexplained
 from jaxhf.scene.localise import localise
 
-pytestmark = pytest.mark.unoptimised
-
 
 def test_noise_that_is_not_given_is_estimated():
     """To a tenth, of each picture its own, in spite of a robust loss and of pixels that are far off."""

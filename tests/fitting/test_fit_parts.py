@@ -25,8 +25,6 @@ from jaxhf.fitting.robust import influence_function, soften
 from jaxhf.scene.localise import localise
 from jaxhf.xla.devices import local_mesh
 
-pytestmark = pytest.mark.unoptimised
-
 
 def without_pictures(field: jaxhf.Heightfield, **values: Any) -> Problem:
     """The problem of a fit to no pictures."""

@@ -10,8 +10,6 @@ import pytest
 
 import jaxhf
 
-pytestmark = pytest.mark.unoptimised
-
 SIZE, NOISE, HEIGHT = 16, 0.002, 0.12
 X, Y = np.meshgrid(np.linspace(0, 0.4, 13), np.linspace(0, 1, 21))
 HILL = HEIGHT * np.exp(-(((X - 0.2) / 0.06) ** 2) / 2 - ((Y - 0.5) / 0.12) ** 2 / 2)

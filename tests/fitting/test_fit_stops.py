@@ -8,13 +8,10 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-import pytest
 
 import jaxhf
 from jaxhf.fitting.history import Pace, printed_progress
 from jaxhf.fitting.solvers import LevenbergMarquardt
-
-pytestmark = pytest.mark.unoptimised
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
 # Slopes up to 3, seen from above in one picture of one light; the prior is the terrain smoothed, and says little.

@@ -64,6 +64,7 @@ def require_terrain(found: jaxhf.Fit, known: dict[str, np.ndarray], ratio: float
     assert found.settings.edge_samples  # chosen, as border and shadows are in sight
 
 
+@pytest.mark.optimised  # as users compile it
 @pytest.mark.parametrize(("name", "ratio"), [("fit-small", 7.0), pytest.param("fit-valley", 9.0, marks=pytest.mark.slow)])
 def test_the_plain_call_finds_the_terrain_and_how_sure_it_is(name, ratio):
     """As measured 12 times nearer than the map; one and two deviations hold 80 and 97, 85 and 99 % of the heights.

@@ -22,8 +22,6 @@ from jaxhf.trace.grid import Grid
 from jaxhf.trace.world import make_world
 from jaxhf.xla.devices import local_mesh
 
-pytestmark = pytest.mark.unoptimised
-
 PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])
 
 CAMERA = jaxhf.Perspective.look_at((0.6, -0.8, 0.9), (0.5, 0.5, 0.1), fov=50.0, width=37, height=22)
@@ -90,7 +88,7 @@ DOUBLE = [pytest.mark.x64, pytest.mark.deep]  # leaves no room for an error that
 @pytest.mark.parametrize(
     ("which", "lights", "view", "settings", "channels", "derivative", "rounding"),
     [
-        ("one", SUN, TURNED, SMOOTH, 1, "jvp", 1e-4),
+        pytest.param("one", SUN, TURNED, SMOOTH, 1, "jvp", 1e-4, marks=pytest.mark.deep),  # fits and their matrix rest on it
         pytest.param("all", LAMP, {}, FLAT, 1, "vjp", 1e-4, marks=pytest.mark.deep),
         pytest.param("all", SUN, TURNED, SMOOTH, 1, "jvp", 1e-10, marks=[pytest.mark.x64, pytest.mark.slow]),
         pytest.param("one", LAMP, {}, jaxhf.Settings(samples=4, chunk=256, edge_samples=300), 3, "jvp", 1e-10, marks=DOUBLE),

@@ -8,8 +8,6 @@ import jaxhf
 from jaxhf.fitting.findings import misfit_of_length
 from jaxhf.fitting.problem import make_problem
 
-pytestmark = pytest.mark.unoptimised
-
 SUNS = ((315, 20), (60, 30), (180, 40))
 SETTINGS = jaxhf.Settings(normals="six", edge_samples=0)
 N = 33

@@ -102,6 +102,7 @@ def test_derivatives_are_differences_of_mujocos_rays():
     assert not any(np.any(slope) for slope in program(*singles, weights * missed[:, None])[2])
 
 
+@pytest.mark.optimised  # to the bit
 def test_prepared_and_replaced():
     """Bounds at hand change no bit; `dataclasses.replace` makes a height field anew; a quat of zero turns nothing."""
     o, d = cases(Reference(GROUND, SIZE), GROUND)

@@ -50,7 +50,7 @@ def test_agrees_with_oracle_over_holes(dtype):
 
 
 @aimed.PRECISIONS
-@pytest.mark.unoptimised(False)  # to the bit, which other compilations need not keep
+@pytest.mark.optimised  # to the bit, which other compilations need not keep
 def test_traversals_agree(dtype):
     """The pyramid of bounds passes over cells in which nothing happens, and over no others: not a bit may change.
 

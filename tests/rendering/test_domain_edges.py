@@ -18,7 +18,6 @@ import jaxhf
 from jaxhf import mujoco
 from jaxhf.core.vector import angle, quotient, time_to, unit
 
-pytestmark = pytest.mark.unoptimised
 PIXELS = 8
 HEIGHTS = np.random.default_rng(0).uniform(0, 0.2, (9, 9))
 TEXTURE = jaxhf.ImageTexture(np.random.default_rng(1).uniform(0.2, 0.9, (3, 4, 3)))
@@ -202,6 +201,7 @@ def on_hfield(data: jax.Array, size: jax.Array, quat: jax.Array, pnt: jax.Array,
     return jnp.sum(t) + jnp.sum(n @ jnp.asarray([1, 2, 3], n.dtype))
 
 
+@pytest.mark.deep
 def test_rays_of_robots():
     size, upright = np.array([4, 4, 1, 1.0]), np.array([1, 0, 0, 0.0])
     for across in (0.0, *TINY, -1e-20, -1e-37):

@@ -22,8 +22,6 @@ from jaxhf.scene.light import Light
 from jaxhf.scene.material import Material
 from jaxhf.scene.scene import Shape
 
-pytestmark = pytest.mark.unoptimised
-
 SIZE = 16  # pixels
 STEP = 1e-4
 

@@ -101,7 +101,6 @@ def assert_finite(name: str, pixels: int, settings: Settings) -> None:
     np.testing.assert_array_equal(np.asarray(gradient.heights)[~np.isfinite(scene.heights)], 0)
 
 
-@pytest.mark.unoptimised
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.deep) if name == "holes" else name for name in EXTREMES])
 def test_finite(name):
     assert_finite(name, 16, Settings(edge_samples=300, chunk=256))

@@ -70,6 +70,7 @@ def test_a_gradient_stores_little_of_each_sample():
     assert max(stored) < 12 * 4 * 1024  # numbers, of 4 samples of 1024 pixels
 
 
+@pytest.mark.deep
 def test_no_matrix_product_has_the_accelerators_precision():
     """By default TPUs multiply matrices in bfloat16 and GPUs in TF32: 8 and 11 bits of an offset or a direction."""
     field = jaxhf.Heightfield(HEIGHTS, x0=5e5, y0=4e6)

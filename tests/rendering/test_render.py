@@ -13,8 +13,6 @@ import pytest
 import jaxhf
 from jaxhf.rendering.render import require_key
 
-pytestmark = pytest.mark.unoptimised
-
 EYE, TARGET = (-0.25, -0.75, 1.25), (0.5, 0.5, 0.125)  # exact in binary, so that an offset takes nothing from them
 WIDTH, HEIGHT, FOV = 24, 16, 24.0
 SKY = np.array([0.1, 0.2, 0.4], np.float32)
@@ -183,7 +181,7 @@ def test_single_precision_agrees_with_double():
     assert np.abs(single - double)[inside].max() < 1e-4
 
 
-@pytest.mark.unoptimised(False)  # two programs, whose bits are the same as users compile them
+@pytest.mark.optimised  # two programs, whose bits are the same as users compile them
 @pytest.mark.parametrize("transformation", [jax.jit, jax.jacfwd, jax.vmap])
 def test_there_is_no_progress_within_a_transformation(transformation):
     heights = jnp.zeros((1, 3, 3) if transformation is jax.vmap else (3, 3), np.float32)

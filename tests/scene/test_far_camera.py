@@ -119,6 +119,7 @@ def test_points_are_projected_to_where_they_are_seen(kind):
     np.testing.assert_allclose(local.viewpoint()[0], np.asarray(eye) - at_place * CORNER, rtol=1e-6)
 
 
+@pytest.mark.deep
 @pytest.mark.x64  # to see motions of 1e-6 rad
 def test_a_fit_turns_a_far_camera_about_its_eye():
     """As it turns one whose rays begin there; and reads the same motion from it."""

@@ -44,7 +44,6 @@ def test_a_hidden_sky_is_that_of_many_suns():
     assert abs(np.mean(hidden - total)) < 0.004
 
 
-@pytest.mark.unoptimised
 def test_an_object_may_be_turned_and_scaled_but_not_tilted():
     plain = jaxhf.render(scene(RIDGES, [jaxhf.Sky(1.0, occlusion=4)], np.diag([1, 1, 1.5, 1])))
     turned = jaxhf.render(scene(RIDGES, [jaxhf.Sky(1.0, occlusion=4)], TURNED))
@@ -57,7 +56,6 @@ def test_an_object_may_be_turned_and_scaled_but_not_tilted():
         jaxhf.Sky(1.0, occlusion=0)
 
 
-@pytest.mark.unoptimised
 @pytest.mark.x64  # for differences of 1e-6
 def test_its_derivative_is_that_of_differences():
     base = scene(jnp.asarray(RIDGES), [jaxhf.Sky(1.0, occlusion=4)])

@@ -12,7 +12,6 @@ import pytest
 
 import jaxhf
 
-pytestmark = pytest.mark.unoptimised
 SIZE, DIAMETER, LOW = 24, 4.0, 12.0
 TOWARDS = jaxhf.Directional.from_angles(270, LOW).towards
 Y, X = np.mgrid[0:25, 0:33].astype(float)
@@ -61,7 +60,7 @@ def mean_of_suns(heights, count=1024):
     return total
 
 
-@pytest.mark.unoptimised(False)  # as users compile it
+@pytest.mark.optimised  # as users compile it
 def test_a_sun_is_the_mean_of_1024_suns():
     found, mean = np.asarray(picture(PEAKS, TOWARDS))[*PIXELS], mean_of_suns(PEAKS)
     share = mean / mean.max()  # of the sun that is seen, as all pixels lie in the plane

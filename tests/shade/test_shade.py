@@ -16,8 +16,7 @@ import jaxhf
 from jaxhf.shade.lighting import rounded_clamp
 from jaxhf.shade.radiance import _reflect
 
-pytestmark = pytest.mark.unoptimised  # but for shadows, which are as users compile them
-OPTIMISED, DEEP = pytest.mark.unoptimised(False), pytest.mark.deep
+OPTIMISED, DEEP = pytest.mark.optimised, pytest.mark.deep
 ROUNDING = 4e-6
 ALBEDO = np.array([0.2, 0.5, 0.8])
 RADIANCE = np.array([1.0, 2.0, 3.0])

@@ -23,8 +23,6 @@ from jaxhf.study.measure import Derivative, prepare, thinned
 from jaxhf.study.plan import COLUMNS, Configuration, Sweep, plan, read_rows
 from jaxhf.study.worker import MeasurementError, Worker, timed
 
-pytestmark = pytest.mark.unoptimised
-
 
 @pytest.fixture
 def sweep(tmp_path) -> Sweep:

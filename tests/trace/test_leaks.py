@@ -66,13 +66,18 @@ def assert_none(wrong: np.ndarray, ground: aimed.Ground, o: np.ndarray, d: np.nd
     )
 
 
-@pytest.mark.parametrize("shapes", [SHAPES[:-1], pytest.param(SHAPES[-1:], marks=pytest.mark.deep)], ids=["small", "large"])
+@pytest.mark.optimised
+@pytest.mark.parametrize(
+    "shapes",
+    [SHAPES[1:4:2], pytest.param(SHAPES[:3:2], marks=pytest.mark.deep), pytest.param(SHAPES[4:], marks=pytest.mark.deep)],
+    ids=["small", "narrow", "large"],
+)
 def test_no_leak(shapes):
-    """Among 1e5 rays and more on small grids, and as many as fit on a large one."""
+    """Among 5e4 rays and more on small grids, and as many as fit on a large one."""
     known = np.array([[check(terrain(shape, scale, seed=1), seed=2) for scale in SCALES] for shape in shapes])
-    assert known.sum() > (100_000 if len(shapes) > 1 else 40_000)
-    # The smallest grids have no vertex or edge but those of the border, where nothing is sure.
-    assert known[-1].min() > PER_FAMILY / 3
+    assert known.sum() > (50_000 if len(shapes) > 1 else 40_000)
+    # Narrow grids have no vertex or edge but those of the border, where nothing is sure.
+    assert min(shapes[-1]) == 2 or known[-1].min() > PER_FAMILY / 3
 
 
 @pytest.mark.slow

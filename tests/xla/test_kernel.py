@@ -160,7 +160,7 @@ def scenes() -> dict[str, tuple[jaxhf.Scene, jaxhf.Settings]]:
     return made | {name: (made["plain"][0], settings) for name, settings in knobs.items()}
 
 
-FAST = ("two", "sun")
+FAST = ("sun",)
 
 
 @pytest.mark.parametrize("name", [name if name in FAST else pytest.param(name, marks=pytest.mark.deep) for name in scenes()])

@@ -60,6 +60,7 @@ def is_plain(every: bool) -> bool:
     return answer
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("every", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_plain_mode_gives_the_same(every, tmp_path):
     script = f"import numpy, sys, test_plain as t; numpy.savez(sys.argv[1], **t.outcomes({every})); assert t.is_plain({every})"
