@@ -274,7 +274,8 @@ class Walk(eqx.Module):
         past_diagonal, past_exit = (-gap if above else gap for gap in (cell.gap_diagonal, cell.gap_out))
         on_diagonal = jnp.where(cell.crosses & ~cell.on_own & (near > beyond), past_diagonal, 0)
         on_exit = jnp.where(cell.skip_out | (far <= beyond), 0, past_exit)
-        kind = jnp.where(on_diagonal * far > on_exit * near, 2, cell.through_x.astype(jnp.int32))
+        # A diagonal that is not crossed may lie behind, with a `near` below 0.
+        kind = jnp.where((on_diagonal > 0) & (on_diagonal * far > on_exit * near), 2, cell.through_x.astype(jnp.int32))
         rises = visits & cell.whole & (greater(on_diagonal, on_exit) > 0)
         edge = materialise(jnp.where(rises, self._edge(ix, iy, kind, ahead=True), -1))
         return jnp.where(visits, self._onwards(side, ix, iy, size, cell.out_x, cell.out_y), state), edge

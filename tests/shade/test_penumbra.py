@@ -80,6 +80,21 @@ def test_more_chords_make_smaller_steps():
     assert few > 4 * many
 
 
+def test_a_small_sun_casts_the_shadows_of_a_point():
+    """Beside azimuths 45 and 225 a chord meets cell after cell whose diagonals lie behind the point."""
+    ground = np.random.default_rng(0).uniform(0, 1.5, Y.shape)
+
+    @jax.jit
+    def draw(towards):
+        suns = jaxhf.Sun(towards, np.pi, 0.01), jaxhf.Directional(towards)
+        return [jaxhf.render(scene(ground, [sun]), FLAT)[..., 0] for sun in suns]
+
+    for azimuth in (45, 60, 135, 225, 300):
+        small, point = draw(jnp.asarray(jaxhf.Directional.from_angles(azimuth, LOW).towards, jnp.float32))
+        assert 0.2 < (point > 0).mean() < 0.8
+        assert (abs(small - point) > 0.01).mean() < 0.005  # one pixel lies in a penumbra
+
+
 def test_behind_a_straight_wall_the_sun_is_a_circular_segment():
     found = np.asarray(picture(KNIFE, TOWARDS))
     x = 16 + (np.arange(SIZE) + 0.5) * 10 / SIZE  # of the pixels' columns
@@ -180,6 +195,21 @@ def test_sheets_hide_the_sun_from_below_and_from_above():
         # The upright edges of the box pass chord after chord: at most half of one is missed.
         np.testing.assert_allclose(found, expected, atol=0.1 * expected.max())
         assert np.abs(found - expected).mean() < 0.002 * expected.max()
+
+
+def test_a_lid_hides_a_sun_overhead():
+    """Up to the zenith and beyond: half of each chord lies there. A lid beneath the ground hides nothing."""
+    (ground, place_of_ground), (lid, _) = sheet(GROUND, 3), sheet((-20, 26, -20, 26, 0, 0, 0), 2)
+    camera = jaxhf.Orthographic.look_at((3, 3, 1), (3, 3, 0), (0, 1, 0), 4, width=4, height=4)
+
+    @jax.jit
+    def draw(corner):
+        objects = [jaxhf.Object(ground, jaxhf.Matte(1.0), place_of_ground)]
+        objects += [jaxhf.Object(lid, jaxhf.Matte(1.0), jnp.asarray(place(0, 0, 0), jnp.float32).at[:3, 3].set(corner))]
+        return jaxhf.render(jaxhf.Scene(objects, camera, [jaxhf.Sun((0, 0, 1), np.pi, WIDE)]), FLAT)[..., 0]
+
+    np.testing.assert_array_equal(draw(jnp.array([-20.0, -20, 2])), 0)
+    np.testing.assert_allclose(draw(jnp.array([-20.0, -20, -1])), 1, rtol=5e-3)
 
 
 @pytest.mark.deep
