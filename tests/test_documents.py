@@ -36,7 +36,7 @@ SLOW = {"docs/gallery.md", "docs/tutorials/photographs.md"}  # minutes; what the
 DEEP = {  # over four seconds of a processor
     "docs/coming-from/gdal.md",
     "docs/index.md",
-    *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/sun-and-sky")),
+    *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/sun-and-sky", "guides/view")),
     *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "robots")),
 }
 FOREIGN = {"gdaldem", "gdalinfo", "gdal_translate"}  # programs that may not be here

@@ -75,6 +75,7 @@ def rough_pictures(normals: str) -> tuple[np.ndarray, list[np.ndarray]]:
     return rough, [picture + 0.002 * rng.standard_normal(picture.shape) for picture in measured]
 
 
+@pytest.mark.deep
 def test_a_fit_takes_the_normals_that_explain_rough_terrain(tmp_path, monkeypatch):
     """Where they are left open, by one program for both, also when it is resumed; those that are given stay."""
     rough, measured = rough_pictures("six-angle")

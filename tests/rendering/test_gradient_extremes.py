@@ -101,9 +101,10 @@ def assert_finite(name: str, pixels: int, settings: Settings) -> None:
     np.testing.assert_array_equal(np.asarray(gradient.heights)[~np.isfinite(scene.heights)], 0)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.deep) if name == "holes" else name for name in EXTREMES])
-def test_finite(name):
-    assert_finite(name, 16, Settings(edge_samples=300, chunk=256))
+@pytest.mark.parametrize("edge_samples", [0, pytest.param(300, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("name", EXTREMES)
+def test_finite(name, edge_samples):
+    assert_finite(name, 16, Settings(edge_samples=edge_samples, chunk=256))
 
 
 @pytest.mark.slow  # three more programs
