@@ -89,12 +89,16 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
     if name == "frame":
         from jaxhf.rendering import render
         from jaxhf.scene.localise import localise
-        from jaxhf.trace.world import resolve_settings
+        from jaxhf.trace.world import make_world, resolve_settings
         from jaxhf.xla.devices import local_mesh, on_every_device
 
         scene, mesh = make_scene(heights, 512), local_mesh(1)
         resolved, local = resolve_settings(jaxhf.Settings(), scene), on_every_device(localise(scene), mesh)
-        return arrays_only(render._trace_all, local, resolved, (), mesh, None)
+
+        def frame(scene: Any) -> Any:
+            return render._trace(make_world(scene, resolved), scene.camera, (), mesh, None)
+
+        return jax.jit(frame), (local,)
     settings = {
         "inside": jaxhf.Settings(),
         "gradient": jaxhf.Settings(samples=4),

@@ -147,11 +147,17 @@ def prepare(
         grid = heightfield_grids(heights.reshape(-1, *heights.shape[-2:]), scene.dx, scene.dy, settings)
         return PreparedHeightfield(scene, settings, grid if heights.ndim > 2 else jax.tree.map(lambda leaf: leaf[0], grid))
     _require_scene("prepare", scene, Scene)
-    settings, mesh = resolve_settings(settings or Settings(), scene), chosen_mesh("prepare", mesh, scene)
-    make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
-    world = make(on_every_device(localise(scene), mesh), settings=settings)
+    mesh = chosen_mesh("prepare", mesh, scene)
+    world, _ = _make_ready(scene, settings, mesh)
     form = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), scene)
     return Prepared(scene.camera, mesh, world, tuple(anchor(scene).tolist()), form, _Given(scene))
+
+
+def _make_ready(scene: Scene, settings: Settings | None, mesh: Mesh) -> tuple[World, Camera]:
+    """What `_trace` takes, on every device of the mesh. The world is made by one program for all cameras."""
+    settings, local = resolve_settings(settings or Settings(), scene), on_every_device(localise(scene), mesh)
+    local = unfolded(local) if is_traced() else local
+    return _make_world(eqx.tree_at(lambda scene: scene.camera, local, None), settings), local.camera
 
 
 @takes_numbers
@@ -193,26 +199,19 @@ def render(
     require_progress("render", progress, is_traced())
     require_key(key)
     aovs = known_aovs("render", aovs)
-    if isinstance(scene, Prepared):
-        here = prepared_mesh("render", scene.mesh, mesh, (scene, key))
-    else:
+    if isinstance(scene, Scene):
         here = chosen_mesh("render", mesh, (scene, key))
-        if progress is not None or scene.sky_occlusion is not None:
-            scene, settings = prepare(scene, settings, mesh=mesh), None
-    if isinstance(scene, Prepared):
+        world, camera = _make_ready(scene, settings, here)
+    else:
+        here, world = prepared_mesh("render", scene.mesh, mesh, (scene, key)), scene._world
         if settings is not None and resolve_settings(settings, scene._form) != scene.settings:
             raise UserError(f"render: the scene was prepared with {scene.settings}, it cannot be rendered with {settings}")
-        world, place = scene._world, (np.array(scene._origin), precision(scene._form))
-        camera = on_every_device(localise_camera(scene.camera, scene._given.scene, *place), here)
-        if progress is None:
-            outputs = _trace_prepared(world, camera, aovs, here, _key(key, world.settings, here))
-        else:
-            outputs = _trace_in_parts(world, camera, aovs, here, progress)
+        camera = localise_camera(scene.camera, scene._given.scene, np.array(scene._origin), precision(scene._form))
+        camera = on_every_device(camera, here)
+    if progress is None:
+        outputs = _trace(world, camera, aovs, here, _key(key, world.settings, here))
     else:
-        settings = resolve_settings(settings or Settings(), scene)
-        local = on_every_device(localise(scene), here)
-        local = unfolded(local) if is_traced() else local
-        outputs = _trace_all(local, settings, aovs, here, _key(key, settings, here))
+        outputs = _trace_in_parts(world, camera, aovs, here, progress)
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -257,21 +256,13 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         resolved = resolve_settings(settings, scene)
-        return _trace_all(on_every_device(scene, mesh), resolved, (), mesh, None)["image"]
+        return _trace(_make_world(on_every_device(scene, mesh), resolved), scene.camera, (), mesh, None)["image"]
 
     return lax.map(one, scenes)
 
 
-@functools.partial(compiled, static_argnames=("settings", "aovs", "mesh"))
-def _trace_all(
-    scene: Scene, settings: Settings, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
-) -> dict[str, jax.Array]:
-    return _trace_world(make_world(scene, settings), scene.camera, aovs, mesh, key)
-
-
-def _trace_world(
-    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
-) -> dict[str, jax.Array]:
+@functools.partial(compiled, static_argnames=("aovs", "mesh"))
+def _trace(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> dict[str, jax.Array]:
     def picture(world: World, camera: Camera, _: jax.Array | None = None) -> dict[str, jax.Array]:
         return _trace_picture(world, camera, aovs, mesh)
 
@@ -322,17 +313,21 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
     return lax.map(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights)
 
 
-_trace_prepared = compiled(_trace_world, static_argnames=("aovs", "mesh"))
 _trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
-_make_world = compiled(make_world, static_argnames=("settings",))
 _make_ceilings = compiled(make_ceilings, static_argnames=("settings",))
+_make_plain_world = compiled(make_world, static_argnames=("settings",))
 _make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
+
+
+def _make_world(scene: Scene, settings: Settings) -> World:
+    make = _make_plain_world if scene.sky_occlusion is None else _make_world_with_horizons
+    return make(scene, settings=settings)
 
 
 def _trace_in_parts(
     world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, progress: Callable[[int, int], None]
 ) -> dict[str, np.ndarray]:
-    """As `_trace_all`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
+    """As `_trace`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
     tiling = Tiling(camera, world.settings)
     size = math.ceil(tiling.count / 64)
     pixels = tiling.width * tiling.height
