@@ -2,7 +2,6 @@
 
 import functools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +26,7 @@ from ..xla.compilation import compiled
 from ..xla.devices import prepared_mesh, where_called
 from ..xla.transfers import takes_numbers
 from .chunks import trace_batch, trace_chunks
-from .render import Prepared, PreparedHeightfield, heightfield_grid
+from .render import Prepared, PreparedHeightfield, heightfield_grid, prepared_world
 
 
 def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings | None = None) -> Hit:
@@ -140,18 +139,24 @@ def cast(
 
     starts = jax.tree.map(lambda leaf: in_a_row(leaf, leaf.shape[axes:]), start)
     rays = starts, in_a_row(d, (3,))
-    if isinstance(surface, Prepared):
-        hit = _cast_prepared(surface._world, *rays)
-    elif isinstance(surface, Scene):
-        hit = _cast_prepared(_make_world(localise(surface.with_lights(())), settings=settings), *rays)
-    elif isinstance(surface, PreparedHeightfield):
-        hit = (_cast_grids if batch else _cast_grid)(surface._grid, *rays, settings)
-    elif batch:
-        heights = field.heights.reshape(-1, *field.heights.shape[-2:])
-        hit = _cast_batch(heights, *rays, field.dx, field.dy, settings)
+    if isinstance(surface, Scene):
+        hit = _cast_world(prepared_world(localise(surface.with_lights(())), settings), *rays)
+    elif isinstance(surface, Prepared):
+        hit = _cast_world(surface._world, *rays)
     else:
-        hit = _cast(Heightfield(field.heights, field.dx, field.dy), *rays, settings)
+        shape = surface._grid if isinstance(surface, PreparedHeightfield) else _with_one_axis(field)
+        hit = (_cast_each if batch else _cast_one)(shape, *rays, settings)
     return jax.tree.map(lambda leaf: leaf.reshape(*many, *leaf.shape[rays[1].ndim - 1 :]), _moved(hit, corner))
+
+
+def _with_one_axis(field: Heightfield) -> Heightfield:
+    """A heightfield, or a batch with one axis, whose x0 and y0 are 0."""
+
+    def at_origin(heights: jax.Array) -> Heightfield:
+        return Heightfield(heights, field.dx, field.dy)
+
+    heights = jnp.asarray(field.heights)
+    return at_origin(heights) if heights.ndim == 2 else jax.vmap(at_origin)(heights.reshape(-1, *heights.shape[-2:]))
 
 
 def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
@@ -159,39 +164,26 @@ def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
     return eqx.tree_at(lambda hit: hit.p, hit, hit.p + jnp.broadcast_to(jnp.asarray(offset, hit.p.dtype), hit.p.shape))
 
 
-def _trace(surface: Grid, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
+@functools.partial(compiled, static_argnames=("settings",))
+def _cast_one(surface: Grid | Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
     """Rays from points (n, 3), or from hits with a leading axis n; chunk after chunk of one fixed size."""
-    return trace_chunks(lambda ray: _first(surface, ray, settings), (start, d), settings.chunk)
-
-
-_cast_grid = compiled(_trace, static_argnames=("settings",))
-
-
-@functools.partial(compiled, static_argnames=("settings",))
-def _cast(heightfield: Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
-    return _trace(heightfield_grid(heightfield, settings), start, d, settings)
+    grid = _ready(surface, settings)
+    return trace_chunks(lambda ray: _first(grid, ray, settings), (start, d), settings.chunk)
 
 
 @functools.partial(compiled, static_argnames=("settings",))
-def _cast_grids(grids: Grid, start: jax.Array | Hit, d: Float[jax.Array, "m n 3"], settings: Settings) -> Hit:
-    """Grids with a leading axis m, each of which has rays of its own."""
-    return _trace_each(lambda grid: grid, grids, start, d, settings)
+def _cast_each(surfaces: Grid | Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "m n 3"], settings: Settings) -> Hit:
+    """Surfaces with a leading axis m, each of which has rays of its own."""
+
+    def one(grid: Grid, ray: tuple[jax.Array | Hit, jax.Array]) -> Hit:
+        return _first(grid, ray, settings)
+
+    make = functools.partial(_ready, settings=settings)
+    return trace_batch(make, joined, one, surfaces, (start, d), settings.chunk)
 
 
-def _trace_each(make: Callable[[Any], Grid], shapes: Any, start: jax.Array | Hit, d: jax.Array, settings: Settings) -> Hit:
-    return trace_batch(make, joined, lambda grid, ray: _first(grid, ray, settings), shapes, (start, d), settings.chunk)
-
-
-@functools.partial(compiled, static_argnames=("dx", "dy", "settings"))
-def _cast_batch(
-    heights: Float[jax.Array, "m ny nx"],
-    start: jax.Array | Hit,
-    d: Float[jax.Array, "m n 3"],
-    dx: float,
-    dy: float,
-    settings: Settings,
-) -> Hit:
-    return _trace_each(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights, start, d, settings)
+def _ready(surface: Grid | Heightfield, settings: Settings) -> Grid:
+    return surface if isinstance(surface, Grid) else heightfield_grid(surface, settings)
 
 
 def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Settings) -> Hit:
@@ -200,9 +192,6 @@ def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Sett
     return intersect(surface, 0, begin, max_steps=settings.max_steps, leaving=leaving)
 
 
-_make_world = compiled(make_world, static_argnames=("settings",))
-
-
 @compiled
-def _cast_prepared(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
+def _cast_world(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
     return trace_chunks(lambda ray: first_hit(world, Ray(ray[0], ray[1])), (o, d), world.settings.chunk)

@@ -148,16 +148,10 @@ def prepare(
         return PreparedHeightfield(scene, settings, grid if heights.ndim > 2 else jax.tree.map(lambda leaf: leaf[0], grid))
     _require_scene("prepare", scene, Scene)
     mesh = chosen_mesh("prepare", mesh, scene)
-    world, _ = _make_ready(scene, settings, mesh)
+    local = on_every_device(localise(scene), mesh)
+    world = prepared_world(local, resolve_settings(settings or Settings(), scene))
     form = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), scene)
     return Prepared(scene.camera, mesh, world, tuple(anchor(scene).tolist()), form, _Given(scene))
-
-
-def _make_ready(scene: Scene, settings: Settings | None, mesh: Mesh) -> tuple[World, Camera]:
-    """What `_trace` takes, on every device of the mesh. The world is made by one program for all cameras."""
-    settings, local = resolve_settings(settings or Settings(), scene), on_every_device(localise(scene), mesh)
-    local = unfolded(local) if is_traced() else local
-    return _make_world(eqx.tree_at(lambda scene: scene.camera, local, None), settings), local.camera
 
 
 @takes_numbers
@@ -201,7 +195,8 @@ def render(
     aovs = known_aovs("render", aovs)
     if isinstance(scene, Scene):
         here = chosen_mesh("render", mesh, (scene, key))
-        world, camera = _make_ready(scene, settings, here)
+        local = on_every_device(localise(scene), here)
+        world, camera = prepared_world(local, resolve_settings(settings or Settings(), scene)), local.camera
     else:
         here, world = prepared_mesh("render", scene.mesh, mesh, (scene, key)), scene._world
         if settings is not None and resolve_settings(settings, scene._form) != scene.settings:
@@ -256,7 +251,7 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         resolved = resolve_settings(settings, scene)
-        return _trace(_make_world(on_every_device(scene, mesh), resolved), scene.camera, (), mesh, None)["image"]
+        return _trace(prepared_world(on_every_device(scene, mesh), resolved), scene.camera, (), mesh, None)["image"]
 
     return lax.map(one, scenes)
 
@@ -315,13 +310,15 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
 
 _trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
 _make_ceilings = compiled(make_ceilings, static_argnames=("settings",))
-_make_plain_world = compiled(make_world, static_argnames=("settings",))
+_make_world = compiled(make_world, static_argnames=("settings",))
 _make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
 
 
-def _make_world(scene: Scene, settings: Settings) -> World:
-    make = _make_plain_world if scene.sky_occlusion is None else _make_world_with_horizons
-    return make(scene, settings=settings)
+def prepared_world(scene: Scene, settings: Settings) -> World:
+    """Of a `localise`d scene, by one program for all cameras."""
+    make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
+    scene = unfolded(scene) if is_traced() else scene
+    return make(eqx.tree_at(lambda scene: scene.camera, scene, None), settings=settings)
 
 
 def _trace_in_parts(
