@@ -18,10 +18,9 @@ from jaxtyping import Float, Int
 
 from ..core.settings import Settings
 from ..scene.camera import Camera
-from ..trace.search import PART
 from ..trace.world import World
 from ..xla.devices import map_over
-from ..xla.kernel import one_kernel, traced_once
+from ..xla.kernel import PART, one_kernel, traced_once
 from ..xla.materialise import materialise
 from .guiding import GuidingDistribution, initial_weights, make_distribution, refined_weights
 from .jump import boundary_segment, pass_edge, radiance_jump

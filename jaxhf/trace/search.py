@@ -15,7 +15,7 @@ from jaxtyping import Int, UInt32
 from ..core.errors import UserError
 from ..core.ray import Ray
 from ..core.types import MOST_PLACES, Flag, Index, Scalar
-from ..xla.kernel import one_kernel
+from ..xla.kernel import in_parts
 from .grid import Grid
 from .hit import Hit
 from .walk import Walk, WalkResult, walking
@@ -77,9 +77,6 @@ Step = Callable[[jax.Array], jax.Array]
 # Blocks of cells that are looked at between two visits to cells.
 SKIPS = 2
 
-# Walks that end together on the CPU; of a larger batch more would wait for the slowest.
-PART = 128
-
 
 def _search(walk: Walk, state: jax.Array, budget: int, count: bool, early_exit: bool) -> tuple[jax.Array, Index | None]:
     """The state in which a walk ends, and the number of its steps if they are to be counted.
@@ -88,18 +85,8 @@ def _search(walk: Walk, state: jax.Array, budget: int, count: bool, early_exit: 
     count the steps of each ray and keep the state of an ended walk by a selection; `Walk` does both by itself, so that this
     rule leaves them out (without it a frame takes 1.06 to 1.09 of the time).
     """
-
-    @jax.custom_batching.custom_vmap
-    def run(walk: Walk, state: jax.Array):
-        return _steps(walk.skip, walk.visit, state, budget, count, early_exit)
-
-    @run.def_vmap
-    def run_many(axis_size: int, in_batched, walk: Walk, state: jax.Array):
-        state = state if in_batched[1] else jnp.broadcast_to(state, (axis_size,))
-        ended = _search_many(in_batched[0], budget, count, early_exit)(walk, state)
-        return ended, jax.tree.map(lambda _: True, ended)
-
-    return run(walk, state)
+    one = _search_many(jax.tree.map(lambda _: False, walk), budget, count, early_exit)
+    return jax.tree.map(lambda leaf: leaf[0], one(walk, state[None]))
 
 
 def _search_many(of_ray: Walk, budget: int, count: bool, early_exit: bool) -> Callable[[Walk, jax.Array], Any]:
@@ -109,31 +96,17 @@ def _search_many(of_ray: Walk, budget: int, count: bool, early_exit: bool) -> Ca
     in a loop's batch took three times as long.
     """
 
-    def together(walk: Walk, state: jax.Array):
-        batched, shared = eqx.partition(walk, of_ray)
+    def together(own: tuple[Walk, jax.Array], shared: Walk) -> Any:
+        batched, state = own
         skip = jax.vmap(lambda batched, state: eqx.combine(batched, shared).skip(state))
         visit = jax.vmap(lambda batched, state: eqx.combine(batched, shared).visit(state))
         skip_all, visit_all = (functools.partial(step, batched) for step in (skip, visit))
         return _steps(skip_all, visit_all, state, budget, count, early_exit)
 
-    def in_parts(walk: Walk, state: jax.Array):
-        if state.shape[0] % PART or jax.default_backend() != "cpu":
-            return together(walk, state)
-
-        def part(ended: Any, first: jax.Array) -> tuple[Any, None]:
-            def of_part(leaf: jax.Array) -> jax.Array:
-                return lax.dynamic_slice_in_dim(leaf, first, PART)
-
-            walks = jax.tree.map(lambda leaf, per_ray: of_part(leaf) if per_ray else leaf, walk, of_ray)
-            done = together(walks, of_part(ended[0]))
-            return jax.tree.map(lambda all, part: lax.dynamic_update_slice_in_dim(all, part, first, 0), ended, done), None
-
-        init = state, jnp.zeros(state.shape, jnp.int32) if count else None
-        return lax.scan(part, init, jnp.arange(0, state.shape[0], PART, dtype=jnp.int32))[0]
-
     @jax.custom_batching.custom_vmap
     def run(walk: Walk, state: jax.Array):
-        return one_kernel(in_parts, walk, state)
+        batched, shared = eqx.partition(walk, of_ray)
+        return in_parts(together, (batched, state), shared)
 
     @run.def_vmap
     def run_more(axis_size: int, in_batched, walk: Walk, state: jax.Array):

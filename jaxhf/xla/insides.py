@@ -52,19 +52,23 @@ class _Call(Primitive):
 kernel, in_turn, in_memory = _Call("kernel"), _Call("in_turn"), Primitive("in_memory")
 
 
-def bound(primitive: Primitive, fun: _Function, args: Any, derivative_of: _Function | None = None) -> Any:
+def bound(primitive: Primitive, fun: _Function, args: Any, **others: _Function | None) -> Any:
+    """`fun(*args)` by a primitive that knows other functions of the same arguments, too."""
     leaves, structure = jax.tree.flatten(args)
 
     def flat(fun: _Function) -> _Function:
         return lambda *leaves: fun(*jax.tree.unflatten(structure, leaves))
 
-    other = None if derivative_of is None else flat(derivative_of)
+    known = {name: other and flat(other) for name, other in others.items()}
     jaxpr, shapes = jax.make_jaxpr(flat(fun), return_shape=True)(*leaves)
-    return jax.tree.unflatten(jax.tree.structure(shapes), primitive.bind(*leaves, jaxpr=jaxpr, derivative_of=other))
+    return jax.tree.unflatten(jax.tree.structure(shapes), primitive.bind(*leaves, jaxpr=jaxpr, **known))
 
 
-def _batched_together(leaves: Any, axes: Any, *, jaxpr: ClosedJaxpr, **_: Any) -> tuple[list[Any], list[int]]:
-    results = bound(kernel, jax.vmap(jaxpr_as_fun(jaxpr), in_axes=tuple(axes)), leaves)
+def _batched_together(
+    leaves: Any, axes: Any, *, jaxpr: ClosedJaxpr, elsewhere: _Function | None = None
+) -> tuple[list[Any], list[int]]:
+    other = elsewhere and jax.vmap(elsewhere, in_axes=tuple(axes))
+    results = bound(kernel, jax.vmap(jaxpr_as_fun(jaxpr), in_axes=tuple(axes)), leaves, elsewhere=other)
     return results, [0] * len(results)
 
 
@@ -81,7 +85,8 @@ def _differentiated(
     tangents: Any,
     *,
     jaxpr: ClosedJaxpr,
-    derivative_of: _Function | None,
+    derivative_of: _Function | None = None,
+    **_: Any,
 ) -> tuple[list[Any], list[Any]]:
     """The value and the tangent. What the linearised function stores of its arguments as they are does not leave the call."""
     moving = [not isinstance(tangent, ad.Zero) for tangent in tangents]
@@ -111,6 +116,10 @@ def _merged(chosen: list[bool], own: Any, others: Any) -> list[Any]:
 
 def _called(*leaves: Any, jaxpr: ClosedJaxpr, **_: Any) -> list[Any]:
     return jaxpr_as_fun(jaxpr)(*leaves)
+
+
+def _called_elsewhere(*leaves: Any, jaxpr: ClosedJaxpr, elsewhere: _Function | None = None) -> list[Any]:
+    return _called(*leaves, jaxpr=jaxpr) if elsewhere is None else jax.tree.leaves(elsewhere(*leaves))
 
 
 def _called_between_barriers(*leaves: Any, jaxpr: ClosedJaxpr) -> list[Any]:
@@ -162,6 +171,7 @@ for _primitive, _batched in ((kernel, _batched_together), (in_turn, _batched_in_
     batching.primitive_batchers[_primitive] = _batched
     ad.primitive_jvps[_primitive] = functools.partial(_differentiated, _primitive)
     mlir.register_lowering(_primitive, _lower)
+mlir.register_lowering(kernel, mlir.lower_fun(_called_elsewhere, multiple_results=True))
 mlir.register_lowering(kernel, _lower_as_kernel, platform="cpu")
 
 

@@ -4,13 +4,14 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax import lax
 
 from .plain import insides
 
 _Function = Callable[..., Any]
 
 
-def one_kernel(fun: _Function, *args: Any) -> Any:
+def one_kernel(fun: _Function, *args: Any, elsewhere: _Function | None = None) -> Any:
     """`fun(*args)`, compiled by XLA on the CPU to a single function: its loops and conditionals become branches within.
 
     A tile of a picture is some 350 loops of about a microsecond each. That XLA's runtime starts them one by one, and asks each
@@ -23,9 +24,34 @@ def one_kernel(fun: _Function, *args: Any) -> Any:
     Args:
       fun: with no other traced values than its arguments.
       args: pytrees of arrays.
+      elsewhere: a function of the same values that stands for `fun` on what is no CPU.
     """
     module = insides()
-    return fun(*args) if module is None else module.bound(module.kernel, fun, args)
+    if module is not None:
+        return module.bound(module.kernel, fun, args, elsewhere=elsewhere)
+    return fun(*args) if elsewhere is None else lax.platform_dependent(*args, cpu=fun, default=elsewhere)
+
+
+PART = 128
+"""Items that are dealt with together on CPUs; of a larger batch more would wait for the slowest."""
+
+
+def in_parts(fun: _Function, own: Any, shared: Any) -> Any:
+    """`fun(own, shared)` as one kernel; on CPUs for `PART` items after `PART` items, if that divides their number.
+
+    Args:
+      fun: with no other traced values than its arguments; its results have an axis for the items, too.
+      own: a pytree of arrays whose leading axis counts the items.
+      shared: a pytree of arrays.
+    """
+    count = jax.tree.leaves(own)[0].shape[0]
+
+    def parts(own: Any, shared: Any) -> Any:
+        split = jax.tree.map(lambda leaf: leaf.reshape(-1, PART, *leaf.shape[1:]), own)
+        results = lax.map(lambda own: fun(own, shared), split)
+        return jax.tree.map(lambda leaf: leaf.reshape(count, *leaf.shape[2:]), results)
+
+    return one_kernel(fun, own, shared) if count <= PART or count % PART else one_kernel(parts, own, shared, elsewhere=fun)
 
 
 def in_turn(fun: _Function, *args: Any, derivative_of: _Function | None = None) -> Any:
@@ -38,7 +64,7 @@ def in_turn(fun: _Function, *args: Any, derivative_of: _Function | None = None) 
     """
     module = insides()
     if module is not None:
-        return module.bound(module.in_turn, fun, args, derivative_of)
+        return module.bound(module.in_turn, fun, args, derivative_of=derivative_of)
     if derivative_of is None:
         return fun(*args)
     plain = jax.custom_jvp(fun)
