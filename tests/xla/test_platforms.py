@@ -15,7 +15,7 @@ from jaxhf.fitting.problem import make_problem
 HEIGHTS = (0.1 * np.sin(np.arange(40.0)).reshape(5, 8)).astype(np.float32)
 CAMERA = jaxhf.Perspective.look_at((0.5, -0.9, 0.8), (0.5, 0.5, 0.0), width=40, height=30)
 SUN = jaxhf.Directional((1.0, 0.2, 0.3))
-RAYS = np.broadcast_to(np.float32([0.3, 0.4, 2]), (1024, 3)), np.broadcast_to(np.float32([0, 0, -1]), (1024, 3))
+RAYS = np.tile(np.array([0.3, 0.4, 2], np.float32), (1024, 1)), np.tile(np.array([0, 0, -1], np.float32), (1024, 1))
 
 
 def picture(heights: jax.Array, **knobs) -> jax.Array:
