@@ -189,9 +189,9 @@ def _ready(surface: Grid | Heightfield, settings: Settings) -> Grid:
 def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Settings) -> Hit:
     start, d = ray
     begin, leaving = leave(surface, 0, start, d) if isinstance(start, Hit) else (Ray(start, d), None)
-    return intersect(surface, 0, begin, max_steps=settings.max_steps, leaving=leaving)
+    return intersect(surface, 0, begin, max_steps=settings.max_steps, leaving=leaving, tangents=True)
 
 
 @compiled
 def _cast_world(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
-    return trace_chunks(lambda ray: first_hit(world, Ray(ray[0], ray[1])), (o, d), world.settings.chunk)
+    return trace_chunks(lambda ray: first_hit(world, Ray(ray[0], ray[1]), tangents=True), (o, d), world.settings.chunk)

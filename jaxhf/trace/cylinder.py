@@ -1,5 +1,7 @@
 """Where a ray meets a cylinder."""
 
+import dataclasses
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -62,7 +64,9 @@ def tube_distance(tube: Tube, ray: Ray, left: Flag | None) -> tuple[Scalar, Flag
     return jnp.where(found, t, 0), found
 
 
-def cylinder_hit(tube: Tube, ray: Ray, left: Flag | None, number: int, active: Flag | None, count_steps: bool) -> Hit:
+def cylinder_hit(
+    tube: Tube, ray: Ray, left: Flag | None, number: int, active: Flag | None, count_steps: bool, tangents: bool = False
+) -> Hit:
     """The first hit of a world-frame ray on a cylinder; `left` as in `tube_distance`, `number` that of its object."""
     t, found = tube_distance(tube, ray, left)
     found = found if active is None else found & active
@@ -76,14 +80,9 @@ def cylinder_hit(tube: Tube, ray: Ray, left: Flag | None, number: int, active: F
     phi = jnp.where(phi < 0, phi + turn, phi)
     zero, height = jnp.zeros_like(x), tube.z_max - tube.z_min
     n = unit(tube.object_from_world.covector(jnp.stack([x, y, zero])))
-    dp_du = tube.world_from_object.vector(jnp.stack([-y, x, zero])) * turn
-    dp_dv = tube.world_from_object.vector(jnp.stack([zero, zero, height]))
-    dp_du, dp_dv = orthogonal_tangents(dp_du, dp_dv, n)
-    bend = tube.object_from_world.covector(jnp.stack([-y, x, zero])) * turn
-    scale = dot(n, tube.object_from_world.covector(jnp.stack([x, y, zero])))
     none = jnp.zeros((), jnp.int32)
     met = found & valid
-    return Hit(
+    hit = Hit(
         status=jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID)).astype(jnp.int32),
         object=jnp.where(met, number, -1).astype(jnp.int32),
         t=jnp.where(met, t, jnp.inf),
@@ -91,12 +90,17 @@ def cylinder_hit(tube: Tube, ray: Ray, left: Flag | None, number: int, active: F
         n=n,
         ns=n,
         uv=jnp.stack([phi / turn, quotient(local[2] - tube.z_min, height)]),
-        dp_du=dp_du,
-        dp_dv=dp_dv,
-        dn_du=quotient(bend - n * dot(n, bend), scale),
-        dn_dv=jnp.zeros_like(n),
         cell=jnp.zeros(2, jnp.int32),
         triangle=none,
         side=jnp.where(dot(n, ray.d) < 0, 1, -1).astype(jnp.int32),
         steps=none if count_steps else None,
     )
+    if not tangents:
+        return hit
+    dp_du = tube.world_from_object.vector(jnp.stack([-y, x, zero])) * turn
+    dp_dv = tube.world_from_object.vector(jnp.stack([zero, zero, height]))
+    dp_du, dp_dv = orthogonal_tangents(dp_du, dp_dv, n)
+    bend = tube.object_from_world.covector(jnp.stack([-y, x, zero])) * turn
+    scale = dot(n, tube.object_from_world.covector(jnp.stack([x, y, zero])))
+    dn_du = quotient(bend - n * dot(n, bend), scale)
+    return dataclasses.replace(hit, dp_du=dp_du, dp_dv=dp_dv, dn_du=dn_du, dn_dv=jnp.zeros_like(n))

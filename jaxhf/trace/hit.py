@@ -21,11 +21,11 @@ class Hit(eqx.Module):
       n: unit normal of the triangle, on the surface's +z side (a cylinder: outwards).
       ns: unit shading normal, interpolated between the vertices; `n` with flat shading.
       uv: position in the footprint, 0..1 over the whole grid.
-      dp_du, dp_dv: tangents, orthogonal to `ns` and to each other (Gram-Schmidt in this order).
-      dn_du, dn_dv: derivatives of `ns`.
       cell: (ix, iy).
       triangle: 0 for (00, 10, 11), 1 for (00, 11, 01).
       side: 1 where the ray came from the side that `n` points to, else -1.
+      dp_du, dp_dv: tangents, orthogonal to `ns` and to each other (Gram-Schmidt in this order).
+      dn_du, dn_dv: derivatives of `ns`. These four are None but in what `cast` returns.
       steps: taken by the search; None unless counted.
     """
 
@@ -36,13 +36,13 @@ class Hit(eqx.Module):
     n: Vector
     ns: Vector
     uv: Point2
-    dp_du: Vector
-    dp_dv: Vector
-    dn_du: Vector
-    dn_dv: Vector
     cell: Int[jax.Array, "2"]
     triangle: Index
     side: Index
+    dp_du: Vector | None = None
+    dp_dv: Vector | None = None
+    dn_du: Vector | None = None
+    dn_dv: Vector | None = None
     steps: Index | None = None
 
 

@@ -5,6 +5,8 @@ arithmetic, so the derivative costs no memory a step and works in forward and in
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +42,7 @@ def intersect(
     active: Flag | None = None,
     t_max: Scalar | None = None,
     count_steps: bool = False,
+    tangents: bool = False,
 ) -> Hit:
     """The first hit of a world-frame ray on one surface.
 
@@ -53,14 +56,15 @@ def intersect(
       active: False spares the ray the search: it ends as a miss.
       t_max: where the search may give up: a hit beyond it may or may not be found.
       count_steps: whether to count the steps of the search.
+      tangents: whether the hit is to have its tangents, and the derivatives of `ns`.
     """
     valid = finite(ray.o) & finite(ray.d)
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
     if isinstance(surface, Tube):
         left = None if leaving is None else leaving.object == number
-        return materialise(cylinder_hit(surface, ray, left, number, active, count_steps))
+        return materialise(cylinder_hit(surface, ray, left, number, active, count_steps, tangents))
     if isinstance(surface, Walls):
-        return materialise(wall_hit(surface, ray, leaving, number, active, count_steps))
+        return materialise(wall_hit(surface, ray, leaving, number, active, count_steps, tangents))
     local, scale = ray_in_grid(surface, ray)
     found = first_triangle(
         surface,
@@ -72,7 +76,7 @@ def intersect(
         t_max=None if t_max is None else t_max * scale,
         count_steps=count_steps,
     )
-    return surface_hit(surface, number, local, scale, stored(materialise(found)))
+    return surface_hit(surface, number, local, scale, stored(materialise(found)), tangents)
 
 
 def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
@@ -134,7 +138,7 @@ def ray_in_grid(grid: Grid, ray: Ray) -> tuple[Ray, Scalar]:
     return materialise((Ray(local.o, local.d / scale), scale))
 
 
-def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkResult) -> Hit:
+def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkResult, tangents: bool = False) -> Hit:
     """The hit in the triangle that the walk found; differentiable in the heights, the transform and the ray.
 
     The ray is one of `ray_in_grid`, where t is longer by `scale`; `number` is that of the grid's object. Heights and normals at
@@ -151,13 +155,12 @@ def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkRes
             normals = _moved(normals, grid.perturbation.normals)
     plane = plane_through(heights, found.upper)
     met = found.status == int(Status.HIT)
-    t, *geometry = only_where(met, _geometry, grid, ray, found, plane, normals, skips=grid.early_exit)
+    t, *geometry = only_where(met, _geometry_with(tangents), grid, ray, found, plane, normals, skips=grid.early_exit)
     t = jnp.where(met, t / scale, jnp.inf)
-    t, p, n, ns, uv, dp_du, dp_dv, dn_du, dn_dv = materialise((t, *geometry))
+    t, p, n, ns, uv, *more = materialise((t, *geometry))
     return Hit(
-        status=found.status, object=jnp.where(met, number, -1).astype(jnp.int32), t=t, p=p, n=n, ns=ns, uv=uv, dp_du=dp_du,
-        dp_dv=dp_dv, dn_du=dn_du, dn_dv=dn_dv, cell=jnp.stack([found.ix, found.iy]), triangle=found.upper.astype(jnp.int32),
-        side=found.side, steps=found.steps,
+        found.status, jnp.where(met, number, -1).astype(jnp.int32), t, p, n, ns, uv, jnp.stack([found.ix, found.iy]),
+        found.upper.astype(jnp.int32), found.side, *more, steps=found.steps,
     )  # fmt: skip
 
 
@@ -198,14 +201,21 @@ def _moved(corners: tuple[jax.Array, jax.Array, jax.Array], by: jax.Array) -> tu
     return a + by[0], b + by[1], c + by[2]
 
 
+@functools.cache  # JAX traces a function once
+def _geometry_with(tangents: bool) -> Callable[..., tuple[jax.Array, ...]]:
+    return functools.partial(_geometry, tangents=tangents)
+
+
 def _geometry(
     grid: Grid,
     ray: Ray,
     found: WalkResult,
     plane: tuple[Scalar, Scalar, Scalar],
     normals: tuple[Vector, Vector, Vector] | None,
+    tangents: bool,
 ) -> tuple[jax.Array, ...]:
-    """t, p, n, ns, uv, dp_du, dp_dv, dn_du, dn_dv of a `Hit`, from the triangle's plane and the normals at its vertices."""
+    """t, p, n, ns, uv of a `Hit`, from the triangle's plane and the normals at its vertices; with tangents dp_du, dp_dv, dn_du
+    and dn_dv, too."""
     t = plane_distance(plane, ray, found)
     dtype = t.dtype
     point = ray(t)
@@ -216,19 +226,22 @@ def _geometry(
     one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
     n = unit(grid.grid_from_world.covector(jnp.stack([-a, -b, one])))
     cells_x, cells_y = grid.cells
+    uv = jnp.stack([x / cells_x, y / cells_y])
+    ns, turning = _shading_normal(grid, found.upper, normals, u, v, n)
+    if not tangents:
+        return t, p, n, ns, uv
     per_u = grid.world_from_grid.vector(jnp.stack([one, zero, a])) * cells_x
     per_v = grid.world_from_grid.vector(jnp.stack([zero, one, b])) * cells_y
-    ns, dn_du, dn_dv = _shading_normal(grid, found.upper, normals, u, v, n)
-    dp_du, dp_dv = orthogonal_tangents(per_u, per_v, ns)
-    return t, p, n, ns, jnp.stack([x / cells_x, y / cells_y]), dp_du, dp_dv, dn_du * cells_x, dn_dv * cells_y
+    dn_du, dn_dv = turning()
+    return t, p, n, ns, uv, *orthogonal_tangents(per_u, per_v, ns), dn_du * cells_x, dn_dv * cells_y
 
 
 def _shading_normal(
     grid: Grid, upper: Flag, normals: tuple[Vector, Vector, Vector] | None, u: Scalar, v: Scalar, n: Vector
-) -> tuple[Vector, Vector, Vector]:
-    """The barycentric mean of the triangle's three vertex normals (Phong 1975), and its derivatives by cells."""
+) -> tuple[Vector, Callable[[], tuple[Vector, Vector]]]:
+    """The barycentric mean of the triangle's three vertex normals (Phong 1975), and what gives its derivatives by cells."""
     if normals is None:
-        return n, jnp.zeros_like(n), jnp.zeros_like(n)
+        return n, lambda: (jnp.zeros_like(n), jnp.zeros_like(n))
     n00, between, n11 = normals
     first, second = between - n00, n11 - between
     per_u, per_v = jnp.where(upper, second, first), jnp.where(upper, first, second)
@@ -238,11 +251,11 @@ def _shading_normal(
     largest = lax.stop_gradient(largest_component(mean))
     largest = jnp.where(largest > 0, largest, 1)
     ns = unit(mean)
-    length = dot(mean / largest, ns)
-    length = jnp.where(length > 0, length, 1)
 
-    def turning(change: Vector) -> Vector:
-        change = change / largest
-        return (change - ns * dot(ns, change)) / length
+    def turning() -> tuple[Vector, Vector]:
+        length = dot(mean / largest, ns)
+        changes = per_u / largest, per_v / largest
+        first, second = ((change - ns * dot(ns, change)) / jnp.where(length > 0, length, 1) for change in changes)
+        return first, second
 
-    return ns, turning(per_u), turning(per_v)
+    return ns, turning

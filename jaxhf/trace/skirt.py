@@ -137,14 +137,16 @@ def wall_slopes(walls: Walls, number: int, p: Vector, level: Vector, leaving: Hi
     return jnp.where(outside, jnp.inf, low), jnp.where(outside, -jnp.inf, high)
 
 
-def wall_hit(walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: Flag | None, count_steps: bool) -> Hit:
+def wall_hit(
+    walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: Flag | None, count_steps: bool, tangents: bool = False
+) -> Hit:
     """The first hit of a world-frame ray on walls or floor; `number` is that of their object. `Hit.cell[0]` says which side."""
     t, found, side = wall_distance(walls, ray, leaving, number)
     found = found if active is None else found & active
     valid = largest_component(ray.d) > 0
     met = found & valid
     t = jnp.where(found, t, 0)
-    hit = hit_on_side(walls, number, side, ray(t), ray.d)
+    hit = hit_on_side(walls, number, side, ray(t), ray.d, tangents)
     # At the rim a wall comes before the terrain, whose lower side would be seen there.
     t = t * jnp.where(hit.side > 0, 1 - _WIDE * jnp.finfo(t.dtype).eps, 1)
     status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID))
@@ -157,7 +159,7 @@ def wall_hit(walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: F
     )
 
 
-def hit_on_side(walls: Walls, number: int, side: Index, p: Vector, d: Vector) -> Hit:
+def hit_on_side(walls: Walls, number: int, side: Index, p: Vector, d: Vector, tangents: bool = False) -> Hit:
     """The hit at a point of a wall, or of the floor, of a ray that comes along `d`; with t = 0."""
     local = walls.object_from_world.point(p)
     (size_x, size_y), dtype = walls.size, p.dtype
@@ -167,13 +169,15 @@ def hit_on_side(walls: Walls, number: int, side: Index, p: Vector, d: Vector) ->
     v = jnp.where(floor, local[1] / size_y, time_to(local[2] - walls.base, walls.tallest)[0])
     n = unit(walls.object_from_world.covector(outwards))
     zero = jnp.zeros((), dtype)
+    none = jnp.zeros((), jnp.int32)
+    faces = dot(n, d) < 0
+    hit = Hit(
+        status=jnp.full((), int(Status.HIT), jnp.int32), object=jnp.full((), number, jnp.int32), t=zero, p=p, n=n, ns=n,
+        uv=jnp.stack([u, v]), cell=jnp.stack([side, none]), triangle=none, side=jnp.where(faces, 1, -1).astype(jnp.int32),
+    )  # fmt: skip
+    if not tangents:
+        return hit
     per_u = jnp.where(along_x, jnp.stack([zero + size_x, zero, zero]), jnp.stack([zero, zero + size_y, zero]))
     per_v = jnp.where(floor, jnp.stack([zero, zero + size_y, zero]), jnp.stack([zero, zero, walls.tallest]))
     dp_du, dp_dv = orthogonal_tangents(walls.world_from_object.vector(per_u), walls.world_from_object.vector(per_v), n)
-    none = jnp.zeros((), jnp.int32)
-    faces = dot(n, d) < 0
-    return Hit(
-        status=jnp.full((), int(Status.HIT), jnp.int32), object=jnp.full((), number, jnp.int32), t=zero, p=p, n=n, ns=n,
-        uv=jnp.stack([u, v]), dp_du=dp_du, dp_dv=dp_dv, dn_du=jnp.zeros_like(n), dn_dv=jnp.zeros_like(n),
-        cell=jnp.stack([side, none]), triangle=none, side=jnp.where(faces, 1, -1).astype(jnp.int32),
-    )  # fmt: skip
+    return dataclasses.replace(hit, dp_du=dp_du, dp_dv=dp_dv, dn_du=jnp.zeros_like(n), dn_dv=jnp.zeros_like(n))

@@ -126,18 +126,27 @@ def make_surface(
     return make_walls(shape, world) if isinstance(shape, Skirt) else make_tube(shape, world)
 
 
-def first_hit(world: World, ray: Ray, leaving: Hit | None = None, active: Flag | None = None, count_steps: bool = False) -> Hit:
+def first_hit(
+    world: World,
+    ray: Ray,
+    leaving: Hit | None = None,
+    active: Flag | None = None,
+    count_steps: bool = False,
+    tangents: bool = False,
+) -> Hit:
     """The nearest hit over all objects. A ray that one object could not decide (EXHAUSTED, INVALID) has that status.
 
     The arguments are those of `intersect`.
     """
-    hits = [
-        intersect(
-            surface, number, ray, max_steps=world.settings.max_steps, leaving=leaving, active=active, count_steps=count_steps
-        )
-        for number, surface in enumerate(world.surfaces)
-    ]
-    return nearest_hit(hits)
+    meet = functools.partial(
+        intersect,
+        max_steps=world.settings.max_steps,
+        leaving=leaving,
+        active=active,
+        count_steps=count_steps,
+        tangents=tangents,
+    )
+    return nearest_hit([meet(surface, number, ray) for number, surface in enumerate(world.surfaces)])
 
 
 def nearest_hit(hits: list[Hit]) -> Hit:
@@ -185,6 +194,6 @@ def no_hit(dtype) -> Hit:
     """A hit on nothing: what camera rays leave, in the form of what mirrored rays leave."""
     zero, up, whole = jnp.zeros(3, dtype), jnp.array([0, 0, 1], dtype), jnp.zeros((), jnp.int32)
     return Hit(
-        status=whole, object=whole - 1, t=jnp.zeros((), dtype), p=zero, n=up, ns=up, uv=jnp.zeros(2, dtype), dp_du=zero,
-        dp_dv=zero, dn_du=zero, dn_dv=zero, cell=jnp.zeros(2, jnp.int32), triangle=whole, side=jnp.ones((), jnp.int32),
+        status=whole, object=whole - 1, t=jnp.zeros((), dtype), p=zero, n=up, ns=up, uv=jnp.zeros(2, dtype),
+        cell=jnp.zeros(2, jnp.int32), triangle=whole, side=jnp.ones((), jnp.int32),
     )  # fmt: skip
