@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core.version import __version__
-from . import aspect, convert, fit, hillshade, horizon, info, relief, render, skyview, slope, tradeoff, view
+from . import tradeoff
+from .commands import aspect, convert, fit, hillshade, horizon, info, relief, render, skyview, slope, view
 
 GROUPS = {
     "terrain maps": (hillshade, slope, aspect, relief, skyview, horizon),

@@ -191,7 +191,8 @@ SLOW = """
 import sys, time
 import jaxhf.fitting.fit
 from jaxhf.fitting.history import Draws, Step
-from jaxhf.cli import fit, main, progress
+from jaxhf.cli import main, progress
+from jaxhf.cli.commands import fit
 
 def pretended(scenes, targets, *, progress, **options):
     time.sleep(1.5)

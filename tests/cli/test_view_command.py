@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 import jaxhf
+from jaxhf.cli import block as looks
+from jaxhf.cli.commands.view import _sun, _sun_path
 from jaxhf.cli.main import main
-from jaxhf.cli.view import _sun, _sun_path
 from jaxhf.core.errors import UserError
 from jaxhf.io.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.terrain import Terrain
-from jaxhf.rendering import render as _render, view as looks
+from jaxhf.rendering import render as _render
 
 SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
 MORNING, EVENING = "2026-06-21T05:00:00Z", "2026-06-21T18:00+01:00"

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
+from ..rendering.render import Prepared, prepare, render
 from ..scene.camera import Perspective
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Sky
@@ -17,7 +18,6 @@ from ..scene.material import Matte
 from ..scene.scene import Object, Scene
 from ..scene.skirt import Skirt
 from ..scene.texture import ImageTexture
-from .render import Prepared, prepare, render
 
 # Radiance of white ground that faces the sun, and what the whole sky adds where nothing hides it, or where nobody asks.
 _SUN, _SKY, _EVEN_SKY = (0.76, 0.74, 0.70), (0.38, 0.42, 0.48), (0.34, 0.38, 0.44)

@@ -6,8 +6,8 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from ..core.errors import UserError
-from . import arguments
+from ...core.errors import UserError
+from .. import arguments
 
 
 def add(commands: Any) -> None:
@@ -28,10 +28,10 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..io.load_terrain import load_heights
-    from ..io.meshes import MESHES, require_writable_mesh, save_mesh
-    from ..io.save_terrain import HEIGHTS, require_writable_heights, save_heights
-    from .describe import heightfield_line
+    from ...io.load_terrain import load_heights
+    from ...io.meshes import MESHES, require_writable_mesh, save_mesh
+    from ...io.save_terrain import HEIGHTS, require_writable_heights, save_heights
+    from ..describe import heightfield_line
 
     ending = Path(options.output).suffix.lower()
     if ending not in MESHES:

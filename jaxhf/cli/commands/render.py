@@ -5,12 +5,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import UserError
-from ..core.settings import Settings
-from . import arguments
+from ...core.errors import UserError
+from ...core.settings import Settings
+from .. import arguments
 
 if TYPE_CHECKING:
-    from ..scene.scene import Scene
+    from ...scene.scene import Scene
 
 
 def add(commands: Any) -> None:
@@ -36,8 +36,8 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..io.images import require_writable, save_image
-    from .scene_warnings import warn
+    from ...io.images import require_writable, save_image
+    from ..scene_warnings import warn
 
     if options.aovs and Path(options.output).suffix.lower() != ".exr":
         raise UserError(f"--aovs are layers of an .exr, {options.output} is none")
@@ -46,7 +46,7 @@ def run(options: argparse.Namespace) -> None:
     require_writable(options.output)
     settings = arguments.settings(options)
     arguments.set_up_jax(options)
-    from ..rendering.aovs import known_aovs
+    from ...rendering.aovs import known_aovs
 
     aovs = known_aovs("render", options.aovs)
     scene = _load(options)
@@ -59,8 +59,8 @@ def run(options: argparse.Namespace) -> None:
 def _load(options: argparse.Namespace) -> "Scene":
     import numpy as np
 
-    from ..io.scenes import load_scene
-    from ..scene.views import resized
+    from ...io.scenes import load_scene
+    from ...scene.views import resized
 
     scene = load_scene(options.scene, np.dtype(options.precision))
     old, (width, height) = scene.camera, arguments.size(options)
@@ -77,11 +77,11 @@ def _timed_render(
     import jax
     import numpy as np
 
-    from ..rendering.render import render
-    from ..trace.world import resolve_settings
-    from ..xla.devices import local_mesh
-    from .limits import require_memory, worthwhile_devices
-    from .progress import CompileTime, compiled_bar
+    from ...rendering.render import render
+    from ...trace.world import resolve_settings
+    from ...xla.devices import local_mesh
+    from ..limits import require_memory, worthwhile_devices
+    from ..progress import CompileTime, compiled_bar
 
     samples = resolve_settings(settings, scene).samples or 1
     on_host = devices is None and jax.default_backend() == "cpu"

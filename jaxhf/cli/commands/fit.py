@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import ArgumentError, counted
-from . import arguments, interruption
-from .overwriting import require_no_input
+from ...core.errors import ArgumentError, counted
+from .. import arguments, interruption
+from ..overwriting import require_no_input
 
 if TYPE_CHECKING:
-    from ..fitting.fit import Fit
-    from ..fitting.history import Draws, Step
-    from ..io.toml.fit import Case
+    from ...fitting.fit import Fit
+    from ...fitting.history import Draws, Step
+    from ...io.toml.fit import Case
 
 _USUAL_STEPS = 30  # of a fit, until it says what is to come
 _EARLY = 50.0  # seconds: most fits compile no longer, and JAX reports a compilation only when it is done
@@ -61,10 +61,10 @@ class Outputs:
     resume: bool
 
     def __post_init__(self):
-        from ..core.extras import import_extra
-        from ..io.errors import FileError
-        from ..io.files import require_writable_text
-        from ..io.save_terrain import require_writable_heights
+        from ...core.extras import import_extra
+        from ...io.errors import FileError
+        from ...io.files import require_writable_text
+        from ...io.save_terrain import require_writable_heights
 
         for path in (self.heights, self.std):
             require_writable_heights(path, (".npy", ".npz", ".tif", ".tiff"))  # which hold any heights, and holes
@@ -102,11 +102,11 @@ def fit_file(path: str, outputs: Outputs, precision: str) -> tuple[str, Sequence
     import jax
     import numpy as np
 
-    from ..fitting.fit import fit
-    from ..io.toml.fit import load_case
-    from .limits import require_memory
-    from .progress import told
-    from .scene_warnings import warn
+    from ...fitting.fit import fit
+    from ...io.toml.fit import load_case
+    from ..limits import require_memory
+    from ..progress import told
+    from ..scene_warnings import warn
 
     case = load_case(path, np.dtype(precision))
     warn(case.scenes)
@@ -150,14 +150,14 @@ class _Progress:
     """What a fit is doing, in a line: how far it is, since when, and what is to come."""
 
     def __init__(self, later: str):
-        from ..fitting.history import Pace
-        from .progress import CompileTime
+        from ...fitting.history import Pace
+        from ..progress import CompileTime
 
         self._compiling, self._begin, self._pace, self._later = CompileTime(), time.monotonic(), Pace(0.0), later
         self._done, self._details, self._remaining, self._noted = "first step", "", None, 0.0
 
     def note(self, done: "Step | Draws") -> None:
-        from ..fitting.history import Draws
+        from ...fitting.history import Draws
 
         self._noted = time.monotonic() - self._begin
         if isinstance(done, Draws):
@@ -168,7 +168,7 @@ class _Progress:
             self._remaining = self._pace.remaining(self._noted - self._compiling.seconds, done.to_come)
 
     def line(self, seconds: float) -> str:
-        from .progress import duration
+        from ..progress import duration
 
         remaining = self._remaining
         if self._noted == 0.0:  # the step that is under way takes this long at least
@@ -185,7 +185,7 @@ def _views(case: "Case", found: "Fit") -> list[str]:
     """The lights' directions and the cameras' positions, where they were sought, and how far they are from those given."""
     import numpy as np
 
-    from ..fitting.view import differences, sun
+    from ...fitting.view import differences, sun
 
     lights, cameras = [], []
     for given, scene in zip(case.scenes, found.scenes, strict=True):
@@ -207,11 +207,11 @@ def _views(case: "Case", found: "Fit") -> list[str]:
 def _write(path: str, case: "Case", found: "Fit", outputs: Outputs) -> None:
     import numpy as np
 
-    from ..io.files import save_text
-    from ..io.images import save_image
-    from ..io.save_terrain import save_heights
-    from ..io.terrain import Terrain
-    from .fit_report import report
+    from ...io.files import save_text
+    from ...io.images import save_image
+    from ...io.save_terrain import save_heights
+    from ...io.terrain import Terrain
+    from ..fit_report import report
 
     field = case.scenes[0].heightfields[0]
     for place, heights in ((outputs.heights, found.heights), (outputs.std, found.std)):

@@ -4,10 +4,10 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
-from . import arguments, mapping
+from .. import arguments, mapping
 
 if TYPE_CHECKING:
-    from ..io.terrain import Terrain
+    from ...io.terrain import Terrain
 
 
 def add(commands: Any) -> None:
@@ -39,10 +39,10 @@ def read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
     """The terrain as the file places it, and in metres, in the precision that is asked for."""
     import dataclasses
 
-    from ..core.errors import ArgumentError, UserError
-    from ..io.errors import FileError
-    from ..io.load_terrain import read_terrain
-    from ..maps.surface import spacing
+    from ...core.errors import ArgumentError, UserError
+    from ...io.errors import FileError
+    from ...io.load_terrain import read_terrain
+    from ...maps.surface import spacing
 
     given = spacing("", options.dx, options.dy)
     options.azimuths = 32 if options.azimuths is None else options.azimuths
@@ -62,14 +62,14 @@ def read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
 def run(options: argparse.Namespace) -> None:
     import numpy as np
 
-    from ..core.errors import counted
-    from ..io.rasters import require_writable_raster, save_raster
+    from ...core.errors import counted
+    from ...io.rasters import require_writable_raster, save_raster
 
     path = require_writable_raster(options.output)
     stored, terrain = read(options)
     arguments.set_up_jax(options)
-    from ..maps.skyview import sky_view
-    from .progress import compiled_bar
+    from ...maps.skyview import sky_view
+    from ..progress import compiled_bar
 
     begin = time.perf_counter()
     with compiled_bar(unit=" heights", unit_scale=True) as advance:

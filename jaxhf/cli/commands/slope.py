@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from . import arguments, mapping
+from .. import arguments, mapping
 
 
 def add(commands: Any) -> None:
@@ -21,7 +21,7 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..maps.slope import NODATA, slope
+    from ...maps.slope import NODATA, slope
 
     wanted = arguments.given(options, "percent", "algorithm", "compute_edges", "scale", "dx", "dy")
     mapping.make(options, lambda terrain: slope(terrain, **wanted), kind="slope", nodata=NODATA, numbers=True)

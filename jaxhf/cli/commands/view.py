@@ -9,17 +9,17 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core.errors import ArgumentError, UserError
-from . import arguments
+from ...core.errors import ArgumentError, UserError
+from .. import arguments
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..io.terrain import Terrain
-    from ..rendering.view import Look
-    from ..scene.camera import Perspective
-    from ..scene.heightfield import Heightfield
-    from ..scene.scene import Scene
+    from ...io.terrain import Terrain
+    from ...scene.camera import Perspective
+    from ...scene.heightfield import Heightfield
+    from ...scene.scene import Scene
+    from ..block import Look
 
 _PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
 
@@ -106,7 +106,7 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
     """The sun's azimuth and altitude in each frame of a film, shape (frames, 2); None where it stands still."""
     import numpy as np
 
-    from ..scene.sun import sun
+    from ...scene.sun import sun
 
     first, last, place = options.sun_from, options.sun_to, (options.latitude, options.longitude)
     times = isinstance(first, datetime.datetime)
@@ -135,10 +135,10 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..io.films import FILMS, require_writable_film
-    from ..io.images import PICTURES, require_writable
-    from ..io.load_terrain import jacksboro_file, load_heights
-    from .overwriting import require_no_input
+    from ...io.films import FILMS, require_writable_film
+    from ...io.images import PICTURES, require_writable
+    from ...io.load_terrain import jacksboro_file, load_heights
+    from ..overwriting import require_no_input
 
     if options.demo == (options.terrain is not None):
         raise UserError(f"view: IN or --demo must say what to show, {'not both' if options.demo else 'there is neither'}")
@@ -191,7 +191,7 @@ class _Stage:
     def __init__(self, options: argparse.Namespace, terrain: "Terrain", size: tuple[int, int]):
         import numpy as np
 
-        from ..rendering.view import Look, exaggeration, with_water
+        from ..block import Look, exaggeration, with_water
 
         self.options, self.size, self.terrain = options, size, terrain
         self.exaggeration = options.exaggeration or exaggeration(terrain.heights, terrain.dx, terrain.dy)
@@ -215,30 +215,30 @@ class _Stage:
     def _colours(self) -> "np.ndarray":
         import numpy as np
 
-        from ..io.drape import load_drape
-        from ..io.images import linear_from_srgb
-        from ..maps.relief import color_relief
+        from ...io.drape import load_drape
+        from ...io.images import linear_from_srgb
+        from ...maps.relief import color_relief
 
         if self.options.drape is not None:
             return load_drape(self.options.drape, self.terrain)
         return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(self.terrain, self.options.ramp)]
 
     def _scene(self, field: "Heightfield", camera: "Perspective", look: "Look") -> "Scene":
-        from ..rendering.view import block
-        from ..xla.devices import local_mesh
-        from .limits import require_memory
+        from ...xla.devices import local_mesh
+        from ..block import block
+        from ..limits import require_memory
 
         scene = block(field, self.colours, camera, look, self.base)
         require_memory(scene, local_mesh().size)
         return scene
 
     def _field(self) -> "Heightfield":
-        from ..scene.heightfield import Heightfield
+        from ...scene.heightfield import Heightfield
 
         return Heightfield(self.heights, self.terrain.dx, self.terrain.dy)
 
     def _camera(self, field: "Heightfield", azimuth: float, around: bool = False) -> "Perspective":
-        from ..scene.camera import Perspective
+        from ...scene.camera import Perspective
 
         width, height = self.size
         altitude, fov = self.options.camera_altitude, self.options.fov
@@ -250,9 +250,9 @@ class _Stage:
         return self.look.azimuth - 110 if given is None else given
 
     def picture(self, output: Path) -> str:
-        from ..io.images import save_image
-        from ..rendering.view import photograph
-        from .progress import bar
+        from ...io.images import save_image
+        from ..block import photograph
+        from ..progress import bar
 
         field = self._field()
         camera = self._camera(field, self._azimuth)
@@ -264,11 +264,11 @@ class _Stage:
     def film(self, output: Path, options: argparse.Namespace, path: "np.ndarray | None") -> str:
         import numpy as np
 
-        from ..io.films import writing_film
-        from ..io.images import srgb_from_linear
-        from ..rendering.render import prepare
-        from ..rendering.view import photograph
-        from .progress import bar
+        from ...io.films import writing_film
+        from ...io.images import srgb_from_linear
+        from ...rendering.render import prepare
+        from ..block import photograph
+        from ..progress import bar
 
         field = self._field()
         if path is None:

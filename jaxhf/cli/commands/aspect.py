@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from . import arguments, mapping
+from .. import arguments, mapping
 
 
 def add(commands: Any) -> None:
@@ -21,7 +21,7 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..maps.slope import NODATA, aspect
+    from ...maps.slope import NODATA, aspect
 
     wanted = arguments.given(options, "trigonometric", "zero_for_flat", "algorithm", "compute_edges")
     nodata = None if options.zero_for_flat else NODATA

@@ -3,7 +3,7 @@
 import argparse
 from typing import Any
 
-from . import arguments, mapping
+from .. import arguments, mapping
 
 
 def add(commands: Any) -> None:
@@ -21,7 +21,7 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..maps.hillshade import hillshade
+    from ...maps.hillshade import hillshade
 
     wanted = {**mapping.light(options), "compute_edges": options.compute_edges}
     mapping.make(options, lambda terrain: hillshade(terrain, **wanted), kind="hillshade", nodata=0.0)

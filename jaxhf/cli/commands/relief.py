@@ -3,8 +3,8 @@
 import argparse
 from typing import Any
 
-from ..maps.choices import ENTRIES
-from . import arguments, mapping
+from ...maps.choices import ENTRIES
+from .. import arguments, mapping
 
 
 def add(commands: Any) -> None:
@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..maps.relief import color_relief, relief
+    from ...maps.relief import color_relief, relief
 
     tint = arguments.given(options, "ramp", "entries", "alpha")
     if not options.shading:

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from . import arguments, mapping
+from .. import arguments, mapping
 from .skyview import add_terrain, read
 
 
@@ -23,9 +23,9 @@ def add(commands: Any) -> None:
 def run(options: argparse.Namespace) -> None:
     import numpy as np
 
-    from ..core.errors import ArgumentError, counted
-    from ..io.files import replacing_all, write_npy
-    from ..io.rasters import geotiff, require_writable_raster
+    from ...core.errors import ArgumentError, counted
+    from ...io.files import replacing_all, write_npy
+    from ...io.rasters import geotiff, require_writable_raster
 
     mapping.require_numbers(options.output, "angles")
     path = require_writable_raster(options.output)
@@ -35,9 +35,9 @@ def run(options: argparse.Namespace) -> None:
         raise ArgumentError("", "--azimuth", f"must be finite, it is {options.azimuth}")
     stored, terrain = read(options)
     arguments.set_up_jax(options)
-    from ..maps.skyview import horizon
-    from ..trace.horizon import even_azimuths
-    from .progress import compiled_bar
+    from ...maps.skyview import horizon
+    from ...trace.horizon import even_azimuths
+    from ..progress import compiled_bar
 
     begin = time.perf_counter()
     azimuths = even_azimuths(options.azimuths) if options.azimuth is None else np.array([options.azimuth])
