@@ -27,10 +27,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _show_any_name()
     from ..core.errors import UserError
     from .overwriting import require_no_input
-    from .parser import make_parser
+    from .parser import parse
     from .progress import quiet
 
-    options = make_parser().parse_args(arguments)
+    options = parse(arguments)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides

@@ -193,7 +193,7 @@ def test_no_memory_is_an_error_in_one_line(monkeypatch, in_this_process, error):
     def fail(*_):
         raise error
 
-    monkeypatch.setattr("jaxhf.cli.commands.info.run", fail)
+    monkeypatch.setattr("jaxhf.io.scenes.load_scene", fail)
     said = "jaxhf: error: memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)\n"
     assert in_this_process("info", SCENE) == (2, "", said)
 

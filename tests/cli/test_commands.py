@@ -13,7 +13,12 @@ from jaxhf.cli import main as entry, parser
 from jaxhf.cli.main import main
 from jaxhf.cli.progress import bar, compiled_bar, quiet
 
-COMMANDS = [module.__name__.rsplit(".", 1)[1] for modules in parser.GROUPS.values() for module in modules]
+GROUPS = {
+    "terrain maps": "hillshade slope aspect relief skyview horizon",
+    "pictures": "view render",
+    "recovery": "fit tradeoff",
+    "files": "convert info",
+}
 
 
 def said(capsys, *arguments):
@@ -29,10 +34,10 @@ def said(capsys, *arguments):
 def test_help_has_the_commands_in_groups_and_each_examples_that_it_takes(capsys):
     code, text = said(capsys, "--help")
     assert code == 0
-    for title, modules in parser.GROUPS.items():
+    for title, commands in GROUPS.items():
         listed = text.split(f"\n{title}:\n")[1].split("\n\n")[0]
-        assert [line.split()[0] for line in listed.splitlines()] == [module.__name__.rsplit(".", 1)[1] for module in modules]
-    for command in COMMANDS:
+        assert [line.split()[0] for line in listed.splitlines()] == commands.split()
+    for command in " ".join(GROUPS.values()).split():
         code, text = said(capsys, command, "--help")
         assert (code, "--quiet" in text) == (0, True)
         examples = [line.strip() for line in text.split("\nexamples:\n")[1].splitlines()]
@@ -40,7 +45,7 @@ def test_help_has_the_commands_in_groups_and_each_examples_that_it_takes(capsys)
         for example in examples:
             program, *words = shlex.split(example)
             assert (program, words[0]) == ("jaxhf", command)
-            parser.make_parser().parse_args(words)  # SystemExit where it is refused
+            parser.parse(words)  # SystemExit where it is refused
 
 
 SCENE = """samples = 1
@@ -78,6 +83,7 @@ REFUSED = [
     ("horizon hills.npz -o a.npy --azimuth 90 --azimuths 8", "--azimuths would change nothing: --azimuth asks for one"),
     ("view hills.npz -o a.png --frames 24", "--frames would change nothing: a.png is one picture, a film is .gif or .mp4"),
     ("view hills.npz -o a.gif --sun-from 90,9 --sun-to 99,9 --altitude 8", "--altitude would change nothing: the sun moves"),
+    ("view hills.npz -o a.png --ramp terrain --drape rock.png", "--ramp would change nothing: --drape gives the terrain its"),
     ("render scene.toml -o a.png --shading flat --normals six", "--normals would change nothing: --shading flat takes those"),
     ("tradeoff scene.toml --knobs max_depth", "tradeoff: knobs 'max_depth' changes nothing here: the scene has no mirror"),
     # Values.

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from ...core.errors import ArgumentError, counted
 from .. import arguments, interruption
+from ..arguments import flag, option, output
+from ..command import Command
 from ..overwriting import require_no_input
 
 if TYPE_CHECKING:
@@ -19,21 +21,6 @@ if TYPE_CHECKING:
 
 _USUAL_STEPS = 30  # of a fit, until it says what is to come
 _EARLY = 50.0  # seconds: most fits compile no longer, and JAX reports a compilation only when it is done
-
-
-def add(commands: Any) -> None:
-    about = "Recover heights from pictures. Beside OUT stand OUT_std and OUT_albedo.npy, where they are asked for."
-    examples = arguments.examples(
-        "jaxhf fit case.toml -o heights.tif --report report.html",
-        "jaxhf fit case.toml -o heights.tif --resume",
-    )
-    command = commands.add_parser("fit", help="recover heights from pictures", description=about, epilog=examples)
-    command.add_argument("case", metavar="CASE", help="a .toml file: a scene, its pictures, and what is known")
-    command.add_argument("-o", "--output", required=True, metavar="OUT", help="the heights: .npy, .npz or .tif")
-    command.add_argument("--report", metavar="PAGE", help="an .html page with plots of heights, pictures and convergence")
-    command.add_argument("--resume", action="store_true", help="go on from OUT.checkpoint, if it is there")
-    arguments.add_machine(command)
-    command.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -224,3 +211,21 @@ def _write(path: str, case: "Case", found: "Fit", outputs: Outputs) -> None:
     if outputs.report is not None:
         page = report(f"Heights from {path}", found, field, case.targets, case.names)
         save_text(outputs.report, page)
+
+
+COMMAND = Command(
+    "fit",
+    "recover heights from pictures",
+    examples=("case.toml -o heights.tif --report report.html", "case.toml -o heights.tif --resume"),
+    options={
+        "": (
+            option("case", metavar="CASE", help="a .toml file: a scene, its pictures, and what is known"),
+            output("the heights: .npy, .npz or .tif"),
+            option("--report", metavar="PAGE", help="an .html page with plots of heights, pictures and convergence"),
+            flag("--resume", "go on from OUT.checkpoint, if it is there"),
+        ),
+        **arguments.MACHINE,
+    },
+    run=run,
+    about="Beside OUT stand OUT_std and OUT_albedo.npy, where they are asked for.",
+)

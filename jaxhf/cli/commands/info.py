@@ -2,20 +2,9 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from .. import arguments
-
-
-def add(commands: Any) -> None:
-    about = "Print what a scene or a terrain file holds."
-    examples = arguments.examples(
-        "jaxhf info terrain.tif",
-        "jaxhf info scene.toml",
-    )
-    command = commands.add_parser("info", help="print what a scene or a terrain file holds", description=about, epilog=examples)
-    command.add_argument("file", metavar="FILE", help=f"a .toml or .pbrt scene; heights: {arguments.TERRAIN}")
-    command.set_defaults(run=run)
+from ..command import Command
 
 
 def run(options: argparse.Namespace) -> None:
@@ -37,3 +26,12 @@ def run(options: argparse.Namespace) -> None:
     print(f"{options.file}: {scene.camera.width} x {scene.camera.height} pixels, {counted(scene.samples, 'sample')} a pixel")
     print("\n".join(scene_lines(scene)))
     warn([scene])
+
+
+COMMAND = Command(
+    "info",
+    "print what a scene or a terrain file holds",
+    examples=("terrain.tif", "scene.toml"),
+    options={"": (arguments.option("file", metavar="FILE", help=f"a .toml or .pbrt scene; heights: {arguments.TERRAIN}"),)},
+    run=run,
+)

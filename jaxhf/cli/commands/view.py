@@ -7,10 +7,12 @@ import math
 import time
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ...core.errors import ArgumentError, UserError
 from .. import arguments
+from ..arguments import choice, flag, number, option, whole
+from ..command import Command
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,67 +26,6 @@ if TYPE_CHECKING:
 _PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
 
 _TALLEST = 100  # times its length: beyond, a terrain is a needle that no pixel shows
-
-
-def add(commands: Any) -> None:
-    about = "Show a terrain as a solid block in colours, from a place that shows all of it. A .gif or .mp4 goes round it."
-    examples = arguments.examples(
-        "jaxhf view --demo -o block.png", "jaxhf view dem.tif -o orbit.gif --size 640x400 --frames 48"
-    )
-    command = commands.add_parser(
-        "view", help="show a terrain as a solid block, or fly round it", description=about, epilog=examples
-    )
-    command.add_argument("terrain", metavar="IN", nargs="?", help=f"heights: {arguments.TERRAIN}")
-    command.add_argument("--demo", action="store_true", help="in place of IN the Jacksboro fault, which matplotlib ships")
-    command.add_argument("-o", "--output", metavar="OUT", help=".png, .jpg, .exr, .npy; a film: .gif, .mp4 [IN's name, .png]")
-    size = command.add_argument_group("picture")
-    size.add_argument("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]")
-    size.add_argument(
-        "--preset",
-        choices=_PRESETS,
-        default="balanced",
-        help="1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]",
-    )
-    size.add_argument("--frames", type=int, metavar="N", help="of a film, 24 a second [72]")
-    camera = command.add_argument_group("camera")
-    camera.add_argument(
-        "--from", dest="camera_azimuth", type=float, metavar="DEGREES",
-        help="where the camera stands, clockwise from north [110 left of the sun]",
-    )  # fmt: skip
-    camera.add_argument(
-        "--above", dest="camera_altitude", type=float, default=35.0, metavar="DEGREES", help="above the horizon [35]"
-    )
-    camera.add_argument("--fov", type=float, default=30.0, metavar="DEGREES", help="angle of view [30]")
-    light = command.add_argument_group("light")
-    light.add_argument("--azimuth", type=float, metavar="DEGREES", help="of the sun, clockwise from north [315]")
-    light.add_argument("--altitude", type=float, metavar="DEGREES", help="of the sun, above the horizon [45]")
-    light.add_argument(
-        "--sun-from", type=_sun, metavar="AZ,ALT|TIME",
-        help="a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00",
-    )  # fmt: skip
-    light.add_argument("--sun-to", type=_sun, metavar="AZ,ALT|TIME", help="and where it ends, or when")
-    for name in ("latitude", "longitude"):
-        light.add_argument(f"--{name}", type=float, metavar="DEGREES", help="for times [that of the terrain's middle]")
-    light.add_argument("--haze", type=float, default=0.15, metavar="SHARE", help="of light lost along the terrain [0.15]")
-    ground = command.add_argument_group("terrain")
-    ground.add_argument(
-        "--exaggeration",
-        type=float,
-        metavar="X",
-        help="heights are multiplied by it [1, or more on flat terrain]",
-    )
-    tint = ground.add_mutually_exclusive_group()
-    tint.add_argument(
-        "--ramp", metavar="FILE|NAME", help="colours by height: a gdaldem colour file, or a matplotlib colour map"
-    )
-    tint.add_argument(
-        "--drape", metavar="IMAGE", help="a picture laid over it: a GeoTIFF where it lies, others from corner to corner"
-    )
-    ground.add_argument("--water", type=float, metavar="LEVEL", help="below it is water")
-    ground.add_argument("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet")
-    arguments.add_raster(command)
-    arguments.add_machine(command)
-    command.set_defaults(run=run)
 
 
 def _sun(text: str) -> tuple[float, float] | datetime.datetime:
@@ -158,6 +99,8 @@ def run(options: argparse.Namespace) -> None:
         arguments.refuse(options, "frames", because=f"{output} is one picture, a film is {' or '.join(FILMS)}")
     if options.sun_from is not None:
         arguments.refuse(options, "azimuth", "altitude", because="the sun moves from --sun-from to --sun-to")
+    if options.drape is not None:
+        arguments.refuse(options, "ramp", because="--drape gives the terrain its colours")
     options.frames = 72 if options.frames is None else options.frames
     if options.frames < 2:
         raise UserError(f"view: --frames must be 2 or more, it is {options.frames}")
@@ -288,3 +231,58 @@ class _Stage:
                 add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
                 shown.update()
         return f"{options.frames} frames of {self.size[0]} x {self.size[1]} pixels"
+
+
+def _degrees(name: str, help: str, default: float | None = None) -> arguments.Option:
+    return number(name, "DEGREES", help, default)
+
+
+_PRESET = "1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]"
+_FROM = "where the camera stands, clockwise from north [110 left of the sun]"
+_SUN_FROM = "a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00"
+_RAMP = "colours by height: a gdaldem colour file, or a matplotlib colour map"
+_DRAPE = "a picture laid over it: a GeoTIFF where it lies, others from corner to corner"
+COMMAND = Command(
+    "view",
+    "show a terrain as a solid block, or fly round it",
+    examples=("--demo -o block.png", "dem.tif -o orbit.gif --size 640x400 --frames 48"),
+    options={
+        "": (
+            option("terrain", metavar="IN", nargs="?", help=f"heights: {arguments.TERRAIN}"),
+            flag("--demo", "in place of IN the Jacksboro fault, which matplotlib ships"),
+            option("-o", "--output", metavar="OUT", help=".png, .jpg, .exr, .npy; a film: .gif, .mp4 [IN's name, .png]"),
+        ),
+        "picture": (
+            option("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]"),
+            choice("--preset", tuple(_PRESETS), _PRESET, default="balanced"),
+            whole("--frames", "N", "of a film, 24 a second [72]"),
+        ),
+        "camera": (
+            option("--from", dest="camera_azimuth", type=float, metavar="DEGREES", help=_FROM),
+            option(
+                "--above", dest="camera_altitude", type=float, default=35.0, metavar="DEGREES", help="above the horizon [35]"
+            ),
+            _degrees("--fov", "angle of view [30]", 30.0),
+        ),
+        "light": (
+            _degrees("--azimuth", "of the sun, clockwise from north [315]"),
+            _degrees("--altitude", "of the sun, above the horizon [45]"),
+            option("--sun-from", type=_sun, metavar="AZ,ALT|TIME", help=_SUN_FROM),
+            option("--sun-to", type=_sun, metavar="AZ,ALT|TIME", help="and where it ends, or when"),
+            _degrees("--latitude", "for times [that of the terrain's middle]"),
+            _degrees("--longitude", "for times [that of the terrain's middle]"),
+            number("--haze", "SHARE", "of light lost along the terrain [0.15]", 0.15),
+        ),
+        "terrain": (
+            number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]"),
+            option("--ramp", metavar="FILE|NAME", help=_RAMP),
+            option("--drape", metavar="IMAGE", help=_DRAPE),
+            number("--water", "LEVEL", "below it is water"),
+            option("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet"),
+        ),
+        **arguments.RASTER,
+        **arguments.MACHINE,
+    },
+    run=run,
+    about="It is seen from a place that shows all of it. A .gif or .mp4 goes round it.",
+)
