@@ -2,7 +2,8 @@
 
 import argparse
 import dataclasses
-from collections.abc import Collection, Sequence
+import math
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, get_args
 
 from ..core.errors import UserError
@@ -10,18 +11,38 @@ from ..core.settings import Settings
 
 Option = tuple[tuple[str, ...], dict[str, Any]]
 """What argparse's `add_argument` takes: names, and keywords."""
+Rule = tuple[str, Callable[[float], bool]]
+"""What a number must be, in words, and whether it is."""
 
 
 def option(*names: str, **keywords: Any) -> Option:
     return names, keywords
 
 
-def number(name: str, metavar: str, help: str, default: float | None = None) -> Option:
-    return option(name, type=float, metavar=metavar, default=default, help=help)
+FINITE = "finite", math.isfinite
+POSITIVE = "positive and finite", lambda value: 0 < value < math.inf
 
 
-def whole(name: str, metavar: str, help: str) -> Option:
-    return option(name, type=whole_number, metavar=metavar, help=help)
+def number(name: str, metavar: str, help: str, default: float | None = None, rule: Rule | None = None, **more: Any) -> Option:
+    """An option that takes a number, and refuses one that breaks the rule."""
+
+    def kind(text: str) -> float:
+        value = real_number(text)
+        if rule is not None and not rule[1](value):
+            raise argparse.ArgumentTypeError(f"must be {rule[0]}, it is {value}")
+        return value
+
+    return option(name, type=kind, metavar=metavar, default=default, help=help, **more)
+
+
+def whole(name: str, metavar: str, help: str, least: int | None = None) -> Option:
+    def kind(text: str) -> int:
+        value = whole_number(text)
+        if least is not None and value < least:
+            raise argparse.ArgumentTypeError(f"must be a whole number from {least} on, it is {value}")
+        return value
+
+    return option(name, type=kind, metavar=metavar, help=help)
 
 
 def flag(name: str, help: str) -> Option:

@@ -64,9 +64,6 @@ def _load(options: argparse.Namespace) -> "Scene":
     from ...scene.views import resized
 
     scene = load_scene(options.scene, np.dtype(options.precision))
-    for name, value in arguments.given(options, "width", "height").items():
-        if value < 1:
-            raise UserError(f"--{name} must be a whole number of pixels from 1 on, it is {value}")
     old, width, height = scene.camera, options.width, options.height
     if width is None and height is None:
         return scene
@@ -93,8 +90,8 @@ COMMAND = Command(
             option("--aovs", type=_names, default=(), metavar="NAMES", help=_AOVS),
         ),
         "size": (
-            whole("--width", "PIXELS", "of the picture; with one of the two, the other keeps the proportions"),
-            whole("--height", "PIXELS", "of the picture"),
+            whole("--width", "PIXELS", "of the picture; with one of the two, the other keeps the proportions", least=1),
+            whole("--height", "PIXELS", "of the picture", least=1),
         ),
         # Nothing is differentiated.
         "accuracy and speed": arguments.settings_options(Settings.__dataclass_fields__.keys() - {"edge_samples"}),

@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ...core.errors import ArgumentError, UserError, counted
+from ...core.errors import UserError, counted
 from .. import arguments
-from ..arguments import choice, number, output, whole
+from ..arguments import FINITE, choice, number, output, whole
 from ..command import Command
 from .maps import STEPS, report_spacing, require_numbers
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def _options(written: str, special: arguments.Option) -> dict[str, tuple[arguments.Option, ...]]:
-    azimuths = whole("--azimuths", "K", "directions, at even steps from north on [32]")
+    azimuths = whole("--azimuths", "K", "directions, at even steps from north on [32]", least=1)
     files = arguments.IN, output(written), azimuths, special
     return {"": files, "spacing": STEPS, **arguments.RASTER, **arguments.MACHINE}
 
@@ -30,8 +30,6 @@ def _read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
 
     given = spacing("", options.dx, options.dy)
     options.azimuths = 32 if options.azimuths is None else options.azimuths
-    if options.azimuths < 1:
-        raise ArgumentError("", "--azimuths", f"must be a whole number from 1 on, it is {options.azimuths}")
     stored = read_terrain(options.terrain, options.z_scale, options.nodata)
     if stored.nodata.all():
         raise UserError(f"{options.terrain}: there is no height in it")
@@ -74,8 +72,6 @@ def _horizon(options: argparse.Namespace) -> None:
     path, one = require_writable_raster(options.output), options.azimuth is not None
     if one:
         arguments.refuse(options, "azimuths", because="--azimuth asks for one")
-        if not np.isfinite(options.azimuth):
-            raise ArgumentError("", "--azimuth", f"must be finite, it is {options.azimuth}")
     stored, terrain = _read(options)
     arguments.set_up_jax(options)
     from ...maps.skyview import horizon
@@ -132,7 +128,7 @@ COMMANDS = (
         examples=("dem.tif -o horizon.npy --azimuths 36", "dem.tif -o west.tif --azimuth 270"),
         options=_options(
             "the map: .npy of shape (azimuths, rows, columns), or .tif, one file an azimuth: OUT_090.tif",
-            number("--azimuth", "DEGREES", "one direction, from north, clockwise, in its place"),
+            number("--azimuth", "DEGREES", "one direction, from north, clockwise, in its place", rule=FINITE),
         ),
         run=_horizon,
         about="They are in degrees above the horizontal, at least 0: exact and without a search radius.",

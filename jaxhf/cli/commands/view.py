@@ -3,15 +3,15 @@
 import argparse
 import dataclasses
 import datetime
-import math
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...core.errors import ArgumentError, UserError
 from .. import arguments
-from ..arguments import choice, flag, number, option, whole
+from ..arguments import FINITE, POSITIVE, choice, flag, number, option, whole
 from ..command import Command
 
 if TYPE_CHECKING:
@@ -75,10 +75,21 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
     return np.stack([azimuth, altitude], -1)
 
 
-def run(options: argparse.Namespace) -> None:
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(word) for word in text.lower().split("x"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be two numbers of pixels, as 1280x800, it is {text!r}") from None
+    if min(width, height) < 1:
+        raise argparse.ArgumentTypeError(f"must be positive, it is {text}")
+    return width, height
+
+
+def _output(options: argparse.Namespace) -> tuple[Path, bool]:
+    """The file, and whether it is a film; UserError where options do not go together."""
     from ...io.films import FILMS, require_writable_film
     from ...io.images import PICTURES, require_writable
-    from ...io.load_terrain import jacksboro_file, load_heights
+    from ...io.load_terrain import jacksboro_file
     from ..overwriting import require_no_input
 
     if options.demo == (options.terrain is not None):
@@ -92,151 +103,125 @@ def run(options: argparse.Namespace) -> None:
         raise UserError("view: --sun-from and --sun-to belong together, one is missing")
     if options.sun_from is not None and not film:
         raise UserError(f"view: a moving sun makes a film, {output} is none; write {' or '.join(FILMS)}")
-    for name, value, low in (("exaggeration", options.exaggeration, 0.0), ("water", options.water, -math.inf)):
-        if value is not None and not low < value < math.inf:
-            raise UserError(f"view: --{name} must be {'finite' if low else 'positive and finite'}, it is {value}")
     if not film:
         arguments.refuse(options, "frames", because=f"{output} is one picture, a film is {' or '.join(FILMS)}")
     if options.sun_from is not None:
         arguments.refuse(options, "azimuth", "altitude", because="the sun moves from --sun-from to --sun-to")
     if options.drape is not None:
         arguments.refuse(options, "ramp", because="--drape gives the terrain its colours")
-    options.frames = 72 if options.frames is None else options.frames
-    if options.frames < 2:
-        raise UserError(f"view: --frames must be 2 or more, it is {options.frames}")
     require_no_input(options, output)
     (require_writable_film if film else require_writable)(output)
-    size = _size(options.size)
+    return output, film
+
+
+def run(options: argparse.Namespace) -> None:
+    from ...io.images import save_image
+    from ...io.load_terrain import load_heights
+
+    output, film = _output(options)
     begin = time.perf_counter()
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
     if terrain.nodata.all():
         raise UserError(f"view: {options.terrain} holds no height")
+    options.frames = options.frames or 72
     path = _sun_path(options, terrain)
-    stage = _Stage(options, terrain, size)
+    from ...scene.heightfield import Heightfield
+    from ...xla.devices import local_mesh
+    from ..block import block, exaggeration, photograph
+    from ..limits import require_memory
+    from ..progress import bar
+
+    factor = options.exaggeration or exaggeration(terrain.heights, terrain.dx, terrain.dy)
+    z, colours, base = _solid(options, terrain, factor)
     arguments.set_up_jax(options)
-    said = stage.film(output, options, path) if film else stage.picture(output)
-    print(f"{output}: {said}, heights x {stage.exaggeration:g}, {time.perf_counter() - begin:.1f} s")
+    field = Heightfield(z, terrain.dx, terrain.dy)
+    cameras, looks = _frames(options, field, base, path, film)
+    scene = block(field, colours, cameras[0], looks[0], base)
+    require_memory(scene, local_mesh().size)
+    said = "{} x {} pixels".format(*options.size)
+    if film:
+        _film(output, scene, cameras, looks)
+        said = f"{len(cameras)} frames of {said}"
+    else:
+        with bar(total=looks[0].samples, unit=" samples", delay=0.5) as shown:
+            save_image(output, photograph(scene, cameras[0], looks[0], shown.update))
+    print(f"{output}: {said}, heights x {factor:g}, {time.perf_counter() - begin:.1f} s")
 
 
-def _size(text: str) -> tuple[int, int]:
-    try:
-        width, height = (int(word) for word in text.lower().split("x"))
-    except ValueError:
-        raise UserError(f"view: --size must be two numbers of pixels, as 1280x800, it is {text!r}") from None
-    if min(width, height) < 1:
-        raise UserError(f"view: --size must be positive, it is {text}")
-    return width, height
+def _solid(options: argparse.Namespace, terrain: "Terrain", factor: float) -> "tuple[np.ndarray, np.ndarray, float | None]":
+    """What `block` takes: the terrain's heights times a factor, with water on them; colours; the floor's level."""
+    import numpy as np
+
+    from ..block import with_water
+
+    z, colours = terrain.heights.astype(options.precision), _colours(options, terrain)
+    if options.water is not None:
+        low, high = np.nanmin(z), np.nanmax(z)
+        if not low < options.water < high:
+            warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {options.water:g}", stacklevel=2)
+        z, colours = with_water(z, colours, options.water)
+    reach = max((n - 1) * d for n, d in zip(z.shape, (terrain.dy, terrain.dx), strict=True))
+    times = (float(np.nanmax(z)) - float(np.nanmin(z))) * factor / reach
+    if times > _TALLEST:
+        found = f"times {factor:g} it is {times:.3g} times its length high"
+        raise UserError(f"view: --exaggeration must leave a terrain at most {_TALLEST} times its length high; {found}")
+    z = z * z.dtype.type(factor)
+    low, high = np.nanmin(z), np.nanmax(z)
+    return z, colours, float(low - max(0.25 * (high - low), 0.02 * reach)) if options.skirt else None
 
 
-class _Stage:
-    """A terrain made ready to be shown: exaggerated, coloured, with a floor."""
+def _colours(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray":
+    import numpy as np
 
-    def __init__(self, options: argparse.Namespace, terrain: "Terrain", size: tuple[int, int]):
-        import numpy as np
+    from ...io.drape import load_drape
+    from ...io.images import linear_from_srgb
+    from ...maps.relief import color_relief
 
-        from ..block import Look, exaggeration, with_water
-
-        self.options, self.size, self.terrain = options, size, terrain
-        self.exaggeration = options.exaggeration or exaggeration(terrain.heights, terrain.dx, terrain.dy)
-        self.colours = self._colours()
-        z = terrain.heights.astype(options.precision)
-        if options.water is not None:
-            low, high = np.nanmin(z), np.nanmax(z)
-            if not low < options.water < high:
-                warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {options.water:g}", stacklevel=2)
-            z, self.colours = with_water(z, self.colours, options.water)
-        reach = max((n - 1) * d for n, d in zip(z.shape, (terrain.dy, terrain.dx), strict=True))
-        times = (float(np.nanmax(z)) - float(np.nanmin(z))) * self.exaggeration / reach
-        if times > _TALLEST:
-            found = f"times {self.exaggeration:g} it is {times:.3g} times its length high"
-            raise UserError(f"view: --exaggeration must leave a terrain at most {_TALLEST} times its length high; {found}")
-        self.heights = z * z.dtype.type(self.exaggeration)
-        low, high = np.nanmin(self.heights), np.nanmax(self.heights)
-        self.base = float(low - max(0.25 * (high - low), 0.02 * reach)) if options.skirt else None
-        self.look = Look(**arguments.given(options, "azimuth", "altitude", "haze"), samples=_PRESETS[options.preset])
-
-    def _colours(self) -> "np.ndarray":
-        import numpy as np
-
-        from ...io.drape import load_drape
-        from ...io.images import linear_from_srgb
-        from ...maps.relief import color_relief
-
-        if self.options.drape is not None:
-            return load_drape(self.options.drape, self.terrain)
-        return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(self.terrain, self.options.ramp)]
-
-    def _scene(self, field: "Heightfield", camera: "Perspective", look: "Look") -> "Scene":
-        from ...xla.devices import local_mesh
-        from ..block import block
-        from ..limits import require_memory
-
-        scene = block(field, self.colours, camera, look, self.base)
-        require_memory(scene, local_mesh().size)
-        return scene
-
-    def _field(self) -> "Heightfield":
-        from ...scene.heightfield import Heightfield
-
-        return Heightfield(self.heights, self.terrain.dx, self.terrain.dy)
-
-    def _camera(self, field: "Heightfield", azimuth: float, around: bool = False) -> "Perspective":
-        from ...scene.camera import Perspective
-
-        width, height = self.size
-        altitude, fov = self.options.camera_altitude, self.options.fov
-        return Perspective.framing(field, azimuth, altitude, fov, width=width, height=height, base=self.base, around=around)
-
-    @property
-    def _azimuth(self) -> float:
-        given = self.options.camera_azimuth
-        return self.look.azimuth - 110 if given is None else given
-
-    def picture(self, output: Path) -> str:
-        from ...io.images import save_image
-        from ..block import photograph
-        from ..progress import bar
-
-        field = self._field()
-        camera = self._camera(field, self._azimuth)
-        with bar(total=self.look.samples, unit=" samples", delay=0.5) as shown:
-            image = photograph(self._scene(field, camera, self.look), camera, self.look, shown.update)
-        save_image(output, image)
-        return f"{self.size[0]} x {self.size[1]} pixels"
-
-    def film(self, output: Path, options: argparse.Namespace, path: "np.ndarray | None") -> str:
-        import numpy as np
-
-        from ...io.films import writing_film
-        from ...io.images import srgb_from_linear
-        from ...rendering.render import prepare
-        from ..block import photograph
-        from ..progress import bar
-
-        field = self._field()
-        if path is None:
-            turns = [self._azimuth + 360 * k / options.frames for k in range(options.frames)]
-            cameras = [self._camera(field, turn, around=True) for turn in turns]
-            looks = [self.look] * options.frames
-        else:
-            cameras = [self._camera(field, self._azimuth)] * options.frames
-            looks = [dataclasses.replace(self.look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
-        ready, lit = None, None
-        with writing_film(output, 24) as add, bar(total=options.frames, unit=" frames") as shown:
-            for camera, look in zip(cameras, looks, strict=True):
-                if ready is None or look != lit:
-                    scene, lit = self._scene(field, camera, look), look
-                    ready = prepare(scene) if ready is None else ready.with_lights(scene.lights)
-                image = photograph(ready, camera, look)
-                add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
-                shown.update()
-        return f"{options.frames} frames of {self.size[0]} x {self.size[1]} pixels"
+    if options.drape is not None:
+        return load_drape(options.drape, terrain)
+    return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(terrain, options.ramp)]
 
 
-def _degrees(name: str, help: str, default: float | None = None) -> arguments.Option:
-    return number(name, "DEGREES", help, default)
+def _frames(
+    options: argparse.Namespace, field: "Heightfield", base: float | None, path: "np.ndarray | None", film: bool
+) -> "tuple[list[Perspective], list[Look]]":
+    """A camera and a look for each frame: round the terrain, or in a moving sun, whose `path` it is; for a picture one."""
+    from ...scene.camera import Perspective
+    from ..block import Look
+
+    look = Look(**arguments.given(options, "azimuth", "altitude", "haze"), samples=_PRESETS[options.preset])
+    azimuth = look.azimuth - 110 if options.camera_azimuth is None else options.camera_azimuth
+    around, (width, height) = film and path is None, options.size
+    looks = [look] if path is None else [dataclasses.replace(look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
+    cameras = [
+        Perspective.framing(
+            field, azimuth + turn, options.camera_altitude, options.fov, width=width, height=height, base=base, around=around
+        )
+        for turn in ([360 * k / options.frames for k in range(options.frames)] if around else [0])
+    ]
+    return cameras * len(looks), looks * len(cameras)
 
 
+def _film(output: Path, scene: "Scene", cameras: "Sequence[Perspective]", looks: "Sequence[Look]") -> None:
+    """A frame for each camera and look; the terrain is prepared once."""
+    import numpy as np
+
+    from ...io.films import writing_film
+    from ...io.images import srgb_from_linear
+    from ...rendering.render import prepare
+    from ..block import lights, photograph
+    from ..progress import bar
+
+    ready = prepare(scene)
+    with writing_film(output, 24) as add, bar(total=len(looks), unit=" frames") as shown:
+        for camera, look in zip(cameras, looks, strict=True):
+            lit = ready if look is looks[0] else ready.with_lights(lights(scene.heightfields[0], look))
+            image = photograph(lit, camera, look)
+            add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
+            shown.update()
+
+
+_DEGREES = "DEGREES"
 _PRESET = "1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]"
 _FROM = "where the camera stands, clockwise from north [110 left of the sun]"
 _SUN_FROM = "a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00"
@@ -253,31 +238,29 @@ COMMAND = Command(
             option("-o", "--output", metavar="OUT", help=".png, .jpg, .exr, .npy; a film: .gif, .mp4 [IN's name, .png]"),
         ),
         "picture": (
-            option("--size", default="1280x800", metavar="WxH", help="pixels [1280x800]"),
+            option("--size", type=_size, default=(1280, 800), metavar="WxH", help="pixels [1280x800]"),
             choice("--preset", tuple(_PRESETS), _PRESET, default="balanced"),
-            whole("--frames", "N", "of a film, 24 a second [72]"),
+            whole("--frames", "N", "of a film, 24 a second [72]", least=2),
         ),
         "camera": (
-            option("--from", dest="camera_azimuth", type=float, metavar="DEGREES", help=_FROM),
-            option(
-                "--above", dest="camera_altitude", type=float, default=35.0, metavar="DEGREES", help="above the horizon [35]"
-            ),
-            _degrees("--fov", "angle of view [30]", 30.0),
+            number("--from", _DEGREES, _FROM, dest="camera_azimuth"),
+            number("--above", _DEGREES, "above the horizon [35]", 35.0, dest="camera_altitude"),
+            number("--fov", _DEGREES, "angle of view [30]", 30.0),
         ),
         "light": (
-            _degrees("--azimuth", "of the sun, clockwise from north [315]"),
-            _degrees("--altitude", "of the sun, above the horizon [45]"),
+            number("--azimuth", _DEGREES, "of the sun, clockwise from north [315]"),
+            number("--altitude", _DEGREES, "of the sun, above the horizon [45]"),
             option("--sun-from", type=_sun, metavar="AZ,ALT|TIME", help=_SUN_FROM),
             option("--sun-to", type=_sun, metavar="AZ,ALT|TIME", help="and where it ends, or when"),
-            _degrees("--latitude", "for times [that of the terrain's middle]"),
-            _degrees("--longitude", "for times [that of the terrain's middle]"),
+            number("--latitude", _DEGREES, "for times [that of the terrain's middle]"),
+            number("--longitude", _DEGREES, "for times [that of the terrain's middle]"),
             number("--haze", "SHARE", "of light lost along the terrain [0.15]", 0.15),
         ),
         "terrain": (
-            number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]"),
+            number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]", rule=POSITIVE),
             option("--ramp", metavar="FILE|NAME", help=_RAMP),
             option("--drape", metavar="IMAGE", help=_DRAPE),
-            number("--water", "LEVEL", "below it is water"),
+            number("--water", "LEVEL", "below it is water", rule=FINITE),
             option("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet"),
         ),
         **arguments.RASTER,
