@@ -19,7 +19,7 @@ class Command:
       options: the title of each group and what is in it, with positional arguments; "": without a title.
       run: does it.
       about: what its own --help says besides.
-      placed: whether files beside its output say where it lies.
+      placed: whether files beside an output that is a map say where it lies.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Command:
     options: Mapping[str, Sequence[arguments.Option]]
     run: Callable[[argparse.Namespace], None]
     about: str = ""
-    placed: bool = False
+    placed: bool = True
 
     def add(self, commands: Any) -> None:
         """Adds its parser to those of `parser.Commands`."""

@@ -55,5 +55,4 @@ COMMAND = Command(
     },
     run=run,
     about="It keeps its place on the map, or becomes a mesh of triangles.",
-    placed=True,
 )

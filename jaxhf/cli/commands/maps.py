@@ -142,7 +142,6 @@ COMMANDS = (
         options={**_files(_BYTES), **_LIGHT, **_SLOPES, **_SPACING},
         run=_hillshade,
         about="Bytes from 1 to 255, 0 where there is no value, as gdaldem hillshade writes them.",
-        placed=True,
     ),
     Command(
         "slope",
@@ -151,7 +150,6 @@ COMMANDS = (
         options={**_files(_NUMBERS, flag("--percent", "rise over run in percent, not degrees")), **_SLOPES, **_SPACING},
         run=_slope,
         about="Degrees in 32-bit floats, -9999 where there is no value, as gdaldem slope.",
-        placed=True,
     ),
     Command(
         "aspect",
@@ -160,7 +158,6 @@ COMMANDS = (
         options={**_files(_NUMBERS, *_DIRECTION), **_SLOPES},
         run=_aspect,
         about="Degrees clockwise from north in 32-bit floats, -9999 where flat, as gdaldem aspect.",
-        placed=True,
     ),
     Command(
         "relief",
@@ -169,6 +166,5 @@ COMMANDS = (
         options={**_files(_COLOURED), **_COLOURS, **_LIGHT, "slopes": (_ALGORITHM,), **_SPACING},
         run=_relief,
         about="Without shading the colours are those of gdaldem color-relief.",
-        placed=True,
     ),
 )

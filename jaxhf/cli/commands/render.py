@@ -98,4 +98,5 @@ COMMAND = Command(
         **arguments.MACHINE,
     },
     run=run,
+    placed=False,
 )

@@ -120,7 +120,6 @@ COMMANDS = (
         ),
         run=_skyview,
         about="It is the share of the sky that the terrain leaves to see, exact and without a search radius.",
-        placed=True,
     ),
     Command(
         "horizon",
@@ -132,6 +131,5 @@ COMMANDS = (
         ),
         run=_horizon,
         about="They are in degrees above the horizontal, at least 0: exact and without a search radius.",
-        placed=True,
     ),
 )

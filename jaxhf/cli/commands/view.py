@@ -268,4 +268,5 @@ COMMAND = Command(
     },
     run=run,
     about="It is seen from a place that shows all of it. A .gif or .mp4 goes round it.",
+    placed=False,
 )
