@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import math
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any, get_args
 
 from ..core.errors import UserError
@@ -11,51 +12,42 @@ from ..core.settings import Settings
 
 Option = tuple[tuple[str, ...], dict[str, Any]]
 """What argparse's `add_argument` takes: names, and keywords."""
-Rule = tuple[str, Callable[[float], bool]]
-"""What a number must be, in words, and whether it is."""
+Rule = tuple[str, Callable[[Any], bool]]
+"""What a value must be, in words, and whether it is."""
+
+_ANY: Rule = "", lambda value: True
+FINITE: Rule = "finite", math.isfinite
+POSITIVE: Rule = "positive and finite", lambda value: 0 < value < math.inf
 
 
 def option(*names: str, **keywords: Any) -> Option:
     return names, keywords
 
 
-FINITE = "finite", math.isfinite
-POSITIVE = "positive and finite", lambda value: 0 < value < math.inf
-
-
-def number(name: str, metavar: str, help: str, default: float | None = None, rule: Rule | None = None, **more: Any) -> Option:
-    """An option that takes a number, and refuses one that breaks the rule."""
-
-    def kind(text: str) -> float:
-        value = real_number(text)
-        if rule is not None and not rule[1](value):
-            raise argparse.ArgumentTypeError(f"must be {rule[0]}, it is {value}")
-        return value
-
-    return option(name, type=kind, metavar=metavar, default=default, help=help, **more)
-
-
-def whole(name: str, metavar: str, help: str, least: int | None = None) -> Option:
-    def kind(text: str) -> int:
-        value = whole_number(text)
-        if least is not None and value < least:
-            raise argparse.ArgumentTypeError(f"must be a whole number from {least} on, it is {value}")
-        return value
-
-    return option(name, type=kind, metavar=metavar, help=help)
-
-
 def flag(name: str, help: str) -> Option:
     return option(name, action="store_true", help=help)
 
 
-def choice(name: str, names: Sequence[str], help: str, default: str | None = None) -> Option:
-    def one(text: str) -> str:
-        if text not in names:
-            raise argparse.ArgumentTypeError(f"must be one of {', '.join(names)}; it is {text!r}")
-        return text
+def number(name: str, metavar: str, help: str, default: float | None = None, rule: Rule = _ANY, **more: Any) -> Option:
+    return option(name, type=partial(_converted, real_number, rule), metavar=metavar, default=default, help=help, **more)
 
-    return option(name, type=one, metavar=f"{{{','.join(names)}}}", default=default, help=help)
+
+def whole(name: str, metavar: str, help: str, least: int | None = None) -> Option:
+    rule = _ANY if least is None else (f"a whole number from {least} on", lambda value: value >= least)
+    return option(name, type=partial(_converted, whole_number, rule), metavar=metavar, help=help)
+
+
+def choice(name: str, names: Sequence[str], help: str, default: str | None = None) -> Option:
+    rule = f"one of {', '.join(names)}", names.__contains__
+    return option(name, type=partial(_converted, str, rule), metavar=f"{{{','.join(names)}}}", default=default, help=help)
+
+
+def _converted(convert: Callable[[str], Any], rule: Rule, text: str) -> Any:
+    value = convert(text)
+    words, holds = rule
+    if not holds(value):
+        raise argparse.ArgumentTypeError(f"must be {words}{';' if ',' in words else ','} it is {value!r}")
+    return value
 
 
 def real_number(text: str) -> float:
