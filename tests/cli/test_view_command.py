@@ -89,10 +89,7 @@ def test_a_picture_from_somewhere_through_haze_of_what_is_laid_over_it(tmp_path,
     texels = np.zeros((4, 6, 3), np.uint8)
     texels[:, :2, 0], texels[:2, :, 2] = 255, 255  # red in the west, blue in the north
     imageio.imwrite(tmp_path / "drape.png", texels)
-    words = [
-        *["--from", "100", "--above", "50", "--fov", "20", "--haze", "0.6", "--no-skirt", "--drape"],
-        tmp_path / "drape.png",
-    ]
+    words = ["--from", 100, "--above", 50, "--fov", 20, "--haze", 0.6, "--no-skirt", "--drape", tmp_path / "drape.png"]
     assert command("view", tmp_path / "in.npz", "-o", tmp_path / "out.npy", *words, *SMALL)[0] == 0
     picture = np.load(tmp_path / "out.npy")
 
