@@ -11,6 +11,7 @@ import pytest
 import jaxhf
 from jaxhf.cli import main as entry, parser
 from jaxhf.cli.main import main
+from jaxhf.cli.overwriting import require_no_input
 from jaxhf.cli.progress import bar, compiled_bar, quiet
 
 GROUPS = {
@@ -196,6 +197,7 @@ def test_nor_is_what_lies_beside_it(folder, command):
         where = "hills.prj: the output cannot replace an input of the same command, which hills.asc comes with"
         assert command(*line.split()) == (2, "", f"jaxhf: error: {where}\n")
     assert not (folder / "hills.png").exists()
+    require_no_input(parser.parse(["view", "hills.asc", "-o", "hills.png"]))  # a picture has no .prj
     (folder / "hills.npy").write_text("old")
     assert command("convert", "hills.asc", "hills.npy")[0] == 0  # which writes no .prj
     np.testing.assert_array_equal(np.load("hills.npy"), [[3, 4], [1, 2]])
