@@ -26,9 +26,7 @@ def _read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
     """The terrain as the file places it, and in metres, in the precision that is asked for."""
     from ...io.errors import FileError
     from ...io.load_terrain import read_terrain
-    from ...maps.surface import spacing
 
-    given = spacing("", options.dx, options.dy)
     options.azimuths = 32 if options.azimuths is None else options.azimuths
     stored = read_terrain(options.terrain, options.z_scale, options.nodata)
     if stored.nodata.all():
@@ -36,7 +34,7 @@ def _read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
     stored = dataclasses.replace(stored, heights=stored.heights.astype(options.precision))
     report_spacing(options, stored)
     try:
-        return stored, stored.in_metres(**given)
+        return stored, stored.in_metres(**arguments.given(options, "dx", "dy"))
     except FileError as error:
         raise FileError(f"{options.terrain}: {error}") from error
 
