@@ -1,8 +1,9 @@
-"""Macros of the pages: tables of measurements, notebooks as they were run, and the settings with their help."""
+"""Macros of the pages: tables of measurements, notebooks as they were run, settings and commands with their help."""
 
 import csv
 import dataclasses
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,18 @@ def settings() -> str:
     return "\n".join(lines)
 
 
+def commands() -> str:
+    """What each command's --help says, which its table of options holds."""
+    from jaxhf.cli.parser import Commands
+
+    os.environ["COLUMNS"] = "88"  # which argparse fills
+    parsers = Commands().parsers
+    return "\n\n".join(f"## {name}\n\n```text\n{parser.format_help()}```" for name, parser in parsers.items())
+
+
 def define_env(env: Any) -> None:
     """Called by the site's builder."""
     env.macro(measured)
     env.macro(notebook)
     env.macro(settings)
+    env.macro(commands)

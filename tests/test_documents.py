@@ -219,3 +219,4 @@ def test_site_builds_strictly_and_needs_no_other(tmp_path):
         assert not re.search("&(reg|copy|trade);|[©®™]", text), f"{page}: (c), (r) and (tm) stand between backquotes"
         assert "{{" not in re.sub(r"<(code|pre).*?</\1>", "", text, flags=re.DOTALL), page
     assert (tmp_path / "site" / "api" / "render.html").read_text().count('class="doc doc-heading"') >= 5
+    assert "usage: jaxhf hillshade" in (tmp_path / "site" / "guides" / "commands.html").read_text()

@@ -1,14 +1,112 @@
-"""Options that several commands share, and what a command makes of them."""
+"""Options as tables, those that several commands share, and what a command makes of them."""
 
 import argparse
 import dataclasses
-from collections.abc import Collection
+import math
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any, get_args
 
 from ..core.errors import UserError
 from ..core.settings import Settings
 
+Option = tuple[tuple[str, ...], dict[str, Any]]
+"""What argparse's `add_argument` takes: names, and keywords."""
+Rule = tuple[str, Callable[[Any], bool]]
+"""What a value must be, in words, and whether it is."""
+
+_ANY: Rule = "", lambda value: True
+FINITE: Rule = "finite", math.isfinite
+POSITIVE: Rule = "positive and finite", lambda value: 0 < value < math.inf
+
+
+def option(*names: str, **keywords: Any) -> Option:
+    return names, keywords
+
+
+def flag(name: str, help: str) -> Option:
+    return option(name, action="store_true", help=help)
+
+
+def number(name: str, metavar: str, help: str, default: float | None = None, rule: Rule = _ANY, **more: Any) -> Option:
+    return option(name, type=partial(_converted, real_number, rule), metavar=metavar, default=default, help=help, **more)
+
+
+def whole(name: str, metavar: str, help: str, least: int | None = None) -> Option:
+    rule = _ANY if least is None else (f"a whole number from {least} on", lambda value: value >= least)
+    return option(name, type=partial(_converted, whole_number, rule), metavar=metavar, help=help)
+
+
+def choice(name: str, names: Sequence[str], help: str, default: str | None = None) -> Option:
+    rule = f"one of {', '.join(names)}", names.__contains__
+    return option(name, type=partial(_converted, str, rule), metavar=f"{{{','.join(names)}}}", default=default, help=help)
+
+
+def _converted(convert: Callable[[str], Any], rule: Rule, text: str) -> Any:
+    value = convert(text)
+    words, holds = rule
+    if not holds(value):
+        raise argparse.ArgumentTypeError(f"must be {words}{';' if ',' in words else ','} it is {value!r}")
+    return value
+
+
+def real_number(text: str) -> float:
+    """What argparse takes for `type=float`, with a message of our own."""
+    try:
+        return float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number, it is {text!r}") from None
+
+
+def whole_number(text: str) -> int:
+    """Of what may be written as 1e6, too."""
+    try:
+        value = float(text)
+        if value.is_integer():
+            return int(value)
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f"must be a whole number, it is {text!r}")
+
+
 TERRAIN = ".tif and others that GDAL reads, .npz, .npy, .asc, .hgt, .png (grey), .exr, .pfm or .hfield (MuJoCo)"
+IN = option("terrain", metavar="IN", help=f"heights: {TERRAIN}")
+NODATA = number("--nodata", "V", "a stored value that means no height [as the file says]")
+RASTER = {"heights as they are stored": (number("--z-scale", "S", "heights are multiplied by it [1]", default=1.0), NODATA)}
+MACHINE = {
+    "machine": (
+        whole("--devices", "N", "cores that share the work, each with a copy [all, at most 16, fewer for a small picture]"),
+        choice("--precision", ("float32", "float64"), "of heights and rays [float32]", default="float32"),
+        option(
+            "--no-cache", dest="cache", action="store_false",
+            help="keep no compiled programs for the next run [kept in the folder JAXHF_CACHE, by default one in the user's "
+            "cache folder; JAXHF_CACHE=off: keep none]",
+        ),
+    )
+}  # fmt: skip
+
+
+def output(help: str) -> Option:
+    return option("-o", "--output", required=True, metavar="OUT", help=help)
+
+
+def settings_options(names: Collection[str]) -> Sequence[Option]:
+    """An option for each of these fields of `Settings`; one that is not given is absent from what is parsed."""
+    return [_knob(field) for field in dataclasses.fields(Settings) if field.name in names]
+
+
+def _knob(field: "dataclasses.Field[Any]") -> Option:
+    name, about = field.name.replace("_", "-"), field.metadata["help"]
+    if field.type is bool:
+        off, about = f"--no-{name}", f"leave out {about}"
+        return option(off, dest=field.name, action="store_false", default=argparse.SUPPRESS, help=about)
+    kind = whole_number if int in (field.type, *get_args(field.type)) else str
+    about = f"{about} [{field.metadata.get('none', field.default)}]"
+    return option(f"--{name}", type=kind, metavar=field.metadata.get("metavar"), default=argparse.SUPPRESS, help=about)
+
+
+def settings(options: argparse.Namespace) -> Settings:
+    return Settings(**{name: value for name, value in vars(options).items() if name in Settings.__dataclass_fields__})
 
 
 def examples(*commands: str) -> str:
@@ -18,7 +116,8 @@ def examples(*commands: str) -> str:
 
 def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Those of these options that were given; where one was not, what takes them has a default of its own."""
-    return {name: value for name in names if (value := getattr(options, name)) is not None}
+    values = {name: getattr(options, name) for name in names}
+    return {name: value for name, value in values.items() if value is not None and value is not False}
 
 
 def refuse(options: argparse.Namespace, *names: str, because: str) -> None:
@@ -27,88 +126,8 @@ def refuse(options: argparse.Namespace, *names: str, because: str) -> None:
         raise UserError(f"--{name.replace('_', '-')} would change nothing: {because}")
 
 
-def add_settings(command: argparse.ArgumentParser, names: Collection[str]) -> None:
-    """Adds an option for each of these fields of `Settings`, with the help that its metadata holds.
-
-    Args:
-      command: gets the options; one that is not given is absent from the parsed namespace.
-      names: of the fields.
-    """
-    group = command.add_argument_group("accuracy and speed")
-    for knob in dataclasses.fields(Settings):
-        option = knob.name.replace("_", "-")
-        if knob.name not in names:
-            continue
-        if knob.type is bool:
-            group.add_argument(
-                f"--no-{option}", dest=knob.name, action="store_false", default=argparse.SUPPRESS,
-                help=f"leave out {knob.metadata['help']}",
-            )  # fmt: skip
-            continue
-        default = knob.metadata.get("none", knob.default)
-        group.add_argument(
-            f"--{option}", type=whole_number if int in (knob.type, *get_args(knob.type)) else str, default=argparse.SUPPRESS,
-            metavar=knob.metadata.get("metavar"), help=f"{knob.metadata['help']} [{default}]",
-        )  # fmt: skip
-
-
-def whole_number(text: str) -> int:
-    """Of what may be written as 1e6, too."""
-    value = float(text)
-    if not value.is_integer():
-        raise ValueError(text)
-    return int(value)
-
-
-def settings(options: argparse.Namespace) -> Settings:
-    return Settings(**{name: value for name, value in vars(options).items() if name in Settings.__dataclass_fields__})
-
-
-def add_size(command: argparse.ArgumentParser) -> None:
-    group = command.add_argument_group("size")
-    group.add_argument(
-        "--width",
-        type=whole_number,
-        metavar="PIXELS",
-        help="of the picture; with one of the two, the other keeps the proportions",
-    )
-    group.add_argument("--height", type=whole_number, metavar="PIXELS", help="of the picture")
-
-
-def size(options: argparse.Namespace) -> tuple[int | None, int | None]:
-    """Width and height, None where not given; ValueError where they are not positive."""
-    for name in ("width", "height"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise UserError(f"--{name} must be a whole number of pixels from 1 on, it is {value}")
-    return options.width, options.height
-
-
-def add_raster(command: argparse.ArgumentParser) -> None:
-    """How numbers stored in a file of heights are to be read."""
-    group = command.add_argument_group("heights as they are stored")
-    group.add_argument("--z-scale", type=float, default=1.0, metavar="S", help="heights are multiplied by it [1]")
-    group.add_argument("--nodata", type=float, metavar="V", help="a stored value that means no height [as the file says]")
-
-
-def add_machine(command: argparse.ArgumentParser) -> None:
-    group = command.add_argument_group("machine")
-    group.add_argument(
-        "--devices",
-        type=whole_number,
-        metavar="N",
-        help="cores that share the work, each with a copy [all, at most 16, fewer for a small picture]",
-    )
-    group.add_argument("--precision", choices=("float32", "float64"), default="float32", help="of heights and rays [float32]")
-    group.add_argument(
-        "--no-cache", dest="cache", action="store_false",
-        help="keep no compiled programs for the next run [kept in the folder JAXHF_CACHE, by default one in the user's cache "
-        "folder; JAXHF_CACHE=off: keep none]",
-    )  # fmt: skip
-
-
 def set_up_jax(options: argparse.Namespace) -> None:
-    """Configures JAX by the options of `add_machine`, which can only be done before its first use."""
+    """Configures JAX by the options of `MACHINE`, which can only be done before its first use."""
     import jax
 
     from ..xla.machine import default_devices

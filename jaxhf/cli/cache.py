@@ -33,9 +33,11 @@ def keep_programs(wanted: bool) -> None:
         return
     if not wanted:
         jax.config.update("jax_enable_compilation_cache", False)
-    asked_otherwise = not jax.config.values["jax_enable_compilation_cache"] or "JAX_COMPILATION_CACHE_DIR" in os.environ
+        return
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ or not jax.config.values["jax_enable_compilation_cache"]:
+        return
     try:
-        folder = None if not wanted or asked_otherwise else programs_folder()
+        folder = programs_folder()
         if folder is None:
             return
         folder.mkdir(parents=True, exist_ok=True)

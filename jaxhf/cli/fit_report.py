@@ -3,14 +3,18 @@
 import base64
 import html
 import io
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..core.extras import import_extra
 from ..fitting.fit import Fit
+from ..fitting.view import differences, sun
 from ..scene.heightfield import Heightfield
+
+if TYPE_CHECKING:
+    from ..io.toml.fit import Case
 
 _FAR = 4  # standard deviations at which the colours of residuals end
 _PAGE = """<!doctype html>
@@ -23,50 +27,61 @@ img {{ max-width: 100% }} th {{ text-align: left; padding-right: 2em; font-weigh
 """
 
 
-def report(title: str, found: Fit, field: Heightfield, targets: Sequence[np.ndarray], names: Sequence[str]) -> str:
-    """An HTML page that needs no other file.
-
-    Args:
-      title: of the page.
-      found: what is reported.
-      field: where the fit began, with its spacing.
-      targets, names: of each picture, as given to `fit`.
-
-    Raises:
-      ValueError: matplotlib is not installed.
-    """
-    facts = "".join(f"<tr><th>{name}</th><td>{html.escape(value)}</td></tr>" for name, value in _facts(found))
+def report(title: str, case: "Case", found: Fit) -> str:
+    """An HTML page that needs no other file; ValueError where matplotlib is not installed."""
+    rows = [*_summary(case, found), *facts(case, found)]
+    table = "".join(f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in rows)
     figures = (
-        ("Heights", _heights(found, field)),
-        ("Pictures", _pictures(found, targets, names)),
+        ("Heights", _heights(found, case.scenes[0].heightfields[0])),
+        ("Pictures", _pictures(found, case.targets, case.names)),
         ("Convergence", _convergence(found)),
     )
     shown = "".join(f'<h2>{name}</h2><img alt="{name}" src="{_embedded(figure)}">\n' for name, figure in figures)
-    return _PAGE.format(title=html.escape(title), facts=facts, figures=shown)
+    return _PAGE.format(title=html.escape(title), facts=table, figures=shown)
 
 
-def _facts(found: Fit) -> list[tuple[str, str]]:
-    ny, nx = found.heights.shape
-    heights = np.asarray(found.heights)
-    facts = [
-        ("result", found.result.value),
-        ("heights", f"{ny} x {nx}, from {heights.min():.6g} to {heights.max():.6g}; {int((~found.seen).sum())} not seen"),
-        ("steps", f"{found.stats['steps']}, {found.stats['accepted']} of them accepted"),
-        ("seconds", f"{found.stats['seconds']:.1f}"),
-        ("loss", f"{found.stats['loss']:.6g}"),
-        ("χ² of a pixel", f"{found.stats['chi2']:.4g} (about 1 where the noise is right and all is explained)"),
-    ]
-    facts.append(("noise", ", ".join(f"{value:.3g}" for value in found.noise)))
-    facts += [("warning", warning) for warning in found.warnings]
-    if found.std is not None:
-        facts.append(("standard deviation", f"{np.median(found.std):.3g} (median)"))
+def facts(case: "Case", found: Fit) -> Iterator[tuple[str, str]]:
+    """What was sought beside the heights, by its name: noise, exposure, light and camera of each picture."""
+    if case.noise is None:
+        yield "noise, estimated", _listed(found.noise, 3)
     for name, values in (("exposures", found.exposures), ("offsets", found.offsets)):
         if values is not None:
-            facts.append((name, ", ".join(f"{float(value):.5g}" for value in values)))
+            yield name, _listed(values, 6)
+    lights, cameras = [], []
+    for given, scene in zip(case.scenes, found.scenes, strict=True):
+        turned, moved, rotated = differences(given, scene)
+        light = sun(scene.lights)
+        if light is not None:
+            x, y, z = np.asarray(light.towards, np.float64)
+            azimuth, altitude = np.degrees(np.arctan2(x, y)) % 360, np.degrees(np.arctan2(z, np.hypot(x, y)))
+            lights.append(f"azimuth {azimuth:.2f} altitude {altitude:.2f} (turned by {turned:.2f} degrees)")
+        eye = " ".join(f"{value:.9g}" for value in np.asarray(scene.camera.world_from_camera)[:3, 3])
+        cameras.append(f"eye {eye} (moved by {moved:.4g}, turned by {rotated:.2f} degrees)")
+    for name, texts in (("light", lights), ("camera", cameras)):
+        if f"{name}_std" in case.options:
+            yield name, ", ".join(texts)
+
+
+def _summary(case: "Case", found: Fit) -> Iterator[tuple[str, str]]:
+    ny, nx = found.heights.shape
+    heights, stats = np.asarray(found.heights), found.stats
+    yield "result", found.result.value
+    yield "heights", f"{ny} x {nx}, from {heights.min():.6g} to {heights.max():.6g}; {int((~found.seen).sum())} not seen"
+    yield "steps", f"{stats['steps']}, {stats['accepted']} of them accepted"
+    yield "seconds", f"{stats['seconds']:.1f}"
+    yield "loss", f"{stats['loss']:.6g}"
+    yield "χ² of a pixel", f"{stats['chi2']:.4g} (about 1 where the noise is right and all is explained)"
+    if case.noise is not None:
+        yield "noise", _listed(found.noise, 3)
+    yield from (("warning", warning) for warning in found.warnings)
+    if found.std is not None:
+        yield "standard deviation", f"{np.median(found.std):.3g} (median)"
     if found.albedo is not None:
-        factors = np.asarray(found.albedo).mean(axis=(0, 1))
-        facts.append(("albedo, mean factor", ", ".join(f"{float(value):.5g}" for value in factors)))
-    return facts
+        yield "albedo, mean factor", _listed(np.asarray(found.albedo).mean(axis=(0, 1)), 5)
+
+
+def _listed(values: Any, digits: int) -> str:
+    return ", ".join(f"{float(value):.{digits}g}" for value in values)
 
 
 def _figure(rows: int, columns: int, height: float) -> tuple[Any, np.ndarray]:

@@ -7,12 +7,8 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from . import interruption
-
-if TYPE_CHECKING:
-    import argparse
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,17 +23,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _show_any_name()
     from ..core.errors import UserError
     from .overwriting import require_no_input
-    from .parser import make_parser
+    from .parser import parse
     from .progress import quiet
 
-    options = make_parser().parse_args(arguments)
+    options = parse(arguments)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides
             warnings.showwarning = lambda message, *_, **__: print(
                 f"jaxhf: warning: {' '.join(str(message).split())}", file=sys.stderr
             )
-            _require_no_address(options)
             require_no_input(options)
             with quiet(options.quiet):
                 options.run(options)
@@ -79,12 +74,3 @@ def _show_any_name() -> None:
         if isinstance(stream, io.TextIOWrapper):  # and not None, where there is no console
             utf8 = codecs.lookup(stream.encoding).name == "utf-8"
             stream.reconfigure(errors="backslashreplace" if utf8 else "jaxhf")
-
-
-def _require_no_address(options: "argparse.Namespace") -> None:
-    """FileError where an option is an address on the network, as it was written: a path would lose one of its slashes."""
-    from ..io.files import file_path
-
-    for value in vars(options).values():
-        if isinstance(value, str):
-            file_path("", value)

@@ -1,4 +1,4 @@
-"""Outputs replace files that are there, but never one that the same command reads."""
+"""Which files a command may write: outputs replace files that are there, but never one that the same command reads."""
 
 import argparse
 import re
@@ -20,10 +20,17 @@ def require_no_input(options: argparse.Namespace, *others: Path) -> None:
       options: of the command: `output` and `report` are written; every other string that names a file counts as read.
         `placed`: files beside the output will say where it lies.
       others: what the command writes besides.
+
+    Raises:
+      FileError: an option is an address on the network.
     """
+    from ..io.files import file_path
+
     values = {name: value for name, value in vars(options).items() if isinstance(value, str)}
+    for value in values.values():  # as it was written: a path would lose one of its slashes
+        file_path("", value)
     outputs = [Path(values.pop(name)) for name in ("output", "report") if name in values] + list(others)
-    if getattr(options, "placed", False):
+    if getattr(options, "placed", True):
         outputs += [beside for path in outputs if path.suffix.lower() in _PLACED for beside in _beside(path)]
     outputs = [path for path in outputs if path.is_file()]
     if not outputs:

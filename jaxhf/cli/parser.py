@@ -1,19 +1,21 @@
-"""The parser of the command line, with one module a command. JAX is imported only when a command runs."""
+"""The parser of the command line. JAX is imported only when a command runs."""
 
 import argparse
 import re
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core.version import __version__
-from . import aspect, convert, fit, hillshade, horizon, info, relief, render, skyview, slope, tradeoff, view
+from . import arguments, tradeoff
+from .commands import convert, fit, info, maps, render, sky, view
 
 GROUPS = {
-    "terrain maps": (hillshade, slope, aspect, relief, skyview, horizon),
-    "pictures": (view, render),
-    "recovery": (fit, tradeoff),
-    "files": (convert, info),
+    "terrain maps": (*maps.COMMANDS, *sky.COMMANDS),
+    "pictures": (view.COMMAND, render.COMMAND),
+    "recovery": (fit.COMMAND, tradeoff),
+    "files": (convert.COMMAND, info.COMMAND),
 }
 _EXAMPLES = """
 examples:
@@ -26,9 +28,6 @@ An output file that is there is replaced, whole or not at all; never one that th
 Exit codes: 0, done; 2, a mistake, which one line on standard error names; 130, interrupted by Ctrl-C."""
 
 
-_KINDS = {"float": "a number", "int": "a whole number", "whole_number": "a whole number", "_angles": "two angles, as 90,10"}
-
-
 class _Formatter(argparse.HelpFormatter):
     """Keeps the lines of a text that has several, and fills one that has not."""
 
@@ -37,78 +36,87 @@ class _Formatter(argparse.HelpFormatter):
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says in one line what is wrong with a command line, and which word may have been meant."""
-
-    commands: Mapping[str, argparse.ArgumentParser] = {}  # all of them, by their names
+    """Says in one line what is wrong with a command line."""
 
     def __init__(self, **options: Any):
-        super().__init__(**{"formatter_class": _Formatter, **options})
+        super().__init__(formatter_class=_Formatter, exit_on_error=False, **options)
+        self.register("type", float, arguments.real_number)
 
     def error(self, message: str) -> NoReturn:
-        choice = re.fullmatch(r"argument (.+): invalid choice: '?(.*?)'? \(choose from (.*)\)", message)
-        if choice is not None:
-            name, word, known = choice[1], choice[2], re.findall(r"[\w-]+", choice[3])
-            among = f"{name} must be one of {', '.join(known)}; it is {word!r}"
-            message = _unknown_command(word, known) if name == "COMMAND" else among
-        kind = re.fullmatch(r"argument (.+): invalid (\w+) value: (.*)", message)
-        if kind is not None:
-            message = f"{kind[1]} must be {_KINDS.get(kind[2], kind[2])}, it is {kind[3]}"
-        message = re.sub(r"^argument (\S+):", r"\1", message)
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
-    def parse_known_args(self, *args: Any, **options: Any) -> Any:
-        """Refuses what is not known here, where the options of this command are."""
-        found, unknown = super().parse_known_args(*args, **options)
-        if not unknown:
-            return found, unknown
-        word = next((word for word in unknown if word.startswith("-")), None)
-        if word is None:
-            self.error(f"unexpected argument {unknown[0]!r}")
-        import difflib
-
-        word = word.partition("=")[0]
-        close = difflib.get_close_matches(word[2:], _options(self), n=1)
-        others = [name for name, command in self.commands.items() if word[2:] in _options(command)]
-        tail = f"; jaxhf {others[0]} has it" if others else ""
-        self.error(f"unknown option {word}" + (f"; did you mean --{close[0]}?" if close else tail))
+    def read(self, words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
+        """What is known of these words, and the rest."""
+        try:
+            return self.parse_known_args(words)
+        except argparse.ArgumentError as error:
+            self.error(" ".join(filter(None, (error.argument_name, error.message))))
 
 
-def _options(command: argparse.ArgumentParser) -> list[str]:
-    """Their names without the dashes, which would make all of them alike."""
-    return re.findall(r"--([a-z][\w-]*)", command.format_usage())
+class Commands:
+    """The parsers of all commands by their names, and the lines of `jaxhf --help` about them."""
 
-
-def _unknown_command(word: str, known: Sequence[str]) -> str:
-    if Path(word).suffix:
-        return f"{word!r} is no command; one stands before its files, as in 'jaxhf info {word}'"
-    from ..io.errors import nearest
-
-    return f"unknown command {word!r}; {nearest(word, known)}"
-
-
-class _Group:
-    """Takes the place of argparse's subparsers for the commands of one group, and keeps a line about each."""
-
-    def __init__(self, commands: Any, title: str):
-        self._commands, self.lines = commands, [f"{title}:"]
+    def __init__(self):
+        self.parsers: dict[str, _Parser] = {}
+        self.lines = ["Renders heightfields, makes maps of them, and recovers them from pictures."]
+        for title, group in GROUPS.items():
+            self.lines += ["", f"{title}:"]
+            for command in group:
+                command.add(self)
 
     def add_parser(self, name: str, *, help: str, **options: Any) -> argparse.ArgumentParser:
         self.lines.append(f"  {name:<11} {help}")
-        command = self._commands.add_parser(name, **options)
+        command = self.parsers[name] = _Parser(prog=f"jaxhf {name}", **options)
         command.add_argument("--quiet", action="store_true", help="print no report and no progress; warnings stay")
         return command
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = _Parser(prog="jaxhf", usage="jaxhf [-h] [--version] COMMAND ...")
-    parser.add_argument("--version", action="version", version=f"jaxhf {__version__}")
-    commands = parser.add_subparsers(prog="jaxhf", required=True, metavar="COMMAND", help=argparse.SUPPRESS)
-    lines = ["Renders heightfields, makes maps of them, and recovers them from pictures."]
-    for title, modules in GROUPS.items():
-        group = _Group(commands, title)
-        for module in modules:
-            module.add(group)
-        lines += ["", *group.lines]
-    _Parser.commands = commands.choices
-    parser.description, parser.epilog = "\n".join(lines), _EXAMPLES
-    return parser
+def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
+    """The options of the command that these words name; SystemExit, after one line, where there is something wrong with them.
+
+    Args:
+      words: None: those of this process.
+    """
+    words = sys.argv[1:] if words is None else words
+    commands = Commands()
+    usage, about = "jaxhf [-h] [--version] COMMAND ...", "\n".join(commands.lines)
+    overview = _Parser(prog="jaxhf", usage=usage, description=about, epilog=_EXAMPLES)
+    overview.add_argument("--version", action="version", version=f"jaxhf {__version__}")
+    overview.add_argument("name", metavar="COMMAND", help=argparse.SUPPRESS)
+    end = next((k for k, word in enumerate(words, 1) if not word.startswith("-")), len(words))
+    found, unknown = overview.read(words[:end])
+    if unknown:
+        _refuse(overview, unknown, commands)
+    if found.name not in commands.parsers:
+        overview.error(_unknown_command(found.name, commands))
+    options, unknown = commands.parsers[found.name].read(words[end:])
+    if unknown:
+        _refuse(commands.parsers[found.name], unknown, commands)
+    return options
+
+
+def _unknown_command(word: str, commands: Commands) -> str:
+    if Path(word).suffix:
+        return f"{word!r} is no command; one stands before its files, as in 'jaxhf info {word}'"
+    from ..io.errors import nearest
+
+    return f"unknown command {word!r}; {nearest(word, commands.parsers)}"
+
+
+def _refuse(parser: _Parser, unknown: Sequence[str], commands: Commands) -> NoReturn:
+    """Says which option may have been meant, or which command has it."""
+    word = next((word for word in unknown if word.startswith("-")), None)
+    if word is None:
+        parser.error(f"unexpected argument {unknown[0]!r}")
+    import difflib
+
+    word = word.partition("=")[0]
+    close = difflib.get_close_matches(word[2:], _options(parser), n=1)
+    others = [name for name, command in commands.parsers.items() if word[2:] in _options(command)]
+    tail = f"; jaxhf {others[0]} has it" if others else ""
+    parser.error(f"unknown option {word}" + (f"; did you mean --{close[0]}?" if close else tail))
+
+
+def _options(parser: _Parser) -> list[str]:
+    """The names of its options without the dashes, which would make all of them alike."""
+    return re.findall(r"--([a-z][\w-]*)", parser.format_usage())

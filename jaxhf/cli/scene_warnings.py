@@ -10,7 +10,6 @@ from jaxtyping import Float
 if TYPE_CHECKING:
     from ..scene.camera import Camera
     from ..scene.heightfield import Heightfield
-    from ..scene.material import Matte
     from ..scene.scene import Object, Scene
 
 _NARROW = 1.0  # degrees
@@ -46,7 +45,9 @@ def scene_warnings(scene: "Scene") -> Iterator[str]:
     for k, item in enumerate(scene.objects):
         if not isinstance(item.shape, Heightfield):
             return  # the rest asks whether anything can be seen
-        if isinstance(item.material, Matte) and (brightest := _brightest(item.material)) > 1:
+        albedo = item.material.albedo if isinstance(item.material, Matte) else 0.0
+        brightest = float(np.max(np.asarray(getattr(albedo, "texels", albedo))))
+        if brightest > 1:
             yield f"objects[{k}]: albedo is {brightest:.4g}, more than 1: it sends out more light than it gets"
         heights = np.asarray(item.shape.heights)
         finite = heights[np.isfinite(heights)]
@@ -68,11 +69,6 @@ def scene_warnings(scene: "Scene") -> Iterator[str]:
         low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
         spans = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high, strict=True))
         yield f"camera: none of the terrain is in the picture, it spans {spans}"
-
-
-def _brightest(material: "Matte") -> float:
-    """The largest number of its albedo."""
-    return float(np.max(np.asarray(getattr(material.albedo, "texels", material.albedo))))
 
 
 def _height_at(field: "Heightfield", heights: np.ndarray, x: float, y: float) -> float:

@@ -20,7 +20,6 @@ import pytest
 from PIL import Image
 
 import jaxhf
-from jaxhf.cli.main import main
 from jaxhf.core.affine import rotate
 from jaxhf.io.toml.fit import load_case
 
@@ -60,14 +59,10 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(autouse=True)
-def in_this_process(monkeypatch):
-    """JAX is set up already."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
-
-
-def run(folder, name, *more, case="case.toml") -> int:
-    return main(["fit", str(folder / case), "-o", str(folder / name), *more])
+@pytest.fixture
+def run(folder, command):
+    """`jaxhf fit` of a file in the folder; the exit code, and what it says."""
+    return lambda name, *more, case="case.toml": command("fit", folder / case, "-o", folder / name, *more)
 
 
 def pretended(options: dict, ends: bool = True):
@@ -99,12 +94,12 @@ def pretended(options: dict, ends: bool = True):
     return fit
 
 
-def test_what_the_file_says_reaches_fit_and_results_lie_where_the_terrain_lies(folder, monkeypatch, capsys):
+def test_what_the_file_says_reaches_fit_and_results_lie_where_the_terrain_lies(folder, monkeypatch, run):
     rasterio = pytest.importorskip("rasterio")
     options = {}
     monkeypatch.setattr("jaxhf.fitting.fit.fit", pretended(options))
-    assert run(folder, "out.tif", "--report", str(folder / "out.html")) == 0
-    assert capsys.readouterr() == (
+    assert run("out.tif", "--report", folder / "out.html") == (
+        0,
         "noise, estimated: 0.0123\n"
         "exposures: 1.25\n"
         "light: azimuth 26.57 altitude 54.74 (turned by 1.43 degrees)\n"
@@ -138,25 +133,24 @@ def test_what_the_file_says_reaches_fit_and_results_lie_where_the_terrain_lies(f
         assert image.std() > 20
 
 
-def test_after_ctrl_c_it_says_how_to_go_on(folder, monkeypatch, capsys):
+def test_after_ctrl_c_it_says_how_to_go_on(folder, monkeypatch, run):
     options, checkpoint = {}, folder / "part.tif.checkpoint"
     monkeypatch.setattr("jaxhf.fitting.fit.fit", pretended(options, ends=False))
-    assert run(folder, "part.tif") == 130
     said = f"interrupted; the same command with --resume goes on from {checkpoint}"
-    assert capsys.readouterr().err == f"\njaxhf: {said}\n"
+    assert run("part.tif") == (130, "", f"\njaxhf: {said}\n")
     assert not (folder / "part.tif").exists()
-
-    assert run(folder, "part.tif") == 2
-    assert capsys.readouterr().err.startswith(f"jaxhf: error: {checkpoint}: an interrupted fit left this checkpoint; --resume")
+    code, _, err = run("part.tif")
+    said = f"jaxhf: error: {checkpoint}: an interrupted fit left this checkpoint; --resume"
+    assert (code, err.startswith(said)) == (2, True)
 
     monkeypatch.setattr("jaxhf.fitting.fit.fit", pretended(options))
-    assert run(folder, "part.tif", "--resume") == 0
+    assert run("part.tif", "--resume")[0] == 0
     assert options["resume"]
     assert not checkpoint.exists()
 
 
 @pytest.mark.deep  # one that runs through is in docs/tutorials/photographs.md
-def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch):
+def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch, run):
     """A real fit; what a kill leaves of one is tested with `fit` itself."""
     plain = re.sub(r"(albedo|uncertainty).*\n", "", CASE)
     (folder / "plain.toml").write_text(plain.replace("seen.npy", "plain.npy"))
@@ -177,13 +171,13 @@ def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch)
 
     with monkeypatch.context() as patched:
         patched.setattr("jaxhf.fitting.fit.fit", fit)
-        assert run(folder, "cut.tif", case="plain.toml") == 130
+        assert run("cut.tif", case="plain.toml")[0] == 130
         assert not (folder / "cut.tif").exists()
-        assert run(folder, "cut.tif", "--resume", case="plain.toml") == 0
+        assert run("cut.tif", "--resume", case="plain.toml")[0] == 0
     assert steps == [1, 2, 3, 4, 5, 6, 7, 8, 9]
     assert to_come[-1] == 0
     assert all(1 <= left <= 9 - step for step, left in zip(steps[:-1], to_come[:-1], strict=True))  # as this file allows
-    assert run(folder, "whole.tif", case="plain.toml") == 0
+    assert run("whole.tif", case="plain.toml")[0] == 0
     assert (folder / "cut.tif").read_bytes() == (folder / "whole.tif").read_bytes()
 
 
@@ -191,7 +185,8 @@ SLOW = """
 import sys, time
 import jaxhf.fitting.fit
 from jaxhf.fitting.history import Draws, Step
-from jaxhf.cli import fit, main, progress
+from jaxhf.cli import main, progress
+from jaxhf.cli.commands import fit
 
 def pretended(scenes, targets, *, progress, **options):
     time.sleep(1.5)

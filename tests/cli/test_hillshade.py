@@ -86,7 +86,7 @@ def test_a_relief_lies_in_shadow_where_rays_say_so(tmp_path):
     np.testing.assert_array_equal(pictures["shadows"][~dark], pictures["light"][~dark])
 
 
-def test_how_far_apart_heights_are_is_said(tmp_path, capsys):
+def test_how_far_apart_heights_are_is_said(tmp_path, command):
     """Of degrees that they are measured in metres; of bare heights that nothing says it."""
     heights = hills(False).heights
     geotiffs.write(tmp_path / "degrees.tif", heights[::-1], (1 / 3600, 0, 7, 0, -1 / 3600, 46), "EPSG:4326")
@@ -94,22 +94,18 @@ def test_how_far_apart_heights_are_is_said(tmp_path, capsys):
     metres = jaxhf.load_heights(tmp_path / "degrees.tif")
     in_degrees = jaxhf.slope(heights, 1 / 3600, 1 / 3600, scale=111120.0)
     bare = jaxhf.slope(heights, 1.0)
+    latitude = "degrees, which are measured in metres at latitude 46;"
+    nothing = "does not say how far apart its heights are, 1 is taken (--dx and --dy overrule)"
     for name, said, silently, measured, given in (
-        (
-            "degrees.tif",
-            "degrees, which are measured in metres at latitude 46;",
-            "--scale 111120",
-            jaxhf.slope(metres),
-            in_degrees,
-        ),
-        ("bare.npy", "does not say how far apart its heights are, 1 is taken (--dx and --dy overrule)", "--dx 1", bare, bare),
+        ("degrees.tif", latitude, "--scale 111120", jaxhf.slope(metres), in_degrees),
+        ("bare.npy", nothing, "--dx 1", bare, bare),
     ):
-        command = ["slope", str(tmp_path / name), "-o", str(tmp_path / "slope.npy")]
-        assert main(command) == 0
-        assert said in capsys.readouterr().err
+        words = ["slope", tmp_path / name, "-o", tmp_path / "slope.npy"]
+        code, _, err = command(*words)
+        assert (code, said in err) == (0, True)
         np.testing.assert_array_equal(np.load(tmp_path / "slope.npy"), measured)
-        assert main([*command, *silently.split()]) == 0
-        assert capsys.readouterr().err == ""
+        code, _, err = command(*words, *silently.split())
+        assert (code, err) == (0, "")
         np.testing.assert_allclose(np.load(tmp_path / "slope.npy"), given, rtol=1e-5)
 
 
@@ -128,24 +124,23 @@ def test_maps_and_conversions_do_without_jax(tmp_path):
     assert run.stdout.splitlines()[-1:] == ["set()"], run.stderr
 
 
-def test_conversion_keeps_heights_and_place(tmp_path, capsys):
+def test_conversion_keeps_heights_and_place(tmp_path, command):
     pytest.importorskip("rasterio")
     terrain = plane(0.5, 0.25)
     terrain.heights[2, 3] = np.nan
     jaxhf.save_heights(tmp_path / "one.npz", terrain)
-    assert main(["convert", str(tmp_path / "one.npz"), str(tmp_path / "two.tif")]) == 0
+    code, out, _ = command("convert", tmp_path / "one.npz", tmp_path / "two.tif")
+    assert (code, "6 x 9 heights, cells 30 x 60, origin (500000, 4.1e+06)" in out) == (0, True)
     found = jaxhf.load_heights(tmp_path / "two.tif")
     np.testing.assert_array_equal(found.heights, terrain.heights)
     assert (found.dx, found.dy, found.x0, found.y0) == (30, 60, 5e5, 4.1e6)
-    assert "6 x 9 heights, cells 30 x 60, origin (500000, 4.1e+06)" in capsys.readouterr().out
-    words = ["--z-scale", "2", "--nodata", "0"]
-    assert main(["convert", str(tmp_path / "two.tif"), str(tmp_path / "three.npy"), *words]) == 0
+    code, out, _ = command("convert", tmp_path / "two.tif", tmp_path / "three.npy", "--z-scale", 2, "--nodata", 0)
+    assert (code, ".npy holds the heights alone" in out) == (0, True)
     expected = np.where(terrain.heights == 0, np.nan, 2 * terrain.heights)
     np.testing.assert_array_equal(np.load(tmp_path / "three.npy"), expected)
-    assert ".npy holds the heights alone" in capsys.readouterr().out
 
 
-def test_conversion_says_what_is_left_out(tmp_path, capsys):
+def test_conversion_says_what_is_left_out(tmp_path, command):
     """And refuses before it reads."""
     for name, top, said in (
         ("out.png", 0.25, " (.png holds whole numbers: heights are rounded to steps of 1)\n"),
@@ -155,7 +150,7 @@ def test_conversion_says_what_is_left_out(tmp_path, capsys):
         if name.endswith(".exr"):
             pytest.importorskip("OpenEXR")
         jaxhf.save_heights(tmp_path / "in.npz", Terrain(top * np.eye(3)))
-        assert main(["convert", str(tmp_path / "in.npz"), str(tmp_path / name)]) == 0
-        assert capsys.readouterr().out.endswith(f"range (0, {top}){said}")
-    assert main(["convert", str(tmp_path / "missing.tif"), str(tmp_path / "out.jpg")]) == 2
-    assert "cannot write heights with the ending '.jpg'" in capsys.readouterr().err
+        code, out, _ = command("convert", tmp_path / "in.npz", tmp_path / name)
+        assert (code, out.endswith(f"range (0, {top}){said}")) == (0, True)
+    code, _, err = command("convert", tmp_path / "missing.tif", tmp_path / "out.jpg")
+    assert (code, "cannot write heights with the ending '.jpg'" in err) == (2, True)

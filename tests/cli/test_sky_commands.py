@@ -8,23 +8,21 @@ import pytest
 from PIL import Image
 
 import jaxhf
-from jaxhf.cli.main import main
 
 Z = np.random.default_rng(0).uniform(size=(5, 7)).astype(np.float32)
 Z[2, 3] = np.nan
 
 
 @pytest.fixture
-def run(monkeypatch, tmp_path, capsys):
+def run(command, tmp_path):
     """A command on that terrain, whose cells are of 2 x 3; its exit code and what it says."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
 
-    def command(name, output, *options, heights=Z):
+    def run(name, output, *options, heights=Z):
         jaxhf.save_heights(tmp_path / "terrain.npz", jaxhf.Terrain(heights, 2.0, 3.0, 100.0, 50.0))
-        code = main([name, str(tmp_path / "terrain.npz"), "-o", str(tmp_path / output), *options])
-        return code, "".join(capsys.readouterr())
+        code, *said = command(name, tmp_path / "terrain.npz", "-o", tmp_path / output, *options)
+        return code, "".join(said)
 
-    return command
+    return run
 
 
 def test_skyview(run, tmp_path):
@@ -60,10 +58,8 @@ def test_skyview_by_each_weighting(run, tmp_path):
 
 
 def test_horizon(run, tmp_path):
-    ask = [
-        np.asarray(jaxhf.horizon(Z, [azimuth], dx=2.0, dy=3.0, progress=lambda done, total: None))[0]
-        for azimuth in (0.0, 90.0, 180.0, 270.0)
-    ]
+    options = {"dx": 2.0, "dy": 3.0, "progress": lambda done, total: None}
+    ask = [np.asarray(jaxhf.horizon(Z, [azimuth], **options))[0] for azimuth in (0.0, 90.0, 180.0, 270.0)]
     assert run("horizon", "all.npy", "--azimuths", "4")[0] == 0
     np.testing.assert_array_equal(np.load(tmp_path / "all.npy"), ask)
     pytest.importorskip("rasterio")

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from jaxhf import Terrain, save_heights
-from jaxhf.cli.main import main
 from jaxhf.io.georeference import WGS84_DEGREES, Georeference, coordinate_system
 
 DEGREES = Georeference(WGS84_DEGREES, nodata=-9999.0)
@@ -42,12 +41,11 @@ heights: none, 4 holes (100 %)
 
 
 @pytest.mark.parametrize("name", INFO)
-def test_info_describes_terrain(folder, capsys, name):
-    assert main(["info", str(folder / name)]) == 0
-    assert capsys.readouterr().out == f"{folder / name}: {INFO[name]}"
+def test_info_describes_terrain(folder, command, name):
+    assert command("info", folder / name)[:2] == (0, f"{folder / name}: {INFO[name]}")
 
 
-def test_convert_reports_what_the_file_says(folder, capsys):
+def test_convert_reports_what_the_file_says(folder, command):
     """Its coordinates, but for a mesh, which is in metres, and may be a solid."""
     trimesh = pytest.importorskip("trimesh")
     for words, said in (
@@ -56,6 +54,6 @@ def test_convert_reports_what_the_file_says(folder, capsys):
         ("metres.asc x.glb --base 0", "x.glb: Heightfield, 2 x 3 heights"),
     ):
         source, output, *more = words.split()
-        assert main(["convert", str(folder / source), str(folder / output), *more]) == 0
-        assert said in capsys.readouterr().out
+        code, out, _ = command("convert", folder / source, folder / output, *more)
+        assert (code, said in out) == (0, True)
     assert trimesh.load(folder / "x.glb", force="mesh", process=False).is_watertight

@@ -9,20 +9,15 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.cli.main import main
-from jaxhf.cli.view import _sun, _sun_path
+from jaxhf.cli import block as looks
+from jaxhf.cli.commands.view import _sun, _sun_path
 from jaxhf.core.errors import UserError
 from jaxhf.io.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.terrain import Terrain
-from jaxhf.rendering import render as _render, view as looks
+from jaxhf.rendering import render as _render
 
 SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
 MORNING, EVENING = "2026-06-21T05:00:00Z", "2026-06-21T18:00+01:00"
-
-
-@pytest.fixture(autouse=True)
-def jax_is_set_up(monkeypatch):
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
 
 
 @pytest.fixture(scope="module")
@@ -34,11 +29,10 @@ def terrain(tmp_path_factory) -> str:
 
 
 @pytest.mark.filterwarnings("always:view. the heights go from")
-def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, capsys):
-    assert main(["view", terrain, "-o", str(tmp_path / "out.png"), "--water", "-9", *SMALL]) == 0
-    told = capsys.readouterr()
-    assert "48 x 32 pixels, heights x 1, " in told.out
-    assert told.err.endswith(" to 300, --water is -9\n")
+def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, command):
+    code, out, err = command("view", terrain, "-o", tmp_path / "out.png", "--water", "-9", *SMALL)
+    assert (code, "48 x 32 pixels, heights x 1, " in out) == (0, True)
+    assert err.endswith(" to 300, --water is -9\n")
     image = imageio.imread(tmp_path / "out.png").astype(int)
     background = (image[:, :1] == image).all(-1)
     rows, columns = np.nonzero(~background)
@@ -48,7 +42,7 @@ def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, capsys
     assert len(np.unique(image[~background], axis=0)) > 100
 
 
-def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch):
+def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch, command):
     """Each film prepares its terrain once."""
     framing, views = jaxhf.Perspective.framing, []
     prepare, prepared = _render.prepare, []
@@ -60,12 +54,12 @@ def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch):
 
     monkeypatch.setattr(jaxhf.Perspective, "framing", recorded)
     turning, sunny = tmp_path / "out.gif", tmp_path / "out.mp4"
-    assert main(["view", terrain, "-o", str(turning), "--frames", "3", *SMALL]) == 0
+    assert command("view", terrain, "-o", turning, "--frames", 3, *SMALL)[0] == 0
     frames = imageio.imread(turning).astype(int)
     assert frames.shape == (3, 32, 48, 3)
     assert views == [(205, True), (325, True), (445, True)]
     sun = ["--sun-from", "90,10", "--sun-to", "90,80"]
-    assert main(["view", terrain, "-o", str(sunny), "--frames", "3", *sun, *SMALL]) == 0
+    assert command("view", terrain, "-o", sunny, "--frames", 3, *sun, *SMALL)[0] == 0
     lit = imageio.imread(sunny, plugin="pyav").astype(int)
     assert lit.shape == (3, 32, 48, 3)
     assert views[3:] == [(205, False)]  # the camera stands still
@@ -89,26 +83,14 @@ def test_the_sun_moves_as_it_does_over_the_terrain(terrain):
         _sun_path(options, heights)
 
 
-def test_a_picture_from_somewhere_through_haze_of_what_is_laid_over_it(tmp_path):
+def test_a_picture_from_somewhere_through_haze_of_what_is_laid_over_it(tmp_path, command):
     """Of level ground without walls, whose colour, distance and light are known at each pixel."""
     jaxhf.save_heights(tmp_path / "in.npz", Terrain(np.zeros((13, 17), np.float32), 100.0, 100.0))
     texels = np.zeros((4, 6, 3), np.uint8)
     texels[:, :2, 0], texels[:2, :, 2] = 255, 255  # red in the west, blue in the north
     imageio.imwrite(tmp_path / "drape.png", texels)
-    words = [
-        "--from",
-        "100",
-        "--above",
-        "50",
-        "--fov",
-        "20",
-        "--haze",
-        "0.6",
-        "--no-skirt",
-        "--drape",
-        str(tmp_path / "drape.png"),
-    ]
-    assert main(["view", str(tmp_path / "in.npz"), "-o", str(tmp_path / "out.npy"), *words, *SMALL]) == 0
+    words = ["--from", 100, "--above", 50, "--fov", 20, "--haze", 0.6, "--no-skirt", "--drape", tmp_path / "drape.png"]
+    assert command("view", tmp_path / "in.npz", "-o", tmp_path / "out.npy", *words, *SMALL)[0] == 0
     picture = np.load(tmp_path / "out.npy")
 
     field = jaxhf.Heightfield(np.zeros((13, 17), np.float32), 100.0)
@@ -116,9 +98,8 @@ def test_a_picture_from_somewhere_through_haze_of_what_is_laid_over_it(tmp_path)
     pose = np.asarray(camera.world_from_camera, float)
     eye, ahead = pose[:3, 3], pose[:3, 2]
     turn, rise = np.radians(100), np.radians(50)
-    np.testing.assert_allclose(
-        ahead, -np.array([np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), np.sin(rise)]), atol=1e-6
-    )
+    towards = [np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), np.sin(rise)]
+    np.testing.assert_allclose(ahead, -np.array(towards), atol=1e-6)
     y, x = np.mgrid[:32, :48] + 0.5
     plane = 2 * np.tan(np.radians(10)) / 32 * np.stack([x - 24, 16 - y, 0 * x], -1) + (0, 0, 1)  # right, up and ahead
     d = plane @ np.stack([pose[:3, 0], pose[:3, 1], ahead])
@@ -154,9 +135,8 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
     heights = np.zeros((1, 11, 11), np.float32)
     grey = np.array([[0, 255, 255], [0, 0, 255]], np.uint8)  # a PNG from corner to corner
     imageio.imwrite(tmp_path / "grey.png", grey)
-    np.testing.assert_array_equal(
-        load_drape(tmp_path / "grey.png", Terrain(heights[0])), grey[::-1, :, None] / 255 * np.ones(3)
-    )
+    drape = load_drape(tmp_path / "grey.png", Terrain(heights[0]))
+    np.testing.assert_array_equal(drape, grey[::-1, :, None] / 255 * np.ones(3))
     terrain = load_heights(write(tmp_path / "dem.tif", heights, (5e5, 5e6), 10.0))  # vertices from 500005 to 500105
     colours = np.zeros((3, 40, 40), np.uint8)
     colours[0], colours[1, :, 20:], colours[2, :20] = 255, 255, 255  # green in the east, blue in the north
@@ -181,9 +161,9 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
             load_drape(path, terrain)
 
 
-def test_there_is_a_terrain_to_try(terrain, tmp_path, monkeypatch):
+def test_there_is_a_terrain_to_try(terrain, tmp_path, monkeypatch, command):
     """Here another, as that of matplotlib takes seconds; docs/index.md shows it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("jaxhf.io.load_terrain.jacksboro_file", lambda: terrain)
-    assert main(["view", "--demo", *SMALL]) == 0
+    assert command("view", "--demo", *SMALL)[0] == 0
     assert np.ptp(imageio.imread("in.png")) > 100

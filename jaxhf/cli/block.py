@@ -10,14 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
+from ..rendering.render import Prepared, prepare, render
 from ..scene.camera import Perspective
 from ..scene.heightfield import Heightfield
-from ..scene.light import Directional, Sky
+from ..scene.light import Directional, Light, Sky
 from ..scene.material import Matte
 from ..scene.scene import Object, Scene
 from ..scene.skirt import Skirt
 from ..scene.texture import ImageTexture
-from .render import Prepared, prepare, render
 
 # Radiance of white ground that faces the sun, and what the whole sky adds where nothing hides it, or where nobody asks.
 _SUN, _SKY, _EVEN_SKY = (0.76, 0.74, 0.70), (0.38, 0.42, 0.48), (0.34, 0.38, 0.44)
@@ -102,10 +102,14 @@ def block(field: Heightfield, colours: Any, camera: Perspective, look: Look, bas
     objects = [Object(field, Matte(albedo))]
     if base is not None:
         objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))
+    return Scene(objects, camera, lights(field, look))
+
+
+def lights(field: Heightfield, look: Look) -> list[Light]:
+    """The sun and the sky, parts of which mountains hide."""
     sun = Directional.from_angles(look.azimuth, look.altitude, np.array(_SUN) * math.pi)
     occluded = look.samples > 1 and field.heights.size <= _MOST_OCCLUDED
-    sky = Sky(np.array(_SKY), occlusion=_OCCLUSION) if occluded else Sky(np.array(_EVEN_SKY))
-    return Scene(objects, camera, [sun, sky])
+    return [sun, Sky(np.array(_SKY), occlusion=_OCCLUSION) if occluded else Sky(np.array(_EVEN_SKY))]
 
 
 def photograph(

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.rendering.view import Look, _in_haze as in_haze, _moved as moved, block, exaggeration, with_water
+from jaxhf.cli.block import Look, _in_haze as in_haze, _moved as moved, block, exaggeration, with_water
 
 RAMP = np.linspace(0, 1, 101)[:, None] * np.ones(101)
 

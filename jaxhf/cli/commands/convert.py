@@ -4,34 +4,17 @@ import argparse
 import dataclasses
 import warnings
 from pathlib import Path
-from typing import Any
 
-from ..core.errors import UserError
-from . import arguments
-
-
-def add(commands: Any) -> None:
-    about = "Write a terrain in another format, with its place on the map, or as a mesh of triangles."
-    examples = arguments.examples(
-        "jaxhf convert terrain.tif terrain.npz",
-        "jaxhf convert terrain.tif block.glb --base 0",
-    )
-    command = commands.add_parser("convert", help="write a terrain in another format", description=about, epilog=examples)
-    command.set_defaults(placed=True)
-    command.add_argument("terrain", metavar="IN", help=f"heights: {arguments.TERRAIN}")
-    command.add_argument(
-        "output", metavar="OUT", help=".tif, .npz, .npy, .asc, .png (rounded) or .exr; a mesh: .glb, .obj or .ply"
-    )
-    command.add_argument("--base", type=float, metavar="Z", help="close a mesh by walls down to this height [open]")
-    arguments.add_raster(command)
-    command.set_defaults(run=run)
+from ...core.errors import UserError
+from .. import arguments
+from ..command import Command
 
 
 def run(options: argparse.Namespace) -> None:
-    from ..io.load_terrain import load_heights
-    from ..io.meshes import MESHES, require_writable_mesh, save_mesh
-    from ..io.save_terrain import HEIGHTS, require_writable_heights, save_heights
-    from .describe import heightfield_line
+    from ...io.load_terrain import load_heights
+    from ...io.meshes import MESHES, require_writable_mesh, save_mesh
+    from ...io.save_terrain import HEIGHTS, require_writable_heights, save_heights
+    from ..describe import heightfield_line
 
     ending = Path(options.output).suffix.lower()
     if ending not in MESHES:
@@ -55,3 +38,21 @@ def run(options: argparse.Namespace) -> None:
         dx, dy, x0, y0 = terrain.in_file
         terrain = dataclasses.replace(terrain, dx=dx, dy=dy, x0=x0, y0=y0, georeference=None)
     print(f"{options.output}: {heightfield_line(terrain)}{alone}")
+
+
+_WRITTEN = ".tif, .npz, .npy, .asc, .png (rounded) or .exr; a mesh: .glb, .obj or .ply"
+COMMAND = Command(
+    "convert",
+    "write a terrain in another format",
+    examples=("terrain.tif terrain.npz", "terrain.tif block.glb --base 0"),
+    options={
+        "": (
+            arguments.IN,
+            arguments.option("output", metavar="OUT", help=_WRITTEN),
+            arguments.number("--base", "Z", "close a mesh by walls down to this height [open]"),
+        ),
+        **arguments.RASTER,
+    },
+    run=run,
+    about="It keeps its place on the map, or becomes a mesh of triangles.",
+)

@@ -1,0 +1,272 @@
+"""`jaxhf view`: a terrain as a solid block, from a place that shows all of it."""
+
+import argparse
+import dataclasses
+import datetime
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...core.errors import ArgumentError, UserError
+from .. import arguments
+from ..arguments import FINITE, POSITIVE, choice, flag, number, option, whole
+from ..command import Command
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ...io.terrain import Terrain
+    from ...scene.camera import Perspective
+    from ...scene.heightfield import Heightfield
+    from ...scene.scene import Scene
+    from ..block import Look
+
+_PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
+
+_TALLEST = 100  # times its length: beyond, a terrain is a needle that no pixel shows
+
+
+def _sun(text: str) -> tuple[float, float] | datetime.datetime:
+    """Azimuth and altitude, or a time with its offset from UTC."""
+    try:
+        if "," in text:
+            azimuth, altitude = text.split(",")
+            return float(azimuth), float(altitude)
+        time = datetime.datetime.fromisoformat(text)
+    except ValueError:
+        time = None
+    if time is None or time.tzinfo is None:
+        rule = "must be an azimuth and an altitude, as 90,10, or a time with its offset from UTC, as 2026-06-21T07:00-05:00"
+        raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
+    return time
+
+
+def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | None":
+    """The sun's azimuth and altitude in each frame of a film, shape (frames, 2); None where it stands still."""
+    import numpy as np
+
+    from ...scene.sun import sun
+
+    first, last, place = options.sun_from, options.sun_to, (options.latitude, options.longitude)
+    times = isinstance(first, datetime.datetime)
+    if times != isinstance(last, datetime.datetime):
+        raise UserError("view: --sun-from and --sun-to must both be angles or both be times")
+    if not times and place != (None, None):
+        raise UserError("view: --latitude and --longitude stand with times, as in --sun-from 2026-06-21T06:00:00Z")
+    if first is None or not times:
+        return None if first is None else np.linspace(first, last, options.frames)
+    if place == (None, None):
+        try:
+            place = terrain.place
+        except ArgumentError as error:
+            why = error.rule.rpartition(", ")[2]
+            raise UserError(f"view: times need --latitude and --longitude for {options.terrain}: {why}") from error
+    elif None in place:
+        raise UserError("view: --latitude and --longitude belong together, one is missing")
+    start, end = (np.datetime64(t.astimezone(datetime.UTC).replace(tzinfo=None), "us") for t in (first, last))
+    instants = start + (end - start) * np.arange(options.frames) // (options.frames - 1)
+    azimuth, altitude = sun(instants, *place)
+    if not (altitude > 0).all():
+        low = int(np.argmin(altitude))
+        when = instants[low].astype("datetime64[s]")
+        raise UserError(f"view: the sun must be up all the time, its altitude is {altitude[low]:.2f} degrees at {when}Z (UTC)")
+    return np.stack([azimuth, altitude], -1)
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(word) for word in text.lower().split("x"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be two numbers of pixels, as 1280x800, it is {text!r}") from None
+    if min(width, height) < 1:
+        raise argparse.ArgumentTypeError(f"must be positive, it is {text}")
+    return width, height
+
+
+def _output(options: argparse.Namespace) -> tuple[Path, bool]:
+    """The file, and whether it is a film; UserError where options do not go together."""
+    from ...io.films import FILMS, require_writable_film
+    from ...io.images import PICTURES, require_writable
+    from ...io.load_terrain import jacksboro_file
+    from ..overwriting import require_no_input
+
+    if options.demo == (options.terrain is not None):
+        raise UserError(f"view: IN or --demo must say what to show, {'not both' if options.demo else 'there is neither'}")
+    if options.demo:
+        options.terrain = jacksboro_file()
+    output = Path(options.output or Path(options.terrain).with_suffix(".png").name)
+    ending, moves = output.suffix.lower(), not options.frames is options.sun_from is None
+    film = ending in FILMS or (moves and ending not in PICTURES)
+    if (options.sun_from is None) != (options.sun_to is None):
+        raise UserError("view: --sun-from and --sun-to belong together, one is missing")
+    if options.sun_from is not None and not film:
+        raise UserError(f"view: a moving sun makes a film, {output} is none; write {' or '.join(FILMS)}")
+    if not film:
+        arguments.refuse(options, "frames", because=f"{output} is one picture, a film is {' or '.join(FILMS)}")
+    if options.sun_from is not None:
+        arguments.refuse(options, "azimuth", "altitude", because="the sun moves from --sun-from to --sun-to")
+    if options.drape is not None:
+        arguments.refuse(options, "ramp", because="--drape gives the terrain its colours")
+    require_no_input(options, output)
+    (require_writable_film if film else require_writable)(output)
+    return output, film
+
+
+def run(options: argparse.Namespace) -> None:
+    from ...io.images import save_image
+    from ...io.load_terrain import load_heights
+
+    output, film = _output(options)
+    begin = time.perf_counter()
+    terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+    if terrain.nodata.all():
+        raise UserError(f"view: {options.terrain} holds no height")
+    options.frames = options.frames or 72
+    path = _sun_path(options, terrain)
+    from ...scene.heightfield import Heightfield
+    from ...xla.devices import local_mesh
+    from ..block import block, exaggeration, photograph
+    from ..limits import require_memory
+    from ..progress import bar
+
+    factor = options.exaggeration or exaggeration(terrain.heights, terrain.dx, terrain.dy)
+    z, colours, base = _solid(options, terrain, factor)
+    arguments.set_up_jax(options)
+    field = Heightfield(z, terrain.dx, terrain.dy)
+    cameras, looks = _frames(options, field, base, path, film)
+    scene = block(field, colours, cameras[0], looks[0], base)
+    require_memory(scene, local_mesh().size)
+    said = "{} x {} pixels".format(*options.size)
+    if film:
+        _film(output, scene, cameras, looks)
+        said = f"{len(cameras)} frames of {said}"
+    else:
+        with bar(total=looks[0].samples, unit=" samples", delay=0.5) as shown:
+            save_image(output, photograph(scene, cameras[0], looks[0], shown.update))
+    print(f"{output}: {said}, heights x {factor:g}, {time.perf_counter() - begin:.1f} s")
+
+
+def _solid(options: argparse.Namespace, terrain: "Terrain", factor: float) -> "tuple[np.ndarray, np.ndarray, float | None]":
+    """What `block` takes: the terrain's heights times a factor, with water on them; colours; the floor's level."""
+    import numpy as np
+
+    from ..block import with_water
+
+    z, colours = terrain.heights.astype(options.precision), _colours(options, terrain)
+    if options.water is not None:
+        low, high = np.nanmin(z), np.nanmax(z)
+        if not low < options.water < high:
+            warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {options.water:g}", stacklevel=2)
+        z, colours = with_water(z, colours, options.water)
+    reach = max((n - 1) * d for n, d in zip(z.shape, (terrain.dy, terrain.dx), strict=True))
+    times = (float(np.nanmax(z)) - float(np.nanmin(z))) * factor / reach
+    if times > _TALLEST:
+        found = f"times {factor:g} it is {times:.3g} times its length high"
+        raise UserError(f"view: --exaggeration must leave a terrain at most {_TALLEST} times its length high; {found}")
+    z = z * z.dtype.type(factor)
+    low, high = np.nanmin(z), np.nanmax(z)
+    return z, colours, float(low - max(0.25 * (high - low), 0.02 * reach)) if options.skirt else None
+
+
+def _colours(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray":
+    import numpy as np
+
+    from ...io.drape import load_drape
+    from ...io.images import linear_from_srgb
+    from ...maps.relief import color_relief
+
+    if options.drape is not None:
+        return load_drape(options.drape, terrain)
+    return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(terrain, options.ramp)]
+
+
+def _frames(
+    options: argparse.Namespace, field: "Heightfield", base: float | None, path: "np.ndarray | None", film: bool
+) -> "tuple[list[Perspective], list[Look]]":
+    """A camera and a look for each frame: round the terrain, or in a moving sun, whose `path` it is; for a picture one."""
+    from ...scene.camera import Perspective
+    from ..block import Look
+
+    look = Look(**arguments.given(options, "azimuth", "altitude", "haze"), samples=_PRESETS[options.preset])
+    azimuth = look.azimuth - 110 if options.camera_azimuth is None else options.camera_azimuth
+    around, (width, height) = film and path is None, options.size
+    looks = [look] if path is None else [dataclasses.replace(look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
+    cameras = [
+        Perspective.framing(
+            field, azimuth + turn, options.camera_altitude, options.fov, width=width, height=height, base=base, around=around
+        )
+        for turn in ([360 * k / options.frames for k in range(options.frames)] if around else [0])
+    ]
+    return cameras * len(looks), looks * len(cameras)
+
+
+def _film(output: Path, scene: "Scene", cameras: "Sequence[Perspective]", looks: "Sequence[Look]") -> None:
+    """A frame for each camera and look; the terrain is prepared once."""
+    import numpy as np
+
+    from ...io.films import writing_film
+    from ...io.images import srgb_from_linear
+    from ...rendering.render import prepare
+    from ..block import lights, photograph
+    from ..progress import bar
+
+    ready = prepare(scene)
+    with writing_film(output, 24) as add, bar(total=len(looks), unit=" frames") as shown:
+        for camera, look in zip(cameras, looks, strict=True):
+            lit = ready if look is looks[0] else ready.with_lights(lights(scene.heightfields[0], look))
+            image = photograph(lit, camera, look)
+            add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
+            shown.update()
+
+
+_DEGREES = "DEGREES"
+_PRESET = "1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]"
+_FROM = "where the camera stands, clockwise from north [110 left of the sun]"
+_SUN_FROM = "a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00"
+_RAMP = "colours by height: a gdaldem colour file, or a matplotlib colour map"
+_DRAPE = "a picture laid over it: a GeoTIFF where it lies, others from corner to corner"
+COMMAND = Command(
+    "view",
+    "show a terrain as a solid block, or fly round it",
+    examples=("--demo -o block.png", "dem.tif -o orbit.gif --size 640x400 --frames 48"),
+    options={
+        "": (
+            option("terrain", metavar="IN", nargs="?", help=f"heights: {arguments.TERRAIN}"),
+            flag("--demo", "in place of IN the Jacksboro fault, which matplotlib ships"),
+            option("-o", "--output", metavar="OUT", help=".png, .jpg, .exr, .npy; a film: .gif, .mp4 [IN's name, .png]"),
+        ),
+        "picture": (
+            option("--size", type=_size, default=(1280, 800), metavar="WxH", help="pixels [1280x800]"),
+            choice("--preset", tuple(_PRESETS), _PRESET, default="balanced"),
+            whole("--frames", "N", "of a film, 24 a second [72]", least=2),
+        ),
+        "camera": (
+            number("--from", _DEGREES, _FROM, dest="camera_azimuth"),
+            number("--above", _DEGREES, "above the horizon [35]", 35.0, dest="camera_altitude"),
+            number("--fov", _DEGREES, "angle of view [30]", 30.0),
+        ),
+        "light": (
+            number("--azimuth", _DEGREES, "of the sun, clockwise from north [315]"),
+            number("--altitude", _DEGREES, "of the sun, above the horizon [45]"),
+            option("--sun-from", type=_sun, metavar="AZ,ALT|TIME", help=_SUN_FROM),
+            option("--sun-to", type=_sun, metavar="AZ,ALT|TIME", help="and where it ends, or when"),
+            number("--latitude", _DEGREES, "for times [that of the terrain's middle]"),
+            number("--longitude", _DEGREES, "for times [that of the terrain's middle]"),
+            number("--haze", "SHARE", "of light lost along the terrain [0.15]", 0.15),
+        ),
+        "terrain": (
+            number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]", rule=POSITIVE),
+            option("--ramp", metavar="FILE|NAME", help=_RAMP),
+            option("--drape", metavar="IMAGE", help=_DRAPE),
+            number("--water", "LEVEL", "below it is water", rule=FINITE),
+            option("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet"),
+        ),
+        **arguments.RASTER,
+        **arguments.MACHINE,
+    },
+    run=run,
+    about="It is seen from a place that shows all of it. A .gif or .mp4 goes round it.",
+    placed=False,
+)
