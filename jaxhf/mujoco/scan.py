@@ -24,7 +24,7 @@ from ..xla.transfers import takes_numbers
 from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import Quaternion, pose, rotation, yaw
 from .ray import Scan, first_met, in_hfield, nearest, one_axis, triangle_heights
-from .solid import base_faces, column, ground
+from .solid import base_faces, column, ground_of
 
 Align = Literal["yaw", "base", "world"]
 
@@ -158,7 +158,7 @@ def _under(hfield: HField, start: _Start, place: Point2) -> Scan:
     of a ray whose triangle was searched.
     """
     field, begin, (nrow, ncol) = lax.stop_gradient((hfield, start, hfield.data.shape))
-    frame, size, ready = pose(field.pos, field.quat), field.size, ground(field)
+    frame, size, ready = pose(field.pos, field.quat), field.size, ground_of(field)
     turn, place_x, place_y = frame.linear, lax.stop_gradient(place[0]), lax.stop_gradient(place[1])
     away = [begin.o[k] + place_x * begin.along_x[k] + place_y * begin.along_y[k] - frame.offset[k] for k in range(3)]
     o = [turn[0, k] * away[0] + turn[1, k] * away[1] for k in (0, 1)]
@@ -192,7 +192,7 @@ def _under(hfield: HField, start: _Start, place: Point2) -> Scan:
     status = jnp.where(on_surface, int(Status.HIT), int(Status.MISS)).astype(jnp.int32)
     zero = jnp.zeros_like(x)
     found = WalkResult(status, ix, iy, upper, jnp.ones_like(ix), zero, zero, None)
-    frame, ready = pose(hfield.pos, hfield.quat), ground(hfield)
+    frame, ready = pose(hfield.pos, hfield.quat), ground_of(hfield)
     local = in_hfield(frame, Ray(start.o + place[0] * start.along_x + place[1] * start.along_y, start.d))
     met = nearest(ready, local, frame, found, base_faces(ready, local, column(ready, local)))
     return Scan(with_tangent(value.p, met.p), with_tangent(value.n, met.n), with_tangent(value.dist, met.dist), valid)
