@@ -47,11 +47,11 @@ lights: shade/lighting.py -> shade/test_shade.py shade/test_hidden_sky.py shade/
 tiles: rendering/tiles.py rendering/samples.py -> rendering/test_render.py rendering/test_bits.py
 tiles: rendering/chunks.py -> rendering/test_cast.py rendering/test_bits.py
 maps: maps/hillshade.py maps/slope.py maps/surface.py maps/choices.py -> maps/test_maps.py
-maps: maps/ramp.py maps/relief.py -> maps/test_maps.py maps/test_tint_values.py cli/test_hillshade.py '-k=tint or colour'
+maps: maps/ramp.py maps/relief.py -> maps/test_maps.py cli/test_hillshade.py '-k=tint or colour or pales or adds'
 maps: maps/shadows.py -> maps/test_shadows.py
 maps: maps/skyview.py maps/windows.py -> maps/test_skyview.py
 mujoco: mujoco/[hprs]*[dreys].py -> mujoco/test_sensors.py mujoco/test_ray.py --optimised
-mujoco: mujoco/scan.py -> mujoco/test_scan.py mujoco/test_scan_beneath.py --optimised
+mujoco: mujoco/scan.py -> mujoco/test_scan.py --optimised
 io: io/images.py io/files.py io/films.py io/png.py -> io/test_images.py io/test_files.py io/test_full_disk.py
 io: io/procedural.py -> io/test_procedural.py
 io: io/pbrt/*.py -> io/test_pbrt.py

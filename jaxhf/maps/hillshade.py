@@ -3,6 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -60,14 +61,14 @@ def hillshade(
     require_light(owner, azimuth, altitude)
     require_positive(owner, "z_factor", z_factor)
     ground = surface(owner, heights, dx, dy, scale)
-    z, z_scaled = ground.north_first(), z_factor / (spans(algorithm) * ground.scale)
-    formula = _FORMULAE[variant](ground.dx, ground.dy, z_scaled, math.radians(azimuth), math.radians(altitude), algorithm)
+    z_scaled, formula = z_factor / (spans(algorithm) * ground.scale), _FORMULAE[variant]
+    light = _Light(ground.dx, ground.dy, z_scaled, math.radians(azimuth), math.radians(altitude), algorithm)
 
     def shade(window: Window) -> UInt8[np.ndarray, "k m"]:
-        values = formula(window).astype(np.float32) + np.float32(0.5)
+        values = formula(light, window).astype(np.float32) + np.float32(0.5)
         return np.clip(values, 0, 255).astype(np.uint8)
 
-    result = over_windows(z, shade, compute_edges, 0, np.uint8)[::-1]
+    result = over_windows(ground.north_first(), shade, compute_edges, 0, np.uint8)[::-1]
     if shadows:
         relief = z_factor / ground.scale
         dark = ~lit(ground.heights, ground.dx / relief, ground.dy / relief, azimuth, altitude)
@@ -88,96 +89,83 @@ def require_light(owner: str, azimuth: float, altitude: float) -> None:
         )
 
 
-# One a variant: from the spacing, heights by cells and the light, in radians, the formula of a window.
+class _Light(NamedTuple):
+    """A light over cells, as the formulae of the variants take it.
+
+    Attributes:
+      dx, dy: the spacing.
+      z_scaled: what differences of heights over `spans` cells are multiplied by.
+      azimuth, altitude: radians.
+      algorithm: of the slope.
+    """
+
+    dx: float
+    dy: float
+    z_scaled: float
+    azimuth: float
+    altitude: float
+    algorithm: str
+
+    def slopes(self, window: Window) -> tuple[_Values, _Values]:
+        """The rise from east to west and, rows being counted to the south, from south to north; over `spans` cells."""
+        west, south = differences(window, self.algorithm)
+        return west * np.float64(1 / self.dx), south * np.float64(-1 / self.dy)
 
 
-def _regular(
-    dx: float, dy: float, z_scaled: float, azimuth: float, altitude: float, algorithm: str
-) -> Callable[[Window], _Values]:
+def _regular(light: _Light, window: Window) -> _Values:
     """1 + 254 max(0, n . l); in GDAL's order of the sums, which is another in square cells."""
-    overhead, level = 254 * math.sin(altitude), math.cos(altitude) * z_scaled
-    east, north = 254 * (math.sin(azimuth) * level), 254 * (math.cos(azimuth) * level)
-    if algorithm == "horn" and dx == dy:
-        east, north, steep = east * (1 / dx), north * (1 / dx), z_scaled**2 * (1 / dx) * (1 / dx)
-
-        def square(window: Window) -> _Values:
-            nw, n, ne, w, _, e, sw, s, se = window
-            falling, rising, middle_x, middle_y = nw - se, sw - ne, w - e, n - s
-            x = (falling + middle_x + middle_x + rising).astype(np.float64)
-            y = (falling + middle_y + middle_y - rising).astype(np.float64)
-            return 1 + np.maximum((overhead + (x * east - y * north)) / np.sqrt(1 + steep * (x * x + y * y)), 0)
-
-        return square
-
-    def oblong(window: Window) -> _Values:
-        x, y = _slopes(window, dx, dy, algorithm)
-        return 1 + np.maximum((overhead - (y * north - x * east)) / np.sqrt(1 + z_scaled**2 * (x * x + y * y)), 0)
-
-    return oblong
+    z_scaled, overhead, level = light.z_scaled, 254 * math.sin(light.altitude), math.cos(light.altitude) * light.z_scaled
+    east, north = 254 * (math.sin(light.azimuth) * level), 254 * (math.cos(light.azimuth) * level)
+    if light.algorithm == "horn" and light.dx == light.dy:
+        per_cell = 1 / light.dx
+        east, north, steep = east * per_cell, north * per_cell, z_scaled**2 * per_cell * per_cell
+        nw, n, ne, w, _, e, sw, s, se = window
+        falling, rising, middle_x, middle_y = nw - se, sw - ne, w - e, n - s
+        x = (falling + middle_x + middle_x + rising).astype(np.float64)
+        y = (falling + middle_y + middle_y - rising).astype(np.float64)
+        return 1 + np.maximum((overhead + (x * east - y * north)) / np.sqrt(1 + steep * (x * x + y * y)), 0)
+    x, y = light.slopes(window)
+    return 1 + np.maximum((overhead - (y * north - x * east)) / np.sqrt(1 + z_scaled**2 * (x * x + y * y)), 0)
 
 
-def _combined(
-    dx: float, dy: float, z_scaled: float, azimuth: float, altitude: float, algorithm: str
-) -> Callable[[Window], _Values]:
-    overhead, level = math.sin(altitude), math.cos(altitude) * z_scaled
-    east, north = math.sin(azimuth) * level, math.cos(azimuth) * level
-
-    def formula(window: Window) -> _Values:
-        x, y = _slopes(window, dx, dy, algorithm)
-        steep = (x * x + y * y) * z_scaled**2
-        cosine = (overhead - (y * north - x * east)) / np.sqrt(1 + steep)
-        angle = np.arccos(np.clip(cosine, -1, 1))
-        return 1 + 254 * np.maximum(1 - angle * np.arctan(np.sqrt(steep)) / (math.pi / 2) ** 2, 0)
-
-    return formula
+def _combined(light: _Light, window: Window) -> _Values:
+    overhead, level = math.sin(light.altitude), math.cos(light.altitude) * light.z_scaled
+    east, north = math.sin(light.azimuth) * level, math.cos(light.azimuth) * level
+    x, y = light.slopes(window)
+    steep = (x * x + y * y) * light.z_scaled**2
+    cosine = (overhead - (y * north - x * east)) / np.sqrt(1 + steep)
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    return 1 + 254 * np.maximum(1 - angle * np.arctan(np.sqrt(steep)) / (math.pi / 2) ** 2, 0)
 
 
-def _multidirectional(
-    dx: float, dy: float, z_scaled: float, azimuth: float, altitude: float, algorithm: str
-) -> Callable[[Window], _Values]:
-    overhead, level = 127 * math.sin(altitude), 127 * math.cos(altitude) * z_scaled
+def _multidirectional(light: _Light, window: Window) -> _Values:
+    overhead, level = 127 * math.sin(light.altitude), 127 * math.cos(light.altitude) * light.z_scaled
     diagonal = level * math.cos(math.radians(225))
-
-    def formula(window: Window) -> _Values:
-        x, y = _slopes(window, dx, dy, algorithm)
-        xx, yy = x * x, y * y
-        both = xx + yy
-        southwest = 0.5 * both - x * y
-        lights = (
-            southwest * np.maximum(overhead + (x - y) * diagonal, 0)
-            + xx * np.maximum(overhead - x * level, 0)
-            + (both - southwest) * np.maximum(overhead + (x + y) * diagonal, 0)
-            + yy * np.maximum(overhead - y * level, 0)
-        )
-        flat = both == 0
-        shade = lights / np.where(flat, 1, both) / np.sqrt(1 + z_scaled**2 * both)
-        return 1 + np.where(flat, 2 * overhead, shade)
-
-    return formula
+    x, y = light.slopes(window)
+    xx, yy = x * x, y * y
+    both = xx + yy
+    southwest = 0.5 * both - x * y
+    lights = (
+        southwest * np.maximum(overhead + (x - y) * diagonal, 0)
+        + xx * np.maximum(overhead - x * level, 0)
+        + (both - southwest) * np.maximum(overhead + (x + y) * diagonal, 0)
+        + yy * np.maximum(overhead - y * level, 0)
+    )
+    flat = both == 0
+    shade = lights / np.where(flat, 1, both) / np.sqrt(1 + light.z_scaled**2 * both)
+    return 1 + np.where(flat, 2 * overhead, shade)
 
 
-def _igor(
-    dx: float, dy: float, z_scaled: float, azimuth: float, altitude: float, algorithm: str
-) -> Callable[[Window], _Values]:
-    turn, towards = 2 * math.pi, (1.5 * math.pi - azimuth) % (2 * math.pi)
-
-    def formula(window: Window) -> _Values:
-        west, south = differences(window, algorithm)
-        x, y = _slopes(window, dx, dy, algorithm)
-        slope = np.degrees(np.arctan(np.sqrt(x * x + y * y) * z_scaled)) / 90
-        apart = np.abs(np.arctan2(south, west, dtype=np.float64) % turn - towards)
-        apart = np.where(apart > math.pi, turn - apart, apart)
-        return 255 * (1 - slope * (1 - apart / math.pi))
-
-    return formula
+def _igor(light: _Light, window: Window) -> _Values:
+    turn, towards = 2 * math.pi, (1.5 * math.pi - light.azimuth) % (2 * math.pi)
+    west, south = differences(window, light.algorithm)
+    x, y = light.slopes(window)
+    slope = np.degrees(np.arctan(np.sqrt(x * x + y * y) * light.z_scaled)) / 90
+    apart = np.abs(np.arctan2(south, west, dtype=np.float64) % turn - towards)
+    apart = np.where(apart > math.pi, turn - apart, apart)
+    return 255 * (1 - slope * (1 - apart / math.pi))
 
 
-_FORMULAE: dict[str, Callable[..., Callable[[Window], _Values]]] = dict(
+_FORMULAE: dict[str, Callable[[_Light, Window], _Values]] = dict(
     zip(VARIANTS, (_regular, _combined, _multidirectional, _igor), strict=True)
 )
-
-
-def _slopes(window: Window, dx: float, dy: float, algorithm: str) -> tuple[_Values, _Values]:
-    """The rise from east to west and, rows being counted to the south, from south to north; over `spans` cells."""
-    west, south = differences(window, algorithm)
-    return west * np.float64(1 / dx), south * np.float64(-1 / dy)

@@ -132,11 +132,9 @@ def _needed(
     """How high on the near line a ray clears each cell between two lines; -inf where both triangles face the light."""
     across, rise, falling = light
     along, up = (near[1:] - near[:-1], far[1:] - far[:-1]), (far[:-1] - near[:-1], far[1:] - near[1:])
+    first, second = up if falling else up[::-1]
     with np.errstate(invalid="ignore"):
-        if falling:
-            faces = (rise > along[0] * across + up[0]) & (rise > along[1] * across + up[1])
-        else:
-            faces = (rise > along[0] * across + up[1]) & (rise > along[1] * across + up[0])
+        faces = (rise > along[0] * across + first) & (rise > along[1] * across + second)
     highest = np.fmax(near, far - rise)  # nan only where both are
     highest = np.fmax(highest[:-1], highest[1:])
     return np.where(faces | np.isnan(highest), -np.inf, highest)

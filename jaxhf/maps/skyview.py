@@ -13,7 +13,6 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_progress
-from ..io.terrain import Terrain
 from ..scene.heightfield import Heightfield
 from ..trace.horizon import (
     HorizonView,
@@ -30,7 +29,7 @@ from ..trace.normals import vertex_normals
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, on_every_device
 from ..xla.transfers import takes_numbers
-from .surface import both_spacings, spacing
+from .surface import with_spacing
 
 
 @takes_numbers
@@ -136,10 +135,8 @@ def _horizontal(slopes: jax.Array) -> jax.Array:
 
 _PARTS = 64  # of a map that reports its progress
 _ROOM = 4  # heights and horizontal distances are divided by it, so that differences of heights stay numbers
-_WEIGHTINGS = ("solid-angle", "horizontal", "slope")
-_SUMMARIES: dict[str, Summary] = dict(
-    zip(("degrees", *_WEIGHTINGS), (_degrees, _solid_angle, _horizontal, sky_vector), strict=True)
-)
+_WEIGHTINGS: dict[str, Summary] = {"solid-angle": _solid_angle, "horizontal": _horizontal, "slope": sky_vector}
+_SUMMARIES: dict[str, Summary] = {"degrees": _degrees, **_WEIGHTINGS}
 
 
 def _mapped(
@@ -188,13 +185,11 @@ def _holed(heights: jax.Array) -> jax.Array:
 
 
 def _field(owner: str, terrain: Any, dx: float | None, dy: float | None) -> Heightfield:
-    given = spacing(owner, dx, dy)
-    if isinstance(terrain, Terrain):
-        return terrain.in_metres(**given).heightfield()
     if not isinstance(terrain, Heightfield):
-        return Heightfield(terrain, *both_spacings(owner, terrain, given))
-    if given:
-        raise ArgumentError(owner, next(iter(given)), "must stand without a Heightfield, which has its own cell size")
+        return Heightfield(*with_spacing(owner, terrain, dx, dy))
+    for name, value in (("dx", dx), ("dy", dy)):
+        if value is not None:
+            raise ArgumentError(owner, name, "must stand without a Heightfield, which has its own cell size")
     return terrain
 
 

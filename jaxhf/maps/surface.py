@@ -4,7 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..core.errors import ArgumentError
@@ -30,10 +30,6 @@ class Surface(NamedTuple):
     dy: float
     scale: float
 
-    @property
-    def nodata(self) -> Bool[np.ndarray, "ny nx"]:
-        return np.isnan(self.heights)
-
     def north_first(self) -> Float[np.ndarray, "ny nx"]:
         """The heights in float32, in which GDAL reads all but short integers, and in the order of its rows."""
         return fitted(self.heights, np.float32)[::-1]
@@ -53,32 +49,35 @@ def surface(
     Raises:
       ArgumentError: heights are not a grid of numbers, none is finite, a number is not positive, or an array has no spacing.
     """
-    grid = spacing(owner, dx, dy)
     require_positive(owner, "scale", 1.0 if scale is None else scale)
-    if isinstance(heights, Terrain):
-        terrain = heights.in_metres(**grid) if scale is None else heights
-        grid = {"dx": terrain.dx, "dy": terrain.dy, **grid}
-        heights = terrain.heights
-    values = _numbers(owner, heights)
-    return Surface(values, *both_spacings(owner, heights, grid), 1.0 if scale is None else scale)
+    heights, dx, dy = with_spacing(owner, heights, dx, dy, in_metres=scale is None)
+    return Surface(_numbers(owner, heights), dx, dy, 1.0 if scale is None else scale)
 
 
-def spacing(owner: str, dx: float | None, dy: float | None) -> dict[str, float]:
-    """What is given of the two; ArgumentError where it is not positive."""
+def with_spacing(
+    owner: str, heights: Any, dx: float | None, dy: float | None, in_metres: bool = True
+) -> tuple[Any, float, float]:
+    """The heights of an array or a `Terrain`, as they are, with dx and dy; see `surface`.
+
+    Args:
+      owner, heights, dx, dy: as for `surface`.
+      in_metres: whether degrees count as metres.
+
+    Raises:
+      ArgumentError: dx or dy is not positive, neither is given for an array, or that is xarray's.
+    """
     given = {name: value for name, value in (("dx", dx), ("dy", dy)) if value is not None}
     for name, value in given.items():
         require_positive(owner, name, value)
-    return given
-
-
-def both_spacings(owner: str, heights: Any, given: dict[str, float]) -> tuple[float, float]:
-    """dx and dy of an array, of which one alone counts for both; ArgumentError where neither is given, or it is xarray's."""
+    if isinstance(heights, Terrain):
+        terrain = heights.in_metres(**given) if in_metres else heights
+        return terrain.heights, given.get("dx", terrain.dx), given.get("dy", terrain.dy)
     if hasattr(heights, "dims"):
         raise ArgumentError(owner, "heights", "must not be xarray's, whose rows begin anywhere: take Terrain.from_xarray(...)")
     if not given:
         raise ArgumentError(owner, "dx", "must be given for an array: its cell size, in the unit of the heights")
     square = next(iter(given.values()))
-    return given.get("dx", square), given.get("dy", square)
+    return heights, given.get("dx", square), given.get("dy", square)
 
 
 def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:

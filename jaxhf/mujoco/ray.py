@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.affine import Affine
 from ..core.autodiff import stored
 from ..core.errors import ArgumentError, require_kind
 from ..core.ray import Ray
-from ..core.types import Flag, Index, Scalar, Vector
+from ..core.types import Flag, Index, Scalar
 from ..core.vector import finite, quotient, unit
 from ..rendering.chunks import trace_batch
 from ..trace.grid import Grid, joined
@@ -28,25 +28,30 @@ from ..xla.materialise import apart, materialise
 from ..xla.transfers import takes_numbers
 from .hfield import HField, as_numbers, search_grid
 from .pose import pose
-from .solid import Ground, Side, base_faces, column, ground, walls
+from .solid import Ground, Side, base_faces, column, ground_of, wall
 
 CHUNK = 1024  # rays traced together
 
 
-class Met(eqx.Module):
-    """What a ray met.
+class Scan(eqx.Module):
+    """What the rays of a scan met, with the scan's axes: of the robots, then of the pattern.
 
     Attributes:
-      t: in units of the ray's direction; -1: nothing.
-      p: where; the ray's origin where it met nothing.
-      n: the unit normal; zero where it met nothing.
-      valid: whether it met anything.
+      p: where in the world; the ray's start where it met nothing.
+      n: unit normals; zero where nothing was met.
+      dist: distances from the rays' starts, in units of their directions' length; -1 where nothing was met.
+      mask: where something was met.
     """
 
-    t: Scalar
-    p: Vector
-    n: Vector
-    valid: Flag
+    p: Float[jax.Array, "*rays 3"]
+    n: Float[jax.Array, "*rays 3"]
+    dist: Float[jax.Array, "*rays"]
+    mask: Bool[jax.Array, "*rays"]
+
+    @property
+    def heights(self) -> Float[jax.Array, "*rays"]:
+        """z of what was met, in the world; of the ray's start where nothing was, see `mask`."""
+        return self.p[..., 2]
 
 
 @takes_numbers
@@ -84,10 +89,10 @@ def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], 
         rule = f"must begin with the axes {hfield.batch} of the height fields, the rays have shape {shape}"
         raise ArgumentError("ray", "pnt", rule)
     met = first_met(hfield, jnp.broadcast_to(pnt, shape), jnp.broadcast_to(vec, shape))
-    return met.t, met.n
+    return met.dist, met.n
 
 
-def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Met:
+def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Scan:
     """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them."""
     return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, hfield._grid, o, d)
 
@@ -95,13 +100,13 @@ def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array
 @compiled
 def _first_met(
     data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, grid: Grid | None, o: jax.Array, d: jax.Array
-) -> Met:
+) -> Scan:
     """From the numbers alone: whether they stand upright makes no other program."""
     hfield = eqx.tree_at(lambda hfield: hfield._grid, HField(data, size, pos, quat), grid, is_leaf=lambda leaf: leaf is None)
     axes, fields = o.shape[:-1], one_axis(hfield)
     count = len(fields.data)
     rays = o.reshape(count, -1, 3), d.reshape(count, -1, 3)
-    met = trace_batch(_ground, _joined, lambda ground, ray: _one(ground, Ray(ray[0], ray[1])), fields, rays, CHUNK)
+    met = trace_batch(_searchable, _joined, lambda ground, ray: _one(ground, Ray(ray[0], ray[1])), fields, rays, CHUNK)
     return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[2:]), met)
 
 
@@ -111,32 +116,36 @@ def one_axis(hfield: HField) -> HField:
     return jax.tree.map(lambda leaf: jnp.asarray(leaf, hfield.data.dtype).reshape(count, *leaf.shape[axes:]), hfield)
 
 
-def _ground(hfield: HField) -> tuple[Ground, Grid]:
-    return ground(hfield), search_grid(hfield.data) if hfield._grid is None else lax.stop_gradient(hfield._grid)
+def _searchable(hfield: HField) -> Ground:
+    return ground_of(hfield, search_grid(hfield.data) if hfield._grid is None else lax.stop_gradient(hfield._grid))
 
 
-def _joined(ready: tuple[Ground, Grid]) -> tuple[Any, Any]:
-    """See `trace_batch`."""
-    shared, own = joined(ready[1])
-    hfields = eqx.tree_at(lambda hfield: hfield.first, ready[0], own.first, is_leaf=lambda leaf: leaf is None)
-    rows = eqx.tree_at(lambda hfield: hfield.rows, jax.tree.map(lambda _: False, hfields), True)
-    common, apiece = eqx.partition(hfields, rows)
-    return (jax.tree.map(jnp.ravel, common), shared), (apiece, own)
+def _joined(grounds: Ground) -> tuple[Ground, Ground]:
+    """See `trace_batch`: what is `joined` of the grids is in common, and so are the data."""
+
+    def with_parts(grounds: Ground, rows: jax.Array | None, grid: Grid) -> Ground:
+        return eqx.tree_at(lambda all: (all.rows, all.grid), grounds, (rows, grid), is_leaf=lambda leaf: leaf is None)
+
+    assert grounds.grid is not None
+    shared, own = joined(grounds.grid)
+    nothing = jax.tree.map(lambda _: None, grounds)
+    return with_parts(nothing, grounds.rows.reshape(-1), shared), with_parts(grounds, None, own)
 
 
-def _one(ready: tuple[Ground, Grid], ray: Ray) -> Met:
+def _one(ground: Ground, ray: Ray) -> Scan:
     """What one ray in the world's frame meets, after a walk over the surface."""
-    hfield, grid = ready
-    frame = pose(hfield.pos, hfield.quat)
+    grid, frame = ground.grid, pose(ground.pos, ground.quat)
+    assert grid is not None
     local = in_hfield(frame, ray)
-    within = column(hfield, local)
-    faces = base_faces(hfield, local, within)
+    within = column(ground, local)
+    faces = base_faces(ground, local, within)
     limit = lax.stop_gradient(jnp.where(faces[0].met, faces[0].t, jnp.where(faces[1].met, faces[1].t, jnp.inf)))
-    scaled, scale = ray_in_grid(grid, in_cells(hfield, local))
+    scaled, scale = ray_in_grid(grid, in_cells(ground, local))
     found = first_triangle(grid, scaled, max_steps=None, t_max=limit * scale)
     found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
     found = stored(materialise(found))
-    return nearest(hfield, local, frame, found, [*faces, *walls(hfield, local, within, found.side < 0)])
+    walls = (wall(ground, local, side, found.side < 0) for side in within)
+    return nearest(ground, local, frame, found, [*faces, *walls])
 
 
 def in_hfield(frame: Affine, ray: Ray) -> Ray:
@@ -146,43 +155,43 @@ def in_hfield(frame: Affine, ray: Ray) -> Ray:
     return Ray(frame.covector(o - frame.offset), frame.covector(d))
 
 
-def in_cells(hfield: Ground, local: Ray) -> Ray:
+def in_cells(ground: Ground, local: Ray) -> Ray:
     """A ray of the height field's frame in cells by cells by data, such that the border is at whole numbers to the last bit."""
-    nrow, ncol = hfield.shape
+    nrow, ncol = ground.shape
     half = jnp.array([(ncol - 1) / 2, (nrow - 1) / 2, 1], local.o.dtype)
     centre = jnp.array([1, 1, 0], local.o.dtype)
-    size = hfield.size[:3]
+    size = ground.size[:3]
     return Ray((quotient(local.o, size) + centre) * half, quotient(local.d, size) * half)
 
 
-def triangle_heights(hfield: Ground, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
+def triangle_heights(ground: Ground, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """The data at the vertices of a triangle, see `triangle_corners`."""
 
     def heights(rows, first, ix, iy, upper):
-        return triangle_corners(rows, hfield.shape[1], ix, iy, upper, first)
+        return triangle_corners(rows, ground.shape[1], ix, iy, upper, first)
 
-    return apart(heights, hfield.rows, hfield.first, ix, iy, upper)
+    return apart(heights, ground.rows, ground.first, ix, iy, upper)
 
 
-def nearest(hfield: Ground, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Met:
+def nearest(ground: Ground, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Scan:
     """The nearest of the triangle that a search found and of the solid's sides; of two at the same distance the first side.
 
     Args:
-      hfield: one.
+      ground: the height field.
       local: the ray in its frame.
       frame: world from that frame.
       found: the triangle; t counts as the ray's does. Of a ray straight down only its cell is used, as it is over one place
         wherever on it the search began.
       solid: the sides.
     """
-    nrow, ncol = hfield.shape
-    plane = a, b, c = plane_through(triangle_heights(hfield, found.ix, found.iy, found.upper), found.upper)
+    nrow, ncol = ground.shape
+    plane = a, b, c = plane_through(triangle_heights(ground, found.ix, found.iy, found.upper), found.upper)
     down = (local.d[0] == 0) & (local.d[1] == 0)
     near, far = jnp.where(down, 0, found.t_near), jnp.where(down, jnp.inf, found.t_far)
     found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (near, far))
-    cells = in_cells(hfield, local)
+    cells = in_cells(ground, local)
     t = plane_distance(plane, cells, found)
-    at, size = cells(t), hfield.size
+    at, size = cells(t), ground.size
     u, v = at[0] - found.ix.astype(t.dtype), at[1] - found.iy.astype(t.dtype)
     per_x, per_y = quotient(a * size[2] * ((ncol - 1) / 2), size[0]), quotient(b * size[2] * ((nrow - 1) / 2), size[1])
     surface = Side(t, found.status == int(Status.HIT), unit(jnp.stack([-per_x, -per_y, jnp.ones_like(a)])))
@@ -193,4 +202,4 @@ def nearest(hfield: Ground, local: Ray, frame: Affine, found: WalkResult, solid:
     t = jnp.where(best.met, best.t, 0)
     p = local(t)
     z = jnp.where(surface.met & (surface.t == best.t), (c + a * u + b * v) * size[2], p[2])  # free of the ray's own rounding
-    return Met(jnp.where(best.met, t, -1), frame.point(jnp.stack([p[0], p[1], z])), frame.vector(best.n), best.met)
+    return Scan(frame.point(jnp.stack([p[0], p[1], z])), frame.vector(best.n), jnp.where(best.met, t, -1), best.met)

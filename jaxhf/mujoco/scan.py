@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, require_kind
@@ -23,31 +23,10 @@ from ..xla.materialise import materialise
 from ..xla.transfers import takes_numbers
 from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import Quaternion, pose, rotation, yaw
-from .ray import first_met, in_hfield, nearest, one_axis, triangle_heights
-from .solid import base_faces, column, ground
+from .ray import Scan, first_met, in_hfield, nearest, one_axis, triangle_heights
+from .solid import base_faces, column, ground_of
 
 Align = Literal["yaw", "base", "world"]
-
-
-class Scan(eqx.Module):
-    """What the rays of a scan met, with the scan's axes: of the robots, then of the pattern.
-
-    Attributes:
-      p: where in the world; the ray's start where it met nothing.
-      n: unit normals; zero where nothing was met.
-      dist: distances from the rays' starts; -1 where nothing was met.
-      mask: where something was met.
-    """
-
-    p: Float[jax.Array, "*rays 3"]
-    n: Float[jax.Array, "*rays 3"]
-    dist: Float[jax.Array, "*rays"]
-    mask: Bool[jax.Array, "*rays"]
-
-    @property
-    def heights(self) -> Float[jax.Array, "*rays"]:
-        """z of what was met, in the world; of the ray's start where nothing was, see `mask`."""
-        return self.p[..., 2]
 
 
 def grid_pattern(size: tuple[float, float] = (1.6, 1.0), resolution: float = 0.1) -> Float[np.ndarray, "n 2"]:
@@ -94,29 +73,31 @@ def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, of
     Raises:
       ValueError: shapes that do not fit, an unknown `align`, an `offset` that is not finite.
     """
-    require_kind("height_scan", "hfields", hfields, HField, "a jaxhf.mujoco.HField")
+    owner = "height_scan"
+    pos, quat, places = on_sensors(owner, hfields, pos, quat, grid_pattern() if pattern is None else pattern, 2)
     if align not in get_args(Align):
-        raise ArgumentError("height_scan", "align", f"must be one of {', '.join(get_args(Align))}; it is {align!r}")
-    dtype = hfields.data.dtype
-    pos, quat = poses_for("height_scan", hfields, pos, quat)
-    places = as_numbers("height_scan", "pattern", grid_pattern() if pattern is None else pattern, dtype)
-    offset = known_numbers("height_scan", "offset", offset)
-    require_number("height_scan", "offset", offset)
-    if places.ndim != 2 or places.shape[1] != 2:
-        raise ArgumentError("height_scan", "pattern", f"must have shape (n, 2), its shape is {places.shape}")
-    starts = _starts(pos, quat, jnp.asarray(offset, dtype), align=align)
+        raise ArgumentError(owner, "align", f"must be one of {', '.join(get_args(Align))}; it is {align!r}")
+    offset = known_numbers(owner, "offset", offset)
+    require_number(owner, "offset", offset)
+    starts = _starts(pos, quat, jnp.asarray(offset, pos.dtype), align=align)
     if hfields.upright and align != "base":
         return _look_up(hfields, starts, places)
-    met = first_met(hfields, *_rays(starts, places))
-    return Scan(met.p, met.n, met.t, met.valid)
+    return first_met(hfields, *_rays(starts, places))
 
 
-def poses_for(owner: str, hfields: HField, pos: Any, quat: Any) -> tuple[jax.Array, jax.Array]:
-    """Positions (..., 3) and orientations (..., 4) of robots in the precision of the height fields, whose axes they begin with.
+def on_sensors(
+    owner: str, hfields: HField, pos: Any, quat: Any, pattern: Any, columns: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """What robots or sensors are given, in the precision of the height fields.
+
+    Returns:
+      Positions (..., 3) and orientations (..., 4), which begin with the axes of the height fields; the pattern (n, columns).
 
     Raises:
-      ValueError: their shapes are others, or an orientation given as plain numbers is zero; `owner` is who says so.
+      ValueError: `hfields` is something else, shapes are others, or an orientation given as plain numbers is zero; `owner`
+        says so.
     """
+    require_kind(owner, "hfields", hfields, HField, "a jaxhf.mujoco.HField")
     given, dtype, batch = quat, hfields.data.dtype, hfields.batch
     pos, quat = as_numbers(owner, "pos", pos, dtype), as_numbers(owner, "quat", quat, dtype)
     if not isinstance(given, jax.Array) and not isinstance(quat, Tracer) and not np.any(given, axis=-1).all():
@@ -126,7 +107,10 @@ def poses_for(owner: str, hfields: HField, pos: Any, quat: Any) -> tuple[jax.Arr
             fits = name == "quat" and pos.ndim > len(batch)
             wanted = ", ".join(map(str, (*pos.shape[:-1], length) if fits else (*batch, "...", length)))
             raise ArgumentError(owner, name, f"must have shape ({wanted}), pos and quat alike, its shape is {value.shape}")
-    return pos, quat
+    places = as_numbers(owner, "pattern", pattern, dtype)
+    if places.ndim != 2 or places.shape[1] != columns:
+        raise ArgumentError(owner, "pattern", f"must have shape (n, {columns}), its shape is {places.shape}")
+    return pos, quat, places
 
 
 @functools.partial(compiled, static_argnames=("align",))
@@ -174,7 +158,7 @@ def _under(hfield: HField, start: _Start, place: Point2) -> Scan:
     of a ray whose triangle was searched.
     """
     field, begin, (nrow, ncol) = lax.stop_gradient((hfield, start, hfield.data.shape))
-    frame, size, ready = pose(field.pos, field.quat), field.size, ground(field)
+    frame, size, ready = pose(field.pos, field.quat), field.size, ground_of(field)
     turn, place_x, place_y = frame.linear, lax.stop_gradient(place[0]), lax.stop_gradient(place[1])
     away = [begin.o[k] + place_x * begin.along_x[k] + place_y * begin.along_y[k] - frame.offset[k] for k in range(3)]
     o = [turn[0, k] * away[0] + turn[1, k] * away[1] for k in (0, 1)]
@@ -208,7 +192,7 @@ def _under(hfield: HField, start: _Start, place: Point2) -> Scan:
     status = jnp.where(on_surface, int(Status.HIT), int(Status.MISS)).astype(jnp.int32)
     zero = jnp.zeros_like(x)
     found = WalkResult(status, ix, iy, upper, jnp.ones_like(ix), zero, zero, None)
-    frame, ready = pose(hfield.pos, hfield.quat), ground(hfield)
+    frame, ready = pose(hfield.pos, hfield.quat), ground_of(hfield)
     local = in_hfield(frame, Ray(start.o + place[0] * start.along_x + place[1] * start.along_y, start.d))
     met = nearest(ready, local, frame, found, base_faces(ready, local, column(ready, local)))
-    return Scan(with_tangent(value.p, met.p), with_tangent(value.n, met.n), with_tangent(value.dist, met.t), valid)
+    return Scan(with_tangent(value.p, met.p), with_tangent(value.n, met.n), with_tangent(value.dist, met.dist), valid)

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import ArgumentError, require_kind, whole_number
+from ..core.errors import ArgumentError, whole_number
 from ..scene.camera import require_size
 from ..xla.compilation import compiled
 from ..xla.transfers import takes_numbers
-from .hfield import HField, as_numbers, known_numbers, number_pair
+from .hfield import HField, known_numbers, number_pair
 from .pose import rotation
-from .ray import first_met
-from .scan import Scan, poses_for
+from .ray import Scan, first_met
+from .scan import on_sensors
 
 
 def lidar_pattern(
@@ -70,13 +70,8 @@ def lidar(hfields: HField, pos: Any, quat: Any, pattern: Any = None) -> Scan:
     Raises:
       ValueError: shapes that do not fit.
     """
-    require_kind("lidar", "hfields", hfields, HField, "a jaxhf.mujoco.HField")
-    pos, quat = poses_for("lidar", hfields, pos, quat)
-    directions = as_numbers("lidar", "pattern", lidar_pattern() if pattern is None else pattern, hfields.data.dtype)
-    if directions.ndim != 2 or directions.shape[1] != 3:
-        raise ArgumentError("lidar", "pattern", f"must have shape (n, 3), its shape is {directions.shape}")
-    met = first_met(hfields, *_turned(pos, quat, directions))
-    return Scan(met.p, met.n, met.t, met.valid)
+    directions = lidar_pattern() if pattern is None else pattern
+    return first_met(hfields, *_turned(*on_sensors("lidar", hfields, pos, quat, directions, 3)))
 
 
 @takes_numbers
@@ -102,21 +97,19 @@ def depth_image(
       ValueError: shapes that do not fit, a size below 1, a fovy that is not between 0 and 180, focal lengths that are not
         positive.
     """
-    require_kind("depth_image", "hfields", hfields, HField, "a jaxhf.mujoco.HField")
     if not 0 < fovy < 180:
         raise ArgumentError("depth_image", "fovy", f"must lie between 0 and 180 degrees, it is {fovy}")
     require_size("depth_image", width, height)
-    pos, quat = poses_for("depth_image", hfields, pos, quat)
     f = height / 2 / np.tan(np.radians(fovy) / 2)
     fx, fy, cx, cy = (f, f, width / 2, height / 2) if intrinsics is None else _lens(intrinsics)
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (cy - np.arange(height) - 0.5) / fy)
     # With 1 along the axis a ray's t is the depth itself.
     pixels = np.stack([x, y, -np.ones_like(x)], -1).reshape(-1, 3)
-    met = first_met(hfields, *_turned(pos, quat, jnp.asarray(pixels, hfields.data.dtype)))
-    lengths = jnp.asarray(np.linalg.norm(pixels, axis=1), met.t.dtype)
-    dist = jnp.where(met.valid, met.t * jnp.broadcast_to(lengths, met.t.shape), -1)
-    shape = *pos.shape[:-1], height, width
-    return met.t.reshape(shape), dist.reshape(shape)
+    met = first_met(hfields, *_turned(*on_sensors("depth_image", hfields, pos, quat, pixels, 3)))
+    depth, lengths = met.dist, jnp.asarray(np.linalg.norm(pixels, axis=1), met.dist.dtype)
+    dist = jnp.where(met.mask, depth * jnp.broadcast_to(lengths, depth.shape), -1)
+    shape = *depth.shape[:-1], height, width
+    return depth.reshape(shape), dist.reshape(shape)
 
 
 def _lens(intrinsics: Any) -> list[float]:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import time_to
+from ..trace.grid import Grid
 from .hfield import HField
 
 _ROUNDING = 16  # units in the last place by which the height of a wall's rim may be off
@@ -25,7 +26,8 @@ class Ground(eqx.Module):
       rows: the data, row after row.
       size, pos, quat: as in `HField`.
       shape: (nrow, ncol).
-      first: the place of its first number in `rows`, where those hold several height fields; None: 0.
+      grid: for the search of a triangle alone, cells by cells by data; None where no ray searches. Where `rows` hold several
+        height fields, so do its arrays, and `grid.first` is the place of this one's first number in both.
     """
 
     rows: Float[jax.Array, " vertices"]
@@ -33,13 +35,17 @@ class Ground(eqx.Module):
     pos: Vector
     quat: Float[jax.Array, "4"]
     shape: tuple[int, int] = eqx.field(static=True)
-    first: Index | None = None
+    grid: Grid | None
+
+    @property
+    def first(self) -> Index | None:
+        return None if self.grid is None else self.grid.first
 
 
-def ground(hfield: HField) -> Ground:
+def ground_of(hfield: HField, grid: Grid | None = None) -> Ground:
     """One height field, not a batch."""
     nrow, ncol = hfield.data.shape
-    return Ground(hfield.data.reshape(-1), hfield.size, hfield.pos, hfield.quat, (nrow, ncol))
+    return Ground(hfield.data.reshape(-1), hfield.size, hfield.pos, hfield.quat, (nrow, ncol), grid)
 
 
 class Side(eqx.Module):
@@ -50,18 +56,14 @@ class Side(eqx.Module):
     n: Vector
 
 
-class Column(eqx.Module):
-    """Where a ray is over the footprint: from `enters.t` to `leaves.t`, which may be infinite, in the planes of two walls."""
+def column(ground: Ground, ray: Ray) -> tuple[Side, Side]:
+    """Where a ray (in the height field's frame) enters the column over the footprint, and where it leaves it.
 
-    enters: Side
-    leaves: Side
-
-
-def column(hfield: Ground, ray: Ray) -> Column:
-    """The column of a ray in the height field's frame; both of its walls are `met` where the ray comes through it."""
+    Both lie in the planes of walls, at t that may be infinite, and are `met` where the ray comes through the column.
+    """
     near, far = [], []
     for axis in (0, 1):
-        d, half = ray.d[axis], hfield.size[axis]
+        d, half = ray.d[axis], ground.size[axis]
         inside, ahead = jnp.abs(ray.o[axis]) <= half, jnp.where(d > 0, 1, -1).astype(d.dtype)
         always, never = jnp.where(inside, -jnp.inf, jnp.inf), jnp.where(inside, jnp.inf, -jnp.inf)
         n = jnp.zeros(3, d.dtype).at[axis].set(ahead)
@@ -72,48 +74,43 @@ def column(hfield: Ground, ray: Ray) -> Column:
     first, last = near_x < near_y, far_x > far_y
     t_in, t_out = jnp.where(first, near_y, near_x), jnp.where(last, far_y, far_x)
     through = t_in <= t_out
-    return Column(Side(t_in, through, jnp.where(first, in_y, in_x)), Side(t_out, through, jnp.where(last, out_y, out_x)))
+    return Side(t_in, through, jnp.where(first, in_y, in_x)), Side(t_out, through, jnp.where(last, out_y, out_x))
 
 
-def base_faces(hfield: Ground, ray: Ray, within: Column) -> list[Side]:
-    """The upper face of the base, and the floor."""
-    up = jnp.array([0, 0, 1], ray.d.dtype)
+def base_faces(ground: Ground, ray: Ray, within: tuple[Side, Side]) -> list[Side]:
+    """The upper face of the base, and the floor; `within` is the ray's column."""
+    (enters, leaves), up = within, jnp.array([0, 0, 1], ray.d.dtype)
     faces = []
-    for level, n in ((jnp.zeros_like(ray.d[2]), up), (-hfield.size[3], -up)):
+    for level, n in ((jnp.zeros_like(ray.d[2]), up), (-ground.size[3], -up)):
         t, ever = time_to(level - ray.o[2], ray.d[2])
-        faces.append(Side(t, ever & (t >= 0) & (within.enters.t <= t) & (t <= within.leaves.t), n))
+        faces.append(Side(t, ever & (t >= 0) & (enters.t <= t) & (t <= leaves.t), n))
     return faces
 
 
-def walls(hfield: Ground, ray: Ray, within: Column, below: Flag) -> list[Side]:
-    """The walls where the ray enters the column and where it leaves it.
+def wall(ground: Ground, ray: Ray, side: Side, below: Flag) -> Side:
+    """The wall in whose plane a side of the ray's column lies: met where that is over the floor and below the rim.
 
     Args:
-      hfield: one.
+      ground: the height field.
       ray: in its frame.
-      within: the ray's column.
+      side: where the ray enters or leaves its column.
       below: whether the ray is below the surface, for where rounding cannot tell at the rim: so nothing gets in between a
         wall and the surface.
     """
-    return [_wall(hfield, ray, side, below) for side in (within.enters, within.leaves)]
-
-
-def _wall(hfield: Ground, ray: Ray, side: Side, below: Flag) -> Side:
-    """The side where it lies over the floor and below the rim."""
     t = jnp.where(side.met & jnp.isfinite(side.t), side.t, 0)
     p, up = ray(t), ray.d[2]
-    t_floor, ever = time_to(-hfield.size[3] - ray.o[2], up)
-    over_floor = jnp.where(ever, jnp.where(up > 0, t >= t_floor, t <= t_floor), ray.o[2] >= -hfield.size[3])
-    nrow, ncol = hfield.shape
+    t_floor, ever = time_to(-ground.size[3] - ray.o[2], up)
+    over_floor = jnp.where(ever, jnp.where(up > 0, t >= t_floor, t <= t_floor), ray.o[2] >= -ground.size[3])
+    nrow, ncol = ground.shape
     along_x = side.n[1] != 0
-    c, u = _cell(p[0] / hfield.size[0], ncol)
-    r, v = _cell(p[1] / hfield.size[1], nrow)
+    c, u = _cell(p[0] / ground.size[0], ncol)
+    r, v = _cell(p[1] / ground.size[1], nrow)
     last = jnp.where(along_x, side.n[1], side.n[0]) > 0
     r, c = jnp.where(along_x, jnp.where(last, nrow - 1, 0), r), jnp.where(along_x, c, jnp.where(last, ncol - 1, 0))
-    at = r * ncol + c if hfield.first is None else r * ncol + c + hfield.first
-    low, high = hfield.rows[at], hfield.rows[at + jnp.where(along_x, 1, ncol)]
-    rim = (low + jnp.where(along_x, u, v) * (high - low)) * hfield.size[2]
-    gap, noise = p[2] - rim, _ROUNDING * jnp.finfo(rim.dtype).eps * (hfield.size[2] + jnp.abs(ray.o[2]) + jnp.abs(t * up))
+    at = r * ncol + c if ground.first is None else r * ncol + c + ground.first
+    low, high = ground.rows[at], ground.rows[at + jnp.where(along_x, 1, ncol)]
+    rim = (low + jnp.where(along_x, u, v) * (high - low)) * ground.size[2]
+    gap, noise = p[2] - rim, _ROUNDING * jnp.finfo(rim.dtype).eps * (ground.size[2] + jnp.abs(ray.o[2]) + jnp.abs(t * up))
     under = (gap < -noise) | ((gap <= noise) & below)
     return Side(t, side.met & jnp.isfinite(side.t) & (t >= 0) & over_floor & under, side.n)
 

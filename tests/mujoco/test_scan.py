@@ -149,27 +149,42 @@ def test_gradient_matches_central_differences():
     np.testing.assert_allclose(sum(along), (ahead - behind) / (2 * eps), rtol=1e-6)
 
 
+def test_rays_from_within_the_base_meet_its_bottom():
+    """Within the solid they meet its bottom from inside, below it nothing."""
+    size = (3.0, 2.0, 1.5, 0.5)
+    data = np.random.default_rng(4).uniform(0.2, 1, (5, 7)).astype(np.float32)
+    above_bottom = np.array([0.125, 0.375, -0.125])
+    pos = np.zeros((3, 3), np.float32)
+    pos[:, 2] = -size[3] + above_bottom - 20  # a scan's rays start 20 above
+    quat = np.tile(np.array([1, 0, 0, 0], np.float32), (3, 1))
+    scan = height_scan(HField(data, size), pos, quat, np.array([[0.3, -0.7], [-1.1, 0.9]], np.float32))
+    np.testing.assert_array_equal(scan.mask, [[True] * 2] * 2 + [[False] * 2])
+    # One unit in the last place of 20 in single precision, where the start is computed.
+    np.testing.assert_allclose(scan.dist, [[0.125] * 2, [0.375] * 2, [-1] * 2], atol=2.0**-19)
+    np.testing.assert_array_equal(scan.n[:2], np.broadcast_to([0, 0, -1], (2, 2, 3)))
+
+
 POS, QUAT = robots(3)
 UNKNOWN = object()
+
+
+scan_fields = functools.partial(height_scan, FIELDS)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: height_scan(FIELDS, POS[0], QUAT[0]), r"height_scan: pos must have shape \(2, \.\.\., 3\)"),
-        (lambda: height_scan(FIELDS, POS, 0 * QUAT), "height_scan: quat must not be zero"),
-        (
-            lambda: height_scan(FIELDS, POS, (1, 0, 0, 0)),
-            r"height_scan: quat must have shape \(2, 3, 4\).*, its shape is \(4,\)",
-        ),
-        (lambda: height_scan(FIELDS, POS, QUAT, align="roll"), "height_scan: align must be one of yaw, base, world"),
-        (lambda: height_scan(FIELDS, POS, QUAT, np.zeros((3, 3))), r"height_scan: pattern must have shape \(n, 2\)"),
-        (lambda: height_scan(FIELDS, POS, QUAT, offset=np.nan), "height_scan: offset must be finite, it is nan"),
-        (lambda: height_scan(FIELDS, POS, QUAT, offset=(1, 2)), r"height_scan: offset must be one number, its shape is \(2,\)"),
+        (lambda: scan_fields(POS[0], QUAT[0]), r"height_scan: pos must have shape \(2, \.\.\., 3\)"),
+        (lambda: scan_fields(POS, 0 * QUAT), "height_scan: quat must not be zero"),
+        (lambda: scan_fields(POS, (1, 0, 0, 0)), r"height_scan: quat must have shape \(2, 3, 4\).*, its shape is \(4,\)"),
+        (lambda: scan_fields(POS, QUAT, align="roll"), "height_scan: align must be one of yaw, base, world"),
+        (lambda: scan_fields(POS, QUAT, np.zeros((3, 3))), r"height_scan: pattern must have shape \(n, 2\)"),
+        (lambda: scan_fields(POS, QUAT, offset=np.nan), "height_scan: offset must be finite, it is nan"),
+        (lambda: scan_fields(POS, QUAT, offset=(1, 2)), r"height_scan: offset must be one number, its shape is \(2,\)"),
         # Such as MJX's data, whose numbers are meant.
-        (lambda: height_scan(FIELDS, UNKNOWN, UNKNOWN), "height_scan: pos must be numbers, it is an object"),
-        (lambda: height_scan(FIELDS, FIELDS, FIELDS), "height_scan: pos must be numbers, it is a HField"),
-        (lambda: height_scan(FIELDS, None, None), "height_scan: pos must be numbers, it is a NoneType"),
+        (lambda: scan_fields(UNKNOWN, UNKNOWN), "height_scan: pos must be numbers, it is an object"),
+        (lambda: scan_fields(FIELDS, FIELDS), "height_scan: pos must be numbers, it is a HField"),
+        (lambda: scan_fields(None, None), "height_scan: pos must be numbers, it is a NoneType"),
         (lambda: ray(FIELDS, POS, "down"), "ray: vec must be numbers, it is a str"),
         (lambda: HField(UNKNOWN, SIZE), "HField: data must be an array of real numbers, they are an object"),
         (lambda: HField(GROUNDS, "large"), "HField: size must be numbers, it is a str"),
