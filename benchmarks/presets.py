@@ -1,7 +1,7 @@
 """The plots that chose the presets: error over samples, over points on edges and over time on four scenes.
 
 Each scene is swept by the command `tradeoff` over these two knobs alone, the derivative over its points only, with four
-samples; what was measured before is not measured again.
+samples; what was measured before is not measured again. After a change of jaxhf's source another folder is needed.
 """
 
 from collections.abc import Sequence
