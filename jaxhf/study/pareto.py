@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 from ..core.settings import Settings
-from .table import Row, changes, in_words, settings_of
+from .table import Row, changes, in_words
 
 _ERRORS = {
     "picture": {"rmse": "RMSE", "p999": "99.9 %", "wrong_hits": "wrong hits"},
@@ -72,8 +72,7 @@ def advice(measured: Sequence[Row], error: float | None, seconds: float | None) 
 
 def _in_python(row: Row) -> str:
     """The settings as they are written in Python, and what they cost."""
-    chosen, default = dataclasses.asdict(settings_of(row)), dataclasses.asdict(Settings())
-    changed = {name: value for name, value in chosen.items() if value != default[name]}
+    changed = {name: row[name] for name, value in dataclasses.asdict(Settings()).items() if row[name] != value}
     written = [f'{name}="{value}"' if isinstance(value, str) else f"{name}={value}" for name, value in changed.items()]
     options = f", tolerance={row['tolerance']}, levels {row['levels']}" if row["task"] == "fit" else ""
     costs = f"error {row['error']:.3g}, {row['seconds']:.3g} s, {row['peak_mb']:.0f} MiB"

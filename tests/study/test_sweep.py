@@ -1,4 +1,4 @@
-"""The sweep as it runs: what it keeps, how it fails, that it can be interrupted and gone on with; its small fits.
+"""The sweep as it runs: what it keeps, how it fails, that it can be interrupted and gone on with.
 
 One sweep is real. What surrounds it is tested with pretended processes: real ones take seconds to compile, each.
 """
@@ -30,6 +30,14 @@ def sweep(tmp_path) -> Sweep:
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "out").mkdir()
     return plan(tmp_path / "scene.toml", tmp_path / "out", knobs=("precision", "traversal"), devices=1)
+
+
+def command(sweep: Sweep, *options: str) -> list[str]:
+    return ["tradeoff", str(sweep.path), "-o", str(sweep.folder), "--devices", "1", "--knobs", *options]
+
+
+def run_quietly(sweep: Sweep, repeats: int = 1, tell=lambda line: None) -> list[str]:
+    return _sweeping.run(sweep, repeats, tell, lambda *_: None)
 
 
 # What is kept.
@@ -133,7 +141,7 @@ def test_a_terrain_too_large_for_derivatives_has_pictures_measured(tmp_path, swe
     monkeypatch.setattr(Pretended, "fatal", ("derivative", "pyramid", "reference"))
     sweep = plan(sweep.path, sweep.folder, knobs=("traversal", "edge_samples"))
     told = []
-    (failure,) = _sweeping.run(sweep, 1, told.append, lambda *_: None)
+    (failure,) = run_quietly(sweep, tell=told.append)
     assert failure == "derivative, the reference, and so all else of it: killed"
     assert [row["task"] for row in sweep.measured()] == ["picture", "picture"]
     assert {one["task"] for one in sweep.missing()} == {"derivative"}
@@ -143,20 +151,18 @@ def test_a_terrain_too_large_for_derivatives_has_pictures_measured(tmp_path, swe
 @pytest.mark.parametrize("question", ["ready", "frame", "errors"])
 def test_a_process_that_dies_is_listed(sweep, started, monkeypatch, capsys, question):
     monkeypatch.setattr(Pretended, "fatal", ("picture", "dda", question))
-    sweep = plan(sweep.path, sweep.folder, knobs=("precision", "traversal"))
-    arguments = ["tradeoff", str(sweep.path), "-o", str(sweep.folder), "--knobs", "precision", "traversal"]
-    assert main(arguments) == 2
+    assert main(command(sweep, "precision", "traversal")) == 2
     out, err = capsys.readouterr()
     assert "2 configurations: " in out
     assert err.splitlines()[1:] == ["failed: picture, traversal dda: killed", "jaxhf: error: 1 configuration failed"]
     assert [one["traversal"] for one in sweep.missing()] == ["dda"]
     monkeypatch.setattr(Pretended, "fatal", ("picture", "pyramid", question))
     with pytest.raises(MeasurementError, match="killed"):
-        _sweeping.run(dataclasses.replace(sweep, folder=sweep.folder / "another"), 1, print, lambda *_: None)
+        run_quietly(dataclasses.replace(sweep, folder=sweep.folder / "another"))
 
 
 def test_runs_are_taken_in_turn_with_those_of_the_base(sweep, started):
-    assert _sweeping.run(sweep, 5, lambda line: None, lambda *_: None) == []
+    assert run_quietly(sweep, 5) == []
     base, exact, dda = sweep.measured()
     assert (base["against_base"], exact["against_base"], dda["against_base"]) == (1, 1, 2)
     assert {name: dda[name] for name in FIGURES if name in dda} == {
@@ -167,8 +173,7 @@ def test_runs_are_taken_in_turn_with_those_of_the_base(sweep, started):
 
 def test_interrupted_it_goes_on_where_it_was(sweep, started, monkeypatch, capsys):
     """Ctrl-C after the first row; then the rest, with the first row as it was; then nothing but a recommendation."""
-    arguments = ["tradeoff", str(sweep.path), "-o", str(sweep.folder), "--knobs", "precision", "traversal", "--devices", "1"]
-    add = Sweep.add
+    arguments, add = command(sweep, "precision", "traversal"), Sweep.add
 
     def add_one(self, *row):
         add(self, *row)
@@ -204,7 +209,7 @@ def test_interrupted_it_goes_on_where_it_was(sweep, started, monkeypatch, capsys
 
 def test_progress_is_shown_on_a_terminal(sweep, started, monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert main(["tradeoff", str(sweep.path), "-o", str(sweep.folder), "--knobs", "traversal", "--devices", "1"]) == 0
+    assert main(command(sweep, "traversal")) == 0
     err = capsys.readouterr().err
     for text in ("0/2", "the base", "the picture's reference, in double precision", "1/2", "picture, traversal dda"):
         assert text in err
@@ -243,11 +248,8 @@ def test_short_runs_are_repeated(monkeypatch):
 
 @pytest.mark.deep  # each part of it is in the tests above
 def test_a_real_sweep(tmp_path, sweep):
-    command = [sys.executable, "-m", "jaxhf", "tradeoff", "scene.toml", "-o", "out", "--devices", "1", "--repeats", "3"]
-    done = subprocess.run(
-        [*command, "--knobs", "precision", "--markdown"], cwd=tmp_path,
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+    words = [sys.executable, "-m", "jaxhf", *command(sweep, "precision", "--repeats", "3", "--markdown")]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     (announced,) = done.stderr.splitlines()
     assert "2 of 2 configurations to measure" in announced
@@ -287,8 +289,8 @@ def test_two_sweeps_agree(tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE)
     found = []
     for folder in ("one", "two"):
-        command = [sys.executable, "-m", "jaxhf", "tradeoff", "scene.toml", "-o", folder, "--quick", "--width", "192"]
-        subprocess.run(command, cwd=tmp_path, check=True, timeout=3600)
+        words = [sys.executable, "-m", "jaxhf", "tradeoff", "scene.toml", "-o", folder, "--quick", "--width", "192"]
+        subprocess.run(words, cwd=tmp_path, check=True, timeout=3600)
         found.append(plan(tmp_path / "scene.toml", tmp_path / folder, quick=True, width=192).measured())
     for one, two in zip(*found, strict=True):
         for name in ("rmse", "p999", "wrong_hits", "cosine", "relative_error"):
