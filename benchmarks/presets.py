@@ -1,7 +1,7 @@
 """The plots that chose the presets: error over samples, over points on edges and over time on four scenes.
 
 Each scene is swept by the command `tradeoff` over these two knobs alone, the derivative over its points only, with four
-samples; what was measured before is not measured again.
+samples; what was measured before is not measured again. After a change of jaxhf's source another folder is needed.
 """
 
 from collections.abc import Sequence
@@ -10,19 +10,17 @@ from pathlib import Path
 import benchmark
 
 import jaxhf
-from jaxhf.study.plan import Configuration, Sweep, plan
+from jaxhf.study.plan import plan
 from jaxhf.study.sweep import run as run_sweep
+from jaxhf.study.table import FIGURES, Row
 
 SCENES = ("jacksboro", "landsea", "texture", "debug4x4")
 PRESETS = {"draft": jaxhf.Settings.draft(), "balanced": jaxhf.Settings.balanced(), "exact": jaxhf.Settings.exact()}
 
 
-def by_samples(measured: Sequence[Configuration]) -> dict[int, dict[str, float]]:
-    return dict(sorted((row.settings.samples or 0, row.figures) for row in measured))
-
-
-def by_points(measured: Sequence[Configuration]) -> dict[int, dict[str, float]]:
-    return dict(sorted((row.settings.edge_samples or 0, row.figures) for row in measured if row.task == "derivative"))
+def by_knob(knob: str, rows: Sequence[Row]) -> dict[int, dict[str, float]]:
+    """The figures of each row, by the value of a knob that is a number."""
+    return dict(sorted((row[knob] or 0, {name: row[name] for name in FIGURES if name in row}) for row in rows))
 
 
 def plot(
@@ -75,15 +73,16 @@ def main() -> None:
     scenes = Path(__file__).parents[1] / "scenes"
     found, derivatives = {}, {}
 
-    def swept(name: str, knob: str) -> list[Configuration]:
-        sweep: Sweep = plan(scenes / f"{name}.toml", options.output / name, width=options.width, knobs=(knob,))
+    def swept(name: str, knob: str) -> list[Row]:
+        sweep = plan(scenes / f"{name}.toml", options.output / name, width=options.width, knobs=(knob,))
         failures = run_sweep(sweep, options.repeats, lambda line: print(line, flush=True), lambda done, total, what: None)
         assert not failures, failures
         return sweep.measured()
 
     for name in options.scenes:
-        found[name] = by_samples(swept(name, "samples"))
-        derivatives[name] = by_points(swept(name, "edge_samples"))
+        found[name] = by_knob("samples", swept(name, "samples"))
+        points = [row for row in swept(name, "edge_samples") if row["task"] == "derivative"]
+        derivatives[name] = by_knob("edge_samples", points)
     plot(found, derivatives, options.output / "presets.png")
     for by, tables in (("samples", found), ("edge_samples", derivatives)):
         presets = {getattr(settings, by): preset for preset, settings in PRESETS.items()}

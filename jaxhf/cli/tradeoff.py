@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from . import arguments, interruption
 
 if TYPE_CHECKING:
-    from ..study.plan import Sweep
+    from ..study.table import Sweep
 
 
 def add(commands: Any) -> None:

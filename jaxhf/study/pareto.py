@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 from ..core.settings import Settings
-from .plan import KNOBS, Configuration, changes
+from .table import Row, changes, in_words
 
 _ERRORS = {
     "picture": {"rmse": "RMSE", "p999": "99.9 %", "wrong_hits": "wrong hits"},
@@ -19,28 +19,29 @@ _COSTS = {
 }  # fmt: skip
 
 
-def by_task(measured: Sequence[Configuration]) -> list[list[Configuration]]:
+def by_task(measured: Sequence[Row]) -> list[list[Row]]:
     """The rows of each task, its base first."""
-    return [list(rows) for _, rows in groupby(measured, lambda row: row.task)]
+    return [list(rows) for _, rows in groupby(measured, lambda row: row["task"])]
 
 
-def pareto_front(rows: Sequence[Configuration]) -> list[Configuration]:
+def pareto_front(rows: Sequence[Row]) -> list[Row]:
     """The configurations of a task that no other beats in both time and error, the cheapest first."""
-    best: list[Configuration] = []
-    for row in sorted(rows, key=lambda row: (row.seconds, row.error)):
-        if not best or row.error < best[-1].error:
+    best: list[Row] = []
+    for row in sorted(rows, key=lambda row: (row["seconds"], row["error"])):
+        if not best or row["error"] < best[-1]["error"]:
             best.append(row)
     return best
 
 
-def one_at_a_time(rows: Sequence[Configuration]) -> dict[str, list[tuple[str, Configuration]]]:
+def one_at_a_time(rows: Sequence[Row]) -> dict[str, list[tuple[str, Row]]]:
     """For each knob that was swept its values and what was measured there, all else as in the task's base."""
     base, *others = rows
-    found: dict[str, list[tuple[str, Configuration]]] = {}
+    found: dict[str, list[tuple[str, Row]]] = {}
     for row in others:
-        changed = [knob for knob in KNOBS if row.knobs[knob] != base.knobs[knob]]
+        changed = changes(row, base)
         if len(changed) == 1:
-            found.setdefault(changed[0], [(base.knobs[changed[0]], base)]).append((row.knobs[changed[0]], row))
+            ((knob, value),) = changed.items()
+            found.setdefault(knob, [(str(base[knob]), base)]).append((str(value), row))
     return {knob: sorted(values, key=lambda pair: (_number(pair[0]), pair[0])) for knob, values in found.items()}
 
 
@@ -52,44 +53,43 @@ def _number(value: str) -> float:
         return math.inf
 
 
-def advice(measured: Sequence[Configuration], error: float | None, seconds: float | None) -> list[str]:
+def advice(measured: Sequence[Row], error: float | None, seconds: float | None) -> list[str]:
     """Each task's Pareto front in words; with a bound only the cheapest within an error, or the most exact within a time."""
     bounds = ("error {:g}", error), ("{:g} s", seconds)
     asked = " and ".join(words.format(bound) for words, bound in bounds if bound is not None)
     lines = []
     for rows in by_task(measured):
-        best = pareto_front(rows)
+        best, task = pareto_front(rows), rows[0]["task"]
         if not asked:
-            lines += [f"{rows[0].task}, Pareto front, the cheapest first:", *(f"  {_in_words(row)}" for row in best)]
+            lines += [f"{task}, Pareto front, the cheapest first:", *(f"  {_in_python(row)}" for row in best)]
             continue
         best = best[::-1] if error else best  # the nearest first, the wanted last
-        within = [row for row in best if row.error <= (error or math.inf) and row.seconds <= (seconds or math.inf)]
+        within = [row for row in best if row["error"] <= (error or math.inf) and row["seconds"] <= (seconds or math.inf)]
         else_nearest = "" if within else "nothing that was measured keeps that; nearest is "
-        lines.append(f"{rows[0].task}, {asked}: {else_nearest}{_in_words(within[-1] if within else best[0])}")
+        lines.append(f"{task}, {asked}: {else_nearest}{_in_python(within[-1] if within else best[0])}")
     return lines
 
 
-def _in_words(row: Configuration) -> str:
+def _in_python(row: Row) -> str:
     """The settings as they are written in Python, and what they cost."""
-    chosen, default = dataclasses.asdict(row.settings), dataclasses.asdict(Settings())
-    changed = {name: value for name, value in chosen.items() if value != default[name]}
+    changed = {name: row[name] for name, value in dataclasses.asdict(Settings()).items() if row[name] != value}
     written = [f'{name}="{value}"' if isinstance(value, str) else f"{name}={value}" for name, value in changed.items()]
-    options = f", tolerance={row.knobs['tolerance']}, levels {row.knobs['levels']}" if row.task == "fit" else ""
-    costs = f"error {row.error:.3g}, {row.seconds:.3g} s, {row.figures['peak_mb']:.0f} MiB"
-    return f"Settings({', '.join(written)}), {row.precision}{options}: {costs}"
+    options = f", tolerance={row['tolerance']}, levels {row['levels']}" if row["task"] == "fit" else ""
+    costs = f"error {row['error']:.3g}, {row['seconds']:.3g} s, {row['peak_mb']:.0f} MiB"
+    return f"Settings({', '.join(written)}), {row['precision']}{options}: {costs}"
 
 
-def markdown(measured: Sequence[Configuration]) -> str:
+def markdown(measured: Sequence[Row]) -> str:
     """A table for each task: every configuration, the Pareto front in bold."""
     return "\n\n".join("\n".join(_table(rows)) for rows in by_task(measured))
 
 
-def _table(rows: Sequence[Configuration]) -> Iterator[str]:
-    task, best = rows[0].task, pareto_front(rows)
+def _table(rows: Sequence[Row]) -> Iterator[str]:
+    task, best = rows[0]["task"], pareto_front(rows)
     columns = {name: (head, ".4g") for name, head in _ERRORS[task].items()} | _COSTS
     yield "| " + " | ".join([task, *(head for head, _ in columns.values())]) + " |"
     yield "|" + "---|" * (1 + len(columns))
     for row in rows:
-        name = changes(row.knobs, rows[0].knobs)
-        figures = [f"{row.figures[column]:{form}}" for column, (_, form) in columns.items()]
+        name = in_words(row, rows[0])
+        figures = [f"{row[column]:{form}}" for column, (_, form) in columns.items()]
         yield "| " + " | ".join([f"**{name}**" if row in best else name, *figures]) + " |"

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..xla.machine import available_bytes
 from .measure import LEAST_SECONDS, prepare
-from .plan import Configuration, Sweep, changes
+from .table import Row, Sweep, in_words
 from .worker import MeasurementError, Worker
 
 _SWOLLEN = 3  # the peak of a derivative's process, of a picture's
@@ -41,14 +41,14 @@ def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Calla
         start = time.perf_counter() - begin
         frame = yardstick.ask("frame")["seconds"]
         together = max(1, int(min(sweep.devices, 4, available_bytes() / 2**20 / (_SWOLLEN * peak_mb))))
-        tasks = {one.task for one in missing}
-        lacking = [one for one in sweep.references if one.task in tasks and not sweep.reference(one.task).exists()]
+        tasks = {one["task"] for one in missing}
+        lacking = [one for one in sweep.references if one["task"] in tasks and not sweep.reference(one["task"]).exists()]
 
-        def forecast(one: Configuration, runs: int) -> float:
+        def forecast(one: Row, runs: int) -> float:
             """Seconds, rather too many than too few."""
-            share = (one.settings.samples or 1) / (base.settings.samples or 1) * (2 if one.precision == "float64" else 1)
-            own = max(frame * (share if one.task == "picture" else 1), LEAST_SECONDS)
-            return 1.2 * (_STARTS[one.task] * start / together + runs * (max(frame, LEAST_SECONDS) + own))
+            share = (one["samples"] or 1) / (base["samples"] or 1) * (2 if one["precision"] == "float64" else 1)
+            own = max(frame * (share if one["task"] == "picture" else 1), LEAST_SECONDS)
+            return 1.2 * (_STARTS[one["task"]] * start / together + runs * (max(frame, LEAST_SECONDS) + own))
 
         seconds = sum(forecast(one, repeats + 1) for one in missing) + sum(forecast(one, 2) for one in lacking)
         tell(
@@ -56,38 +56,37 @@ def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Calla
             f"{sweep.width} x {sweep.height} pixels; about {math.ceil(seconds / 60)} minutes"
         )
         for reference in lacking:
-            progress(0, len(missing), f"the {reference.task}'s reference, in double precision")
+            task = reference["task"]
+            progress(0, len(missing), f"the {task}'s reference, in double precision")
             try:
                 with Worker(prepare, (sweep, reference)) as worker:
                     worker.answer()
                     worker.ask("reference")
             except MeasurementError as error:
-                if reference.task == "picture":
+                if task == "picture":
                     raise
-                failures.append(f"{reference.task}, the reference, and so all else of it: {error}")
-                missing = [one for one in missing if one.task != reference.task]
+                failures.append(f"{task}, the reference, and so all else of it: {error}")
+                missing = [one for one in missing if one["task"] != task]
         for done in range(0, len(missing), together):
-            measured = {one: _measure(sweep, one, yardstick, repeats) for one in missing[done : done + together]}
-            names = {one: f"{one.task}, {changes(one.knobs, base.knobs)}" for one in measured}
-            progress(done, len(missing), "; ".join(names.values()))
-            while measured:
-                for one in list(measured):
+            batch = {f"{one['task']}, {in_words(one, base)}": one for one in missing[done : done + together]}
+            progress(done, len(missing), "; ".join(batch))
+            turns = {name: _measure(sweep, one, yardstick, repeats) for name, one in batch.items()}
+            while turns:
+                for name in list(turns):
                     try:
-                        next(measured[one])
+                        next(turns[name])
                         continue
                     except StopIteration as end:
-                        sweep.add(one, end.value)
+                        sweep.add(batch[name], end.value)
                     except MeasurementError as error:
-                        if one == base:
+                        if batch[name] == base:
                             raise
-                        failures.append(f"{names[one]}: {error}")
-                    del measured[one]
+                        failures.append(f"{name}: {error}")
+                    del turns[name]
     return failures
 
 
-def _measure(
-    sweep: Sweep, one: Configuration, yardstick: Worker, repeats: int
-) -> Generator[None, None, dict[str, float]]:  # fmt: skip
+def _measure(sweep: Sweep, one: Row, yardstick: Worker, repeats: int) -> Generator[None, None, dict[str, float]]:
     """Returns the figures of one configuration; yields where others take their turn."""
     with Worker(prepare, (sweep, one)) as worker:
         yield
@@ -95,7 +94,7 @@ def _measure(
         yield
         runs: list[dict[str, float]] = []
         for turn in range(repeats):
-            enough = one.task == "fit" or (turn >= 3 and sum(run["seconds"] for run in runs) >= 15)
+            enough = one["task"] == "fit" or (turn >= 3 and sum(run["seconds"] for run in runs) >= 15)
             if not turn or not enough:
                 runs.append({"base": yardstick.ask("frame")["seconds"], **worker.ask("frame")})
             yield

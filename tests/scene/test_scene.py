@@ -16,7 +16,6 @@ from compare import heightfield
 
 import jaxhf
 from jaxhf.scene.localise import localise
-from jaxhf.scene.views import from_above
 
 NAN, INF = np.nan, np.inf
 GRID = np.zeros((2, 3))
@@ -365,21 +364,6 @@ def test_normals_at_vertices_are_the_oracles(scheme):
         expected, _ = oracle.vertex_normals(z, 0.5, 2.0, scheme)
         np.testing.assert_allclose(units(found), units(expected), atol=1e-6)
         assert np.isfinite(z).sum() in (4, 88)
-
-
-@pytest.mark.parametrize("shape", [(4, 61), (61, 4), (9, 30)])
-@pytest.mark.parametrize("size", [(20, None), (None, 7), (12, 12)])
-def test_a_camera_above_sees_all_of_a_field(shape, size):
-    """Whatever the proportions and the rounding."""
-    camera = from_above(jaxhf.Heightfield(np.zeros(shape), 2.0, 3.0, 100.0, 50.0), *size)
-    assert all(wanted in (None, pixels) for wanted, pixels in zip(size, (camera.width, camera.height), strict=True))
-    pixels, middle = np.array([camera.width, camera.height]), np.array([2 * (shape[1] - 1), 3 * (shape[0] - 1)]) / 2
-    np.testing.assert_allclose(np.asarray(camera.world_from_camera)[:2, 3], np.add(middle, [100, 50]))
-    half = float(camera.extent) / 2 * pixels / pixels.min()
-    assert (half >= middle * (1 - 1e-12)).all()
-    assert np.isclose(half, middle).any()
-    if None in size:  # less than half a pixel on either side is beside it
-        assert (half - middle < half / pixels).all()
 
 
 def test_a_camera_takes_its_size_by_place():

@@ -10,7 +10,6 @@ import pytest
 import jaxhf
 from jaxhf.io.procedural import bumps, fractal, waves
 from jaxhf.study.measure import Derivative, Picture
-from jaxhf.study.plan import Configuration
 
 WIDTH, HEIGHT = 128, 96
 
@@ -44,7 +43,7 @@ def dunes(dtype: Any) -> jaxhf.Scene:
 @functools.cache
 def reference(scene: Any) -> dict[str, np.ndarray]:
     with jax.enable_x64(True):  # else a hit that single precision gets wrong is wrong in both
-        found = Picture(scene(np.float64), Configuration("picture", settings=jaxhf.Settings(samples=256)))
+        found = Picture(scene(np.float64), jaxhf.Settings(samples=256))
         reference = found.reference()
         assert found.image.dtype == np.float64
         return reference
@@ -57,7 +56,7 @@ def reference(scene: Any) -> dict[str, np.ndarray]:
     "scene", [pytest.param(mountains, marks=pytest.mark.slow), pytest.param(hills, marks=pytest.mark.slow), dunes]
 )
 def test_promise(scene, preset):
-    picture = Picture(scene(np.float32), Configuration("picture", settings=getattr(jaxhf.Settings, preset)()))
+    picture = Picture(scene(np.float32), getattr(jaxhf.Settings, preset)())
     assert picture.run().dtype == np.float32
     errors = picture.errors(reference(scene))
     assert 0 < errors["rmse"] <= PROMISES[preset][0]
@@ -68,11 +67,11 @@ def test_promise(scene, preset):
 @pytest.mark.x64  # of the reference
 @pytest.mark.slow
 def test_derivatives_come_nearer_from_preset_to_preset():
-    finest = Configuration("derivative", settings=jaxhf.Settings(samples=64, edge_samples=300_000))
+    finest = jaxhf.Settings(samples=64, edge_samples=300_000)
     exact = Derivative(mountains(np.float64), finest).reference()
     errors = []
     for preset in PROMISES:
-        derivative = Derivative(mountains(np.float32), Configuration("derivative", settings=getattr(jaxhf.Settings, preset)()))
+        derivative = Derivative(mountains(np.float32), getattr(jaxhf.Settings, preset)())
         errors.append(derivative.errors(exact)["relative_error"])
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.5

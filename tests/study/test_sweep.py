@@ -1,4 +1,4 @@
-"""The sweep as it runs: what it keeps, how it fails, that it can be interrupted and gone on with; its small fits.
+"""The sweep as it runs: what it keeps, how it fails, that it can be interrupted and gone on with.
 
 One sweep is real. What surrounds it is tested with pretended processes: real ones take seconds to compile, each.
 """
@@ -16,11 +16,11 @@ import pytest
 import served
 from test_tradeoff import SCENE
 
-import jaxhf
 from jaxhf.cli.main import main
 from jaxhf.study import sweep as _sweeping
-from jaxhf.study.measure import Derivative, prepare, thinned
-from jaxhf.study.plan import COLUMNS, Configuration, Sweep, plan, read_rows
+from jaxhf.study.measure import Derivative
+from jaxhf.study.plan import plan
+from jaxhf.study.table import COLUMNS, FIGURES, Row, Sweep, read_rows
 from jaxhf.study.worker import MeasurementError, Worker, timed
 
 
@@ -30,6 +30,14 @@ def sweep(tmp_path) -> Sweep:
     (tmp_path / "scene.toml").write_text(SCENE)
     (tmp_path / "out").mkdir()
     return plan(tmp_path / "scene.toml", tmp_path / "out", knobs=("precision", "traversal"), devices=1)
+
+
+def command(sweep: Sweep, *options: str) -> list[str]:
+    return ["tradeoff", str(sweep.path), "-o", str(sweep.folder), "--devices", "1", "--knobs", *options]
+
+
+def run_quietly(sweep: Sweep, repeats: int = 1, tell=lambda line: None) -> list[str]:
+    return _sweeping.run(sweep, repeats, tell, lambda *_: None)
 
 
 # What is kept.
@@ -47,7 +55,7 @@ def test_rows_appear_whole(sweep, monkeypatch):
     assert sweep.table.read_text() == text
     assert list(sweep.folder.iterdir()) == [sweep.table]
     assert text.splitlines()[0] == ",".join(COLUMNS)
-    assert [row.seconds for row in sweep.measured()] == [3.0, 5.0]  # ratios, in units of the base's own
+    assert [row["seconds"] for row in sweep.measured()] == [3.0, 5.0]  # ratios, in units of the base's own
     assert sweep.missing() == [sweep.configurations[2]]
     sweep.table.write_text(text.replace(sweep.identity, "another"))
     assert sweep.measured() == []
@@ -96,7 +104,7 @@ def test_a_worker_says_why_it_died(question, said):
 class Pretended(Worker):
     """Stands for a process that measures; notes who was started, and dies where `fatal` says so."""
 
-    started: list[Configuration]
+    started: list[Row]
     fatal: tuple[str, str, str]
 
     def __init__(self, prepare, job):
@@ -107,11 +115,11 @@ class Pretended(Worker):
         self.question = question
 
     def answer(self):
-        if (self.one.task, self.one.settings.traversal, self.question) == self.fatal:
+        if (self.one["task"], self.one["traversal"], self.question) == self.fatal:
             raise MeasurementError("killed")
         if self.question == "reference":
-            np.savez(self.sweep.reference(self.one.task), picture=np.zeros(1))
-        frame = {"seconds": 2.0 if self.one.settings.traversal == "dda" else 1.0, "cpu_seconds": 1.0}
+            np.savez(self.sweep.reference(self.one["task"]), picture=np.zeros(1))
+        frame = {"seconds": 2.0 if self.one["traversal"] == "dda" else 1.0, "cpu_seconds": 1.0}
         return {
             "ready": {"peak_mb": 100.0, "first_seconds": 3.0}, "frame": frame, "reference": {},
             "errors": {"rmse": 0.1, "p999": 0.1, "wrong_hits": 0.0},
@@ -122,7 +130,7 @@ class Pretended(Worker):
 
 
 @pytest.fixture
-def started(monkeypatch) -> list[Configuration]:
+def started(monkeypatch) -> list[Row]:
     monkeypatch.setattr(Pretended, "started", [], raising=False)
     monkeypatch.setattr(Pretended, "fatal", (), raising=False)
     monkeypatch.setattr(_sweeping, "Worker", Pretended)
@@ -133,33 +141,31 @@ def test_a_terrain_too_large_for_derivatives_has_pictures_measured(tmp_path, swe
     monkeypatch.setattr(Pretended, "fatal", ("derivative", "pyramid", "reference"))
     sweep = plan(sweep.path, sweep.folder, knobs=("traversal", "edge_samples"))
     told = []
-    (failure,) = _sweeping.run(sweep, 1, told.append, lambda *_: None)
+    (failure,) = run_quietly(sweep, tell=told.append)
     assert failure == "derivative, the reference, and so all else of it: killed"
-    assert [row.task for row in sweep.measured()] == ["picture", "picture"]
-    assert {one.task for one in sweep.missing()} == {"derivative"}
+    assert [row["task"] for row in sweep.measured()] == ["picture", "picture"]
+    assert {one["task"] for one in sweep.missing()} == {"derivative"}
     assert len(told) == 1
 
 
 @pytest.mark.parametrize("question", ["ready", "frame", "errors"])
 def test_a_process_that_dies_is_listed(sweep, started, monkeypatch, capsys, question):
     monkeypatch.setattr(Pretended, "fatal", ("picture", "dda", question))
-    sweep = plan(sweep.path, sweep.folder, knobs=("precision", "traversal"))
-    arguments = ["tradeoff", str(sweep.path), "-o", str(sweep.folder), "--knobs", "precision", "traversal"]
-    assert main(arguments) == 2
+    assert main(command(sweep, "precision", "traversal")) == 2
     out, err = capsys.readouterr()
     assert "2 configurations: " in out
     assert err.splitlines()[1:] == ["failed: picture, traversal dda: killed", "jaxhf: error: 1 configuration failed"]
-    assert [one.settings.traversal for one in sweep.missing()] == ["dda"]
+    assert [one["traversal"] for one in sweep.missing()] == ["dda"]
     monkeypatch.setattr(Pretended, "fatal", ("picture", "pyramid", question))
     with pytest.raises(MeasurementError, match="killed"):
-        _sweeping.run(dataclasses.replace(sweep, folder=sweep.folder / "another"), 1, print, lambda *_: None)
+        run_quietly(dataclasses.replace(sweep, folder=sweep.folder / "another"))
 
 
 def test_runs_are_taken_in_turn_with_those_of_the_base(sweep, started):
-    assert _sweeping.run(sweep, 5, lambda line: None, lambda *_: None) == []
+    assert run_quietly(sweep, 5) == []
     base, exact, dda = sweep.measured()
-    assert (base.figures["against_base"], exact.figures["against_base"], dda.figures["against_base"]) == (1, 1, 2)
-    assert dda.figures == {
+    assert (base["against_base"], exact["against_base"], dda["against_base"]) == (1, 1, 2)
+    assert {name: dda[name] for name in FIGURES if name in dda} == {
         "seconds": 2, "fastest": 2, "cpu_seconds": 1, "against_base": 2, "compile_seconds": 1, "peak_mb": 100,
         "rmse": 0.1, "p999": 0.1, "wrong_hits": 0,
     }  # fmt: skip
@@ -167,8 +173,7 @@ def test_runs_are_taken_in_turn_with_those_of_the_base(sweep, started):
 
 def test_interrupted_it_goes_on_where_it_was(sweep, started, monkeypatch, capsys):
     """Ctrl-C after the first row; then the rest, with the first row as it was; then nothing but a recommendation."""
-    arguments = ["tradeoff", str(sweep.path), "-o", str(sweep.folder), "--knobs", "precision", "traversal", "--devices", "1"]
-    add = Sweep.add
+    arguments, add = command(sweep, "precision", "traversal"), Sweep.add
 
     def add_one(self, *row):
         add(self, *row)
@@ -204,7 +209,7 @@ def test_interrupted_it_goes_on_where_it_was(sweep, started, monkeypatch, capsys
 
 def test_progress_is_shown_on_a_terminal(sweep, started, monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
-    assert main(["tradeoff", str(sweep.path), "-o", str(sweep.folder), "--knobs", "traversal", "--devices", "1"]) == 0
+    assert main(command(sweep, "traversal")) == 0
     err = capsys.readouterr().err
     for text in ("0/2", "the base", "the picture's reference, in double precision", "1/2", "picture, traversal dda"):
         assert text in err
@@ -230,20 +235,6 @@ def test_a_gradient_of_zero_points_nowhere(monkeypatch):
     assert errors == {"cosine": 0.0, "relative_error": 1.0, "spread": 0.0}
 
 
-@pytest.mark.deep
-def test_small_fits_are_measured_on_any_shape(sweep):
-    """The side that is short already stays as it is; there need be no reference."""
-    heights = np.random.default_rng(0).uniform(0, 0.1, (3, 40)).astype(np.float32)
-    thin = thinned(jaxhf.Heightfield(heights, dx=0.1, dy=0.5), 32)
-    np.testing.assert_array_equal(thin.heights, heights[:, ::2])
-    assert (thin.dx, thin.dy) == (0.2, 0.5)
-    sweep.path.write_text(SCENE[: SCENE.index("heights = ")] + f"heights = {heights.tolist()}\ndx = 0.1\ndy = 0.5\n")
-    settings = jaxhf.Settings(samples=1, shadows=False, chunk=256)
-    with Worker(prepare, (sweep, Configuration("fit", settings=settings, tolerance=1e-2, levels=(1.0,)))) as worker:
-        worker.answer()
-        assert 0 < worker.ask("errors")["rmse"] < 0.1
-
-
 def test_short_runs_are_repeated(monkeypatch):
     """By a clock of which a run takes three seconds, and one of the processors on which it takes five."""
     runs = []
@@ -257,11 +248,8 @@ def test_short_runs_are_repeated(monkeypatch):
 
 @pytest.mark.deep  # each part of it is in the tests above
 def test_a_real_sweep(tmp_path, sweep):
-    command = [sys.executable, "-m", "jaxhf", "tradeoff", "scene.toml", "-o", "out", "--devices", "1", "--repeats", "3"]
-    done = subprocess.run(
-        [*command, "--knobs", "precision", "--markdown"], cwd=tmp_path,
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+    words = [sys.executable, "-m", "jaxhf", *command(sweep, "precision", "--repeats", "3", "--markdown")]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     (announced,) = done.stderr.splitlines()
     assert "2 of 2 configurations to measure" in announced
@@ -301,13 +289,13 @@ def test_two_sweeps_agree(tmp_path):
     (tmp_path / "scene.toml").write_text(SCENE)
     found = []
     for folder in ("one", "two"):
-        command = [sys.executable, "-m", "jaxhf", "tradeoff", "scene.toml", "-o", folder, "--quick", "--width", "192"]
-        subprocess.run(command, cwd=tmp_path, check=True, timeout=3600)
+        words = [sys.executable, "-m", "jaxhf", "tradeoff", "scene.toml", "-o", folder, "--quick", "--width", "192"]
+        subprocess.run(words, cwd=tmp_path, check=True, timeout=3600)
         found.append(plan(tmp_path / "scene.toml", tmp_path / folder, quick=True, width=192).measured())
     for one, two in zip(*found, strict=True):
         for name in ("rmse", "p999", "wrong_hits", "cosine", "relative_error"):
-            assert one.figures.get(name) == two.figures.get(name), (one.knobs, name)
-    times = [np.array([row.figures["against_base"] for row in rows if row.task == "picture"]) for rows in found]
+            assert one.get(name) == two.get(name), (one, name)
+    times = [np.array([row["against_base"] for row in rows if row["task"] == "picture"]) for rows in found]
     apart = times[0][:, None] > 1.2 * times[0]
     assert apart.sum() > 20
     assert (times[1][:, None] > times[1])[apart].all()

@@ -1,37 +1,57 @@
-"""`jaxhf tradeoff --fit --time`: what its table and its advice say of small fits, against a fit that is made here."""
+"""Small fits: their camera and terrain, and what `jaxhf tradeoff --fit --time` says of one, against a fit that is made here."""
 
 import csv
 import time
 
 import numpy as np
 import pytest
+from test_tradeoff import SCENE
 
 import jaxhf
 from jaxhf.cli.main import main
-from jaxhf.scene.views import from_above
-from jaxhf.study import plan as planning
-
-pytestmark = pytest.mark.deep  # processes that compile fits; `study` has what is done with their figures
+from jaxhf.study import plan as _plan
+from jaxhf.study.measure import prepare
+from jaxhf.study.plan import plan
+from jaxhf.study.recovery import from_above, thinned
+from jaxhf.study.worker import Worker
 
 TRUTH = np.array([[0, 0.1, 0.3, 0], [0.2, 0, 0.1, 0.1], [0.1, 0.3, 0, 0.2]])
-SCENE = f"""samples = 1
-lights = [{{ type = "directional" }}]
-objects = [{{ shape = "heightfield", heights = {TRUTH.tolist()} }}]
-[camera]
-type = "orthographic"
-eye = [0.5, 0.2, 5]
-target = [0.5, 0.5, 0]
-up = [0, 1, 0]
-extent = 1.2
-width = 24
-height = 16
-"""
+
+
+@pytest.mark.parametrize("shape", [(4, 61), (61, 4), (9, 30)])
+@pytest.mark.parametrize("most", [20, 7, 12])
+def test_a_camera_above_sees_all_of_a_field(shape, most):
+    """Whatever the proportions and the rounding."""
+    camera = from_above(jaxhf.Heightfield(np.zeros(shape), 2.0, 3.0, 100.0, 50.0), most)
+    pixels, middle = np.array([camera.width, camera.height]), np.array([2 * (shape[1] - 1), 3 * (shape[0] - 1)]) / 2
+    assert pixels[np.argmax(middle)] == most
+    np.testing.assert_allclose(np.asarray(camera.world_from_camera)[:2, 3], np.add(middle, [100, 50]))
+    half = float(camera.extent) / 2 * pixels / pixels.min()
+    assert (half >= middle * (1 - 1e-12)).all()
+    assert np.isclose(half, middle).any()
+    assert (half - middle < half / pixels).all()  # less than half a pixel on either side is beside it
+
+
+@pytest.mark.deep
+def test_small_fits_are_measured_on_any_shape(tmp_path):
+    """The side that is short already stays as it is; there need be no reference."""
+    heights = np.random.default_rng(0).uniform(0, 0.1, (3, 40)).astype(np.float32)
+    thin = thinned(jaxhf.Heightfield(heights, dx=0.1, dy=0.5), 32)
+    np.testing.assert_array_equal(thin.heights, heights[:, ::2])
+    assert (thin.dx, thin.dy) == (0.2, 0.5)
+    path = tmp_path / "scene.toml"
+    path.write_text(SCENE[: SCENE.index("heights = ")] + f"heights = {heights.tolist()}\ndx = 0.1\ndy = 0.5\n")
+    sweep = plan(path, tmp_path, knobs=("levels",), devices=1)
+    cheap = {"samples": 1, "shadows": False, "chunk": 256, "tolerance": 1e-2, "levels": "1.0"}
+    with Worker(prepare, (sweep, sweep.configurations[1] | cheap)) as worker:
+        worker.answer()
+        assert 0 < worker.ask("errors")["rmse"] < 0.1
 
 
 def recovered(truth: np.ndarray) -> np.ndarray:
     """The heights that the guide describes: from straight above, in three suns, from a prior of the smoothest modes."""
     field = jaxhf.Heightfield(truth)
-    camera = from_above(field, 64, None)
+    camera = from_above(field, 64)
     suns = [jaxhf.Directional.from_angles(azimuth, 45.0) for azimuth in (30.0, 150.0, 270.0)]
     scenes = [jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(0.6))], camera, [sun]) for sun in suns]
     targets = [np.asarray(jaxhf.render(scene, jaxhf.Settings(samples=16))) for scene in scenes]
@@ -44,9 +64,10 @@ def recovered(truth: np.ndarray) -> np.ndarray:
     return np.asarray(found.heights)
 
 
+@pytest.mark.deep  # processes that compile fits
 def test_a_fit_within_a_time(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(planning._VALUES, "fit", {})  # none but the base
+    monkeypatch.setitem(_plan._VALUES, "fit", {})  # none but the base
     (tmp_path / "scene.toml").write_text(SCENE)
     command = ["tradeoff", "scene.toml", "-o", "out", "--knobs", "tolerance", "--fit", "--devices", "1", "--repeats", "1"]
     begin = time.perf_counter()
