@@ -48,7 +48,7 @@ def traced(settings: jaxhf.Settings, transform: Callable[..., Any]) -> list[Any]
 @pytest.mark.parametrize(
     ("settings", "transform", "bound"),
     [
-        (jaxhf.Settings(), lambda loss: loss, 4250),
+        (jaxhf.Settings(), lambda loss: loss, 3950),
         (jaxhf.Settings(samples=4), jax.value_and_grad, 5250),
         (jaxhf.Settings(samples=4, edge_samples=1000), jax.value_and_grad, 15800),
     ],
