@@ -17,7 +17,7 @@ from jaxhf.io.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.procedural import grid
 from jaxhf.io.toml import tables
 from jaxhf.io.toml.fit import load_case
-from jaxhf.io.toml.lines import line_numbers
+from jaxhf.io.toml.lines import line_of
 from jaxhf.io.toml.values import STEPS
 
 SCENES = sorted((Path(__file__).parents[2] / "scenes").glob("*.toml"))
@@ -358,13 +358,14 @@ x.y = 1
 [objects.inner]
 z = 2
 '''
-    found, block = line_numbers(text), ("a", "b.c", "d")
+    block = ("a", "b.c", "d")
     top = {("samples",): 2, ("text",): 3, ("long",): 4, block: 7, (*block, "list"): 8, (*block, "after"): 11}
     first, second = ("objects", 0), ("objects", 1)
     expected = top | {first: 12, (*first, "x", "y"): 13, second: 14, (*second, "inner"): 15, (*second, "inner", "z"): 16}
-    assert {where: found.get(where) for where in expected} == expected
-    assert ("camera",) not in found
-    assert max(found.values()) == 16
+    assert {where: line_of(text, where) for where in expected} == expected
+    assert line_of(text, ("camera",)) is None
+    assert line_of(text, (*block, "none")) == 7
+    assert line_of(text, (*second, "inner", "y", 3)) == 15
 
 
 PAGE = (Path(__file__).parents[2] / "docs" / "guides" / "scene-files.md").read_text(encoding="utf-8")

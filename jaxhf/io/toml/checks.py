@@ -1,21 +1,21 @@
 """Checks on the tables of a TOML scene; each of them ends with the line on which things went wrong."""
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...core.errors import ArgumentError, UserError
 from ..errors import SceneError, nearest
-from .lines import Where
+from .lines import Where, line_of
 from .tables import Keys
 
 
 class Part(NamedTuple):
-    """A table of the file `path`, and where in it the table stands."""
+    """A table of the file `path`, which holds `text`, and where in it the table stands."""
 
     path: Path
-    lines: Mapping[Where, int]
+    text: str
     where: Where
     table: dict[str, Any]
 
@@ -29,9 +29,8 @@ class Part(NamedTuple):
         return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in self.where).lstrip(".")
 
     def error(self, message: str) -> SceneError:
-        """An error on the line of this part, or of the nearest one around it whose line is known."""
-        around = (self.where[:k] for k in range(len(self.where), 0, -1))
-        return SceneError(self.path, next((self.lines[where] for where in around if where in self.lines), None), message)
+        """An error on the line of this part, or of the nearest one around it."""
+        return SceneError(self.path, line_of(self.text, self.where), message)
 
     def read(self, keys: Keys) -> dict[str, Any]:
         """The values of all `keys`, by their kinds; SceneError on any other key, and on one that is missing."""

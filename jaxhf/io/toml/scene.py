@@ -28,7 +28,6 @@ from ..images import TRANSFERS, load_image
 from ..load_terrain import jacksboro_file, read_terrain
 from ..terrain import Terrain
 from .checks import Part
-from .lines import line_numbers
 from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, OBJECT, ORIGINS, SCENE, TEXTURES, Key, Keys
 from .values import word
 
@@ -63,7 +62,7 @@ def open_toml(path: Path) -> Part:
         raise SceneError(path, int(at[1]) if at else len(text.splitlines()), f"this is not TOML: {message}") from error
     except (UnicodeDecodeError, RecursionError) as error:
         raise SceneError(path, None, f"this is not TOML: {error}") from error
-    return Part(path, line_numbers(text), (), content)
+    return Part(path, text, (), content)
 
 
 def read_scene(part: Part) -> dict[str, Any]:
