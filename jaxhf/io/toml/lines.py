@@ -34,7 +34,8 @@ def line_of(text: str, where: Where) -> int | None:
 def _depth(content: Any, where: Where) -> int:
     """How many steps of the way there are."""
     for depth, step in enumerate(where):
-        if not (step in content if isinstance(content, dict) else isinstance(content, list) and step in range(len(content))):
+        try:
+            content = content[step]
+        except (KeyError, IndexError, TypeError):
             return depth
-        content = content[step]
     return len(where)
