@@ -5,11 +5,11 @@ length and against `MAX_PIXELS` before anything is decoded.
 """
 
 import contextlib
-import errno
 import re
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,19 +19,17 @@ from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from ..core.errors import ArgumentError
-from ..core.extras import import_extra
+from . import files
 from .errors import FileError
+from .exr import channels_of, read_channels, read_exr, write_channels
 from .files import (
     PathLike,
     by_ending,
-    file_path,
     read_npy,
     reading,
     replacing,
     require_file,
-    require_folder,
     require_pixels,
-    utf8_name,
     write_npy,
 )
 from .gdal import opened
@@ -122,12 +120,15 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         raise FileError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
     if aovs and path.suffix.lower() != ".exr":
         raise ArgumentError("save_image", "aovs", f"are layers of an .exr, {path} is none")
-    layers = _layers(aovs or {}, pixels.shape[:2])
+    ending, layers = path.suffix.lower(), _layers(aovs or {}, pixels.shape[:2])
+    if ending in _OF_BYTES:
+        shares = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
+        pixels = (TRANSFERS[transfer][0](shares) * 255 + 0.5).astype(np.uint8)
     with replacing(path) as temporary:
         if layers:
-            write_exr(temporary, _planes(pixels) | layers)
+            write_channels(temporary, channels_of(pixels) | layers)
         else:
-            _WRITERS[path.suffix.lower()](temporary, pixels, TRANSFERS[transfer][0])
+            _WRITERS[ending](temporary, pixels)
 
 
 def _layers(aovs: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
@@ -142,23 +143,6 @@ def _layers(aovs: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, np.nda
         for c in range(values.shape[2]):
             found[f"{name}.{letters[c] if len(letters) == values.shape[2] else c}"] = values[:, :, c]
     return found
-
-
-def require_writable(path: PathLike) -> Path:
-    """Checks that `save_image` can write to `path`, so that nobody renders for an hour first.
-
-    Raises:
-      ValueError: the ending is not known, a package for it is missing, or `path` is a folder.
-      FileNotFoundError: the folder does not exist.
-      PermissionError: the folder cannot be written to.
-    """
-    path = file_path("save_image", path)
-    by_ending(_WRITERS, path, "write an image with")
-    require_folder(path, "an image")
-    if path.suffix.lower() == ".exr":
-        with reading(path):
-            import_extra("OpenEXR", "writing .exr needs", "exr")
-    return path
 
 
 def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
@@ -189,7 +173,7 @@ def read_grey(path: Path) -> np.ndarray:
     """What a picture of one channel stores, .png, .exr or .pfm: shape (h, w), in the numbers of the file."""
     ending = path.suffix.lower()
     if ending == ".exr":
-        channels = _exr_channels(path)
+        channels = read_channels(path)
         if len(channels) > 1:
             raise FileError(f"heights must be one channel, it has {', '.join(channels)}")
         return next(iter(channels.values()))
@@ -232,35 +216,6 @@ def _any_size() -> Iterator[None]:
             yield
         finally:
             Image.MAX_IMAGE_PIXELS = limit
-
-
-def _exr_channels(path: Path) -> dict[str, np.ndarray]:
-    """The channels of an .exr by their names, float32."""
-    exr = import_extra("OpenEXR", "reading .exr needs", "exr")
-    try:
-        with utf8_name(path) as name:
-            with exr.File(name, separate_channels=True, header_only=True) as file:
-                (x0, y0), (x1, y1) = file.header()["dataWindow"]
-            require_pixels(int(y1) - int(y0) + 1, int(x1) - int(x0) + 1)
-            with exr.File(name, separate_channels=True) as file:
-                return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except RuntimeError as error:
-        raise FileError("it is not an OpenEXR file, or damaged") from error
-    except ValueError as error:
-        if "part index" not in str(error):
-            raise
-        raise FileError("it is cut off or damaged: pixels are missing") from error
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    channels = _exr_channels(path)
-    names = next((names for names in ("RGB", "Y") if set(names) <= set(channels)), None)
-    if names is None:
-        raise FileError(f"its channels must be R, G, B or Y, they are {', '.join(channels)}")
-    shapes = {channels[name].shape for name in names}
-    if len(shapes) > 1:
-        raise FileError(f"its channels must have one size, they have {sorted(shapes)}")
-    return np.stack([channels[name] for name in names], axis=-1) if len(names) == 3 else channels[names]
 
 
 def _read_pfm(path: Path) -> np.ndarray:
@@ -310,23 +265,14 @@ def _read_tiff(path: Path) -> np.ma.MaskedArray:
 
 _MOST_OF_JPEG = 65500  # of libjpeg
 
-# One writer a format; the last argument maps linear values in 0..1 to those that a .png or .jpg holds.
+# One writer a format: a path, and pixels as the file holds them, bytes or floats of shape (h, w, 3) or (h, w).
 
 
-def _write_png(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> None:
-    write_png(path, _in_bytes(pixels, encode))
-
-
-def _write_jpeg(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> None:
+def _write_jpeg(path: Path, pixels: np.ndarray) -> None:
     if max(pixels.shape[:2]) > _MOST_OF_JPEG:
         raise FileError(f"a JPEG has at most {_MOST_OF_JPEG} pixels a side, this has {pixels.shape[1]} x {pixels.shape[0]}")
     with path.open("wb") as file:
-        imageio.imwrite(file, _in_bytes(pixels, encode), plugin="pillow", extension=".jpg", quality=95, subsampling=0)
-
-
-def _in_bytes(pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> UInt8[np.ndarray, "..."]:
-    clipped = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
-    return (encode(clipped) * 255 + 0.5).astype(np.uint8)
+        imageio.imwrite(file, pixels, plugin="pillow", extension=".jpg", quality=95, subsampling=0)
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
@@ -335,60 +281,33 @@ def write_png(path: Path, pixels: np.ndarray) -> None:
         imageio.imwrite(file, np.ascontiguousarray(pixels), plugin="pillow", extension=".png")
 
 
-def _write_exr(path: Path, pixels: np.ndarray, _: Any) -> None:
-    write_exr(path, _planes(pixels))
-
-
-def _planes(pixels: np.ndarray) -> dict[str, np.ndarray]:
-    return {"Y": pixels} if pixels.ndim == 2 else {name: pixels[:, :, c] for c, name in enumerate("RGB")}
-
-
-def write_exr(path: Path, planes: Mapping[str, np.ndarray]) -> None:
-    """Channels of shape (h, w) by their names, top row first, in float32.
-
-    Raises:
-      OSError: what is found in the file is something else: OpenEXR does not say when a disk is full.
-    """
-    exr = import_extra("OpenEXR", "writing .exr needs", "exr")
-    channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
-    options, found = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {}
-    with contextlib.suppress(FileError, OSError, RuntimeError):
-        with utf8_name(path) as name, exr.File(options, dict(channels)) as file:
-            file.write(name)
-        found = _exr_channels(path)
-    if not all(name in found and np.array_equal(found[name], plane, equal_nan=True) for name, plane in channels.items()):
-        raise OSError(errno.ENOSPC, "OpenEXR left it incomplete, the disk is probably full")
-
-
-def _write_pfm(path: Path, pixels: np.ndarray, _: Any) -> None:
+def _write_pfm(path: Path, pixels: np.ndarray) -> None:
     h, w = pixels.shape[:2]
     header = f"{'PF' if pixels.ndim == 3 else 'Pf'}\n{w} {h}\n-1.0\n"
     path.write_bytes(header.encode() + pixels[::-1].astype("<f4").tobytes())
-
-
-def _write_npy(path: Path, pixels: np.ndarray, _: Any) -> None:
-    write_npy(path, pixels)
 
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".png": read_png,
     ".jpg": _read_jpeg,
     ".jpeg": _read_jpeg,
-    ".exr": _read_exr,
+    ".exr": read_exr,
     ".pfm": _read_pfm,
     ".npy": _read_npy,
     ".tif": _read_tiff,
     ".tiff": _read_tiff,
 }
-_WRITERS: dict[str, Callable[[Path, np.ndarray, Callable[[np.ndarray], np.ndarray]], None]] = {
-    ".png": _write_png,
+_WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
+    ".png": write_png,
     ".jpg": _write_jpeg,
     ".jpeg": _write_jpeg,
-    ".exr": _write_exr,
+    ".exr": lambda path, pixels: write_channels(path, channels_of(pixels)),
     ".pfm": _write_pfm,
-    ".npy": _write_npy,
+    ".npy": write_npy,
 }
+_OF_BYTES = (".png", ".jpg", ".jpeg")
 PICTURES = tuple(_WRITERS)  # the endings of what `save_image` writes
+require_writable = partial(files.require_writable, "save_image", "an image", PICTURES)
 # How values in 0..1 are encoded in whole numbers, and decoded.
 TRANSFERS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]] = {
     "srgb": (srgb_from_linear, linear_from_srgb),
