@@ -79,6 +79,13 @@ class Part(NamedTuple):
             raise self.at(*present[1:2]).error(f"{self.name} must have exactly one of {', '.join(names)}; {has}")
         return present[0]
 
+    def at_most_one(self, first: str, second: str) -> str | None:
+        """Which of two keys the table has; None: neither."""
+        present = [name for name in (first, second) if name in self.table]
+        if len(present) > 1:
+            raise self.at(second).error(f"{self.name} must have {first} or {second}, it has both")
+        return present[0] if present else None
+
     def made(self, function: Callable[..., Any], *args: Any, **values: Any) -> Any:
         """function(*args, **values); what the user got wrong becomes a SceneError, on the line of the key that is to blame."""
         try:

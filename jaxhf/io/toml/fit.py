@@ -24,7 +24,7 @@ from ..terrain import Terrain
 from .checks import Part
 from .priors import Sought, known_deviations, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene, transfer_of
-from .tables import SCENE, Key, Keys
+from .tables import SCENE, Key, Keys, optional
 from .values import flag, number, number_list, numbers, or_word, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
@@ -39,29 +39,23 @@ _CASE: Keys = {
 }
 _PICTURE: Keys = {
     "image": Key(word),
-    "transfer": Key(word, None),
-    "mask": Key(word, None),
-    "weights": Key(word, None),
-    "noise": Key(number, None),
-    "camera": Key(table, None),
-    "lights": Key(tables, None),
+    **optional("transfer", "mask", "weights", kind=word),
+    **optional("noise", kind=number),
+    **optional("camera", kind=table),
+    **optional("lights", kind=tables),
 }
 _ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argument of `fit` is in such a table
 # Those of `fit` and of `Settings`, whose defaults they have and who check their values.
 _FIT: Keys = {
-    "noise": Key(number, None),
-    **{name: Key(or_word(number), None) for name in ("start", "prior", "prior_std")},
-    **{
-        name: Key(number, None)
-        for name in ("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", "loss_scale", "tolerance")
-    },
-    **{name: Key(word, None) for name in ("albedo", "loss", "solver")},
-    **{name: Key(flag, None) for name in ("exposures", "offsets")},
-    "light_std": Key(number, None),
-    "camera_std": Key(numbers(2), None),
-    **{name: Key(whole, None) for name in ("max_steps", "inner_steps", "checkpoint_every")},
-    "levels": Key(number_list, None),
-    "uncertainty": Key(or_word(whole), None),
+    **optional("start", "prior", "prior_std", kind=or_word(number)),
+    **optional("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", kind=number),
+    **optional("noise", "light_std", "loss_scale", "tolerance", kind=number),
+    **optional("albedo", "loss", "solver", kind=word),
+    **optional("exposures", "offsets", kind=flag),
+    **optional("camera_std", kind=numbers(2)),
+    **optional("max_steps", "inner_steps", "checkpoint_every", kind=whole),
+    **optional("levels", kind=number_list),
+    **optional("uncertainty", kind=or_word(whole)),
 }
 _WHOLE_OR_FLAG = {int: whole, int | None: whole, bool: flag}
 _SETTINGS: Keys = {
@@ -229,19 +223,17 @@ def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any
 
 
 def _weights(picture: Part, given: dict[str, Any], target: np.ndarray) -> Float32[np.ndarray, "h w"] | None:
-    present = [name for name in ("mask", "weights") if given[name] is not None]
+    present = picture.at_most_one("mask", "weights")
     size = target.shape[:2]
     declares = Path(given["image"]).suffix.lower() in (".tif", ".tiff")  # a nan elsewhere is for `fit` to refuse
     there = ~np.isnan(target[..., 0]) if declares else np.ones(size, bool)
-    if not present:
+    if present is None:
         return None if there.all() else there.astype(np.float32)
-    if len(present) > 1:
-        raise picture.at("weights").error(f"{picture.name} must have mask or weights, it has both")
-    weights = _read(picture, present[0], load_numbers, given[present[0]]).mean(axis=-1)
+    weights = _read(picture, present, load_numbers, given[present]).mean(axis=-1)
     if weights.shape != size:
-        place = picture.at(present[0])
+        place = picture.at(present)
         raise place.error(f"{place.name} must have the size of the image, {_by(size)}; it is {_by(weights.shape)}")
-    weights = (weights > 0).astype(np.float32) if present[0] == "mask" else weights
+    weights = (weights > 0).astype(np.float32) if present == "mask" else weights
     return np.where(there, weights, np.zeros_like(weights))
 
 

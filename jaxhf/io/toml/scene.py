@@ -147,13 +147,11 @@ def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> t
 
 
 def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
-    given = [name for name in ("transform", "matrix") if values[name] is not None]
-    if not given:
+    given = part.at_most_one("transform", "matrix")
+    if given is None:
         return None
-    if len(given) > 1:
-        raise part.at("matrix").error(f"{part.name} must have transform or matrix, it has both")
-    part.made(require_invertible, "", given[0], values[given[0]])
-    return values[given[0]]
+    part.made(require_invertible, "", given, values[given])
+    return values[given]
 
 
 def _painted(part: Part, value: Any, textures: dict[str, ImageTexture]) -> Any:

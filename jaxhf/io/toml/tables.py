@@ -24,6 +24,11 @@ class Key(NamedTuple):
 Keys = Mapping[str, Key]
 
 
+def optional(*names: str, kind: kinds.Kind | None = None) -> Keys:
+    """Keys that may be missing, of one kind or, where that is None, of those that their names say."""
+    return {name: Key(kind or _KINDS[name], None) for name in names}
+
+
 def _directional(irradiance, radiance=None, kind: type[Directional] = Directional, **given) -> Directional:
     if irradiance is not None and radiance is not None:
         raise ArgumentError("", "radiance", "must stand without irradiance, whose old name it is")
@@ -73,10 +78,6 @@ def _keys(function: Callable[..., Any], **defaults: Any) -> Keys:
     return {name: Key(_KINDS[name], default) for name, default in {**own, **defaults}.items()}
 
 
-def _optional(*names: str) -> Keys:
-    return {name: Key(_KINDS[name], None) for name in names}
-
-
 SCENE: Keys = {
     "samples": Key(kinds.whole, 1),
     "camera": Key(kinds.table),
@@ -89,10 +90,10 @@ CAMERAS: dict[str, tuple[Callable[..., Camera], Keys]] = {
     "orthographic": (Orthographic.look_at, _keys(Orthographic.look_at, extent=...)),
     "pinhole": (Perspective.from_intrinsics, _keys(Perspective.from_intrinsics)),
 }
-_DIRECTION = _optional("towards", "azimuth", "altitude", "time", "latitude", "longitude", "irradiance")
+_DIRECTION = optional("towards", "azimuth", "altitude", "time", "latitude", "longitude", "irradiance")
 LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
-    "directional": (_directional, {**_DIRECTION, **_optional("radiance")}),  # the old name of irradiance
-    "sun": (functools.partial(_directional, kind=Sun), {**_DIRECTION, **_optional("angular_diameter", "chords")}),
+    "directional": (_directional, {**_DIRECTION, **optional("radiance")}),  # the old name of irradiance
+    "sun": (functools.partial(_directional, kind=Sun), {**_DIRECTION, **optional("angular_diameter", "chords")}),
     "point": (_point, _keys(_point)),
     "sky": (Sky, _keys(Sky)),
 }
@@ -107,10 +108,10 @@ HEIGHTS: dict[str, Keys] = {
 }
 ORIGINS: dict[str, Keys] = {  # where a heightfield comes from
     "heights": {"heights": Key(kinds.grid)},
-    "file": {"file": Key(kinds.word), "nodata": Key(kinds.number, None)},
+    "file": {"file": Key(kinds.word), **optional("nodata", kind=kinds.number)},
     "source": {"source": Key(kinds.word)},
 }
-GRID: Keys = {**{name: Key(kinds.number, None) for name in ("dx", "dy", "x0", "y0")}, "z_scale": Key(kinds.number, 1.0)}
+GRID: Keys = {**optional("dx", "dy", "x0", "y0", kind=kinds.number), "z_scale": Key(kinds.number, 1.0)}
 CYLINDER = _keys(Cylinder)
 OBJECT: Keys = {
     "shape": Key(kinds.word),
