@@ -16,13 +16,13 @@ from numpy.typing import DTypeLike
 from ...core.affine import require_invertible
 from ...core.errors import ArgumentError
 from ...core.precision import fitted
+from ...scene import procedural
 from ...scene.camera import Camera
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
 from ...scene.light import Directional, Light
 from ...scene.scene import Object, Scene
 from ...scene.texture import ImageTexture, Wrap
-from .. import procedural
 from ..errors import SceneError, nearest, resolve_inside
 from ..images import TRANSFERS, load_image
 from ..load_terrain import jacksboro_file, read_terrain

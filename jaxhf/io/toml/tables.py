@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from ...core.errors import ArgumentError
+from ...scene import procedural
 from ...scene.camera import Camera, Orthographic, Perspective
 from ...scene.cylinder import Cylinder
 from ...scene.light import Directional, Light, Point, Sky, Sun
 from ...scene.material import Material, Matte, Mirror
-from .. import procedural
 from . import values as kinds
 
 
