@@ -57,7 +57,7 @@ scene: scene/procedural.py -> scene/test_procedural.py
 io: io/pbrt/*.py -> io/test_pbrt.py
 io: io/toml/*.py io/scenes.py -> io/test_toml.py io/test_fit_case.py
 io: io/meshes.py -> io/test_meshes.py
-io: io/g*.py -> io/test_grids.py io/test_written_digits.py io/test_terrain.py io/test_rasters.py
+io: io/g*.py -> io/test_grids.py io/test_terrain.py io/test_rasters.py
 io: io/l*.py io/r*.py io/s*n.py io/sidecars.py io/terrain.py -> io/test_terrain.py io/test_grids.py io/test_rasters.py
 boundary: boundary/*.py -> boundary
 fitting: fitting/[lj]*.py -> fitting/test_linearise.py fitting/test_fit_stops.py
