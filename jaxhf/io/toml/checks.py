@@ -19,9 +19,16 @@ class Part(NamedTuple):
     where: Where
     table: dict[str, Any]
 
-    def at(self, *steps: str | int, table: dict[str, Any] | None = None) -> "Part":
-        """What stands in this table under `steps`."""
-        return self._replace(where=(*self.where, *steps), table={} if table is None else table)
+    def at(self, *steps: str | int) -> "Part":
+        """What stands in this table under `steps`; what is missing there, or is no table, is an empty one."""
+        inner: Any = self.table
+        for step in steps:
+            inner = inner.get(step) if isinstance(inner, dict) else inner[step]
+        return self._replace(where=(*self.where, *steps), table=inner if isinstance(inner, dict) else {})
+
+    def all(self, name: str) -> list["Part"]:
+        """The tables in the list `name`; none where it is missing."""
+        return [self.at(name, k) for k in range(len(self.table.get(name, ())))]
 
     @property
     def name(self) -> str:

@@ -131,12 +131,12 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         part.require_known(_CASE)
         raise part.error("a fit must have 'pictures', those that were measured; this is a scene, for `jaxhf render`")
     values = part.read(_CASE)
-    settings = _given(part.at("settings", table=values["settings"]), _SETTINGS)
-    settings = part.at("settings", table=values["settings"]).made(Settings, **settings)
+    chosen = part.at("settings")
+    settings = chosen.made(Settings, **_given(chosen, _SETTINGS))
     base = _base(part, values, dtype)
     if not values["pictures"]:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
-    chosen = part.at("fit", table=values["fit"])
+    chosen = part.at("fit")
     options = _given(chosen, _FIT)
     noise = options.pop("noise", None)
     for name in ("start", "prior", "prior_std"):
@@ -144,12 +144,11 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
             known = known_deviations if name == "prior_std" else known_heights
             options[name] = _read(chosen, name, partial(known, base.sought), options[name])
     scenes, targets, weights, noises, names = [], [], [], [], []
-    for k, picture_table in enumerate(values["pictures"]):
-        picture = part.at("pictures", k, table=picture_table)
+    for picture in part.all("pictures"):
         given = picture.read(_PICTURE)
         target = _read(picture, "image", partial(load_image, transfer=transfer_of(picture)), given["image"])
-        lights = base.lights if given["lights"] is None else read_lights(picture, given["lights"], base.sought.stored)
-        camera = _camera(picture, given["camera"], base, target.shape[:2])
+        lights = base.lights if given["lights"] is None else read_lights(picture, base.sought.stored)
+        camera = _camera(picture, base, target.shape[:2])
         scenes.append(picture.made(Scene, base.objects, camera, lights, base.samples))
         targets.append(target)
         weights.append(_weights(picture, given, target))
@@ -176,7 +175,7 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     if values["scene"] is None:
         if values["objects"] is None:
             raise part.error("a fit must have 'scene', the name of a scene file, or 'objects', both are missing")
-        return _toml_base(part, values, dtype)
+        return _toml_base(part, values["samples"], dtype)
     for name in SCENE:
         if name in part.table:
             raise part.at(name).error(f"{name} must stand without scene, whose file has its own")
@@ -184,18 +183,18 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     path = place.made(named_file, part, values["scene"])
     if place.made(by_ending, {".toml": True, ".pbrt": False}, path, "read a scene from"):
         other = open_toml(path)
-        return _toml_base(other, read_scene(other), dtype)
+        return _toml_base(other, read_scene(other)["samples"], dtype)
     scene = load_pbrt(path, dtype)
     sought = _sought(part, [{}] * len(scene.objects), [(item, None) for item in scene.objects])
     return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, sought)
 
 
-def _toml_base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
-    objects = read_objects(part, values, dtype)
-    camera = None if values["camera"] is None else partial(_sized, part.at("camera", table=values["camera"]))
-    sought = _sought(part, values["objects"], objects)
-    lights = read_lights(part, values["lights"], sought.stored)
-    return _Base(tuple(item for item, _ in objects), tuple(lights), values["samples"], camera, sought)
+def _toml_base(part: Part, samples: int, dtype: np.dtype) -> _Base:
+    objects = read_objects(part, dtype)
+    camera = partial(_sized, part.at("camera")) if "camera" in part.table else None
+    sought = _sought(part, part.table["objects"], objects)
+    lights = read_lights(part, sought.stored)
+    return _Base(tuple(item for item, _ in objects), tuple(lights), samples, camera, sought)
 
 
 def _sought(part: Part, tables: Sequence[dict[str, Any]], objects: Sequence[tuple[Object, Terrain | None]]) -> Sought:
@@ -237,9 +236,9 @@ def _weights(picture: Part, given: dict[str, Any], target: np.ndarray) -> Float3
     return np.where(there, weights, np.zeros_like(weights))
 
 
-def _camera(picture: Part, view: dict[str, Any] | None, base: _Base, size: tuple[int, ...]) -> Camera:
-    if view is not None:
-        camera = _sized(picture.at("camera", table=view), size)
+def _camera(picture: Part, base: _Base, size: tuple[int, ...]) -> Camera:
+    if "camera" in picture.table:
+        camera = _sized(picture.at("camera"), size)
     elif base.camera is not None:
         camera = base.camera(size)
     else:

@@ -44,9 +44,9 @@ def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
     """
     part = open_toml(path)
     values = read_scene(part)
-    camera = read_camera(part.at("camera", table=values["camera"]))
-    objects = read_objects(part, values, np.dtype(dtype))
-    lights = read_lights(part, values["lights"], next((stored for _, stored in objects if stored is not None), None))
+    camera = read_camera(part.at("camera"))
+    objects = read_objects(part, np.dtype(dtype))
+    lights = read_lights(part, next((stored for _, stored in objects if stored is not None), None))
     return part.made(Scene, [item for item, _ in objects], camera, lights, samples=values["samples"])
 
 
@@ -77,9 +77,9 @@ def read_camera(part: Part) -> Camera:
     return _variant(part, "type", CAMERAS)
 
 
-def read_lights(part: Part, tables: list[dict[str, Any]], terrain: Terrain | None) -> list[Light]:
+def read_lights(part: Part, terrain: Terrain | None) -> list[Light]:
     """The lights in the list `lights` of `part`; those by date alone stand where they do over the terrain."""
-    return [_light(part.at("lights", k, table=table), terrain) for k, table in enumerate(tables)]
+    return [_light(light, terrain) for light in part.all("lights")]
 
 
 def _light(part: Part, terrain: Terrain | None) -> Light:
@@ -97,10 +97,10 @@ def _light(part: Part, terrain: Terrain | None) -> Light:
     return light
 
 
-def read_objects(part: Part, values: dict[str, Any], dtype: np.dtype) -> list[tuple[Object, Terrain | None]]:
+def read_objects(part: Part, dtype: np.dtype) -> list[tuple[Object, Terrain | None]]:
     """The objects of a scene with its textures; beside those from a terrain file, this file in its own coordinates."""
-    textures = {name: _texture(part.at("textures", name, table=table)) for name, table in values["textures"].items()}
-    return [_object(part.at("objects", k, table=table), textures, dtype) for k, table in enumerate(values["objects"])]
+    textures = {name: _texture(part.at("textures", name)) for name in part.table.get("textures", {})}
+    return [_object(item, textures, dtype) for item in part.all("objects")]
 
 
 def _variant(part: Part, key: str, variants: Any) -> Any:
