@@ -14,7 +14,7 @@ from ..core.extras import import_extra
 from .errors import FileError
 from .files import PathLike, replacing, require_writable, write_npy
 from .gdal import opened
-from .georeference import CoordinateSystem, Georeference, coordinate_system
+from .georeference import Georeference, coordinate_system
 from .images import write_png
 from .sidecars import beside
 from .terrain import Terrain, heights_of
@@ -61,7 +61,7 @@ def _placed(heights: np.ndarray, dataset: Any, nodata: float | None) -> Terrain:
     heights = heights[:: 1 if e > 0 else -1, :: 1 if a > 0 else -1]
     x0, y0 = c + (0.5 if a > 0 else nx - 0.5) * a, f + (0.5 if e > 0 else ny - 0.5) * e
     point = dataset.tags().get("AREA_OR_POINT") == "Point"
-    crs = coordinate_system(wkt) if wkt else CoordinateSystem()
+    crs = coordinate_system(wkt)
     return Terrain(heights, abs(a), abs(e), x0, y0, crs, Georeference(wkt, nodata=nodata, point=point))
 
 
