@@ -35,18 +35,13 @@ Shape "heightfield" "integer nu" [] "integer nv" [] "float Pz" [...]
 Shape "cylinder" "float radius" 1 "float zmin" -1 "float zmax" 1 "float phimax" 360
 """
 KINDS = kinds(_DEFAULTS)
-_AT_LEAST_1: Rule = (lambda count: count >= 1, "be at least 1")
-_AT_LEAST_2: Rule = (lambda count: count >= 2, "be at least 2")
-_HALF: Rule = (lambda width: width == 0.5, "be 0.5")
+_LEAST_ONE: Rule = (lambda count: count >= 1, "be at least 1")
+_LEAST_TWO: Rule = (lambda count: count >= 2, "be at least 2")
 RULES: Mapping[str, Rule] = {
-    "integer xresolution": _AT_LEAST_1,
-    "integer yresolution": _AT_LEAST_1,
-    "integer pixelsamples": _AT_LEAST_1,
-    "integer xsamples": _AT_LEAST_1,
-    "integer nu": _AT_LEAST_2,
-    "integer nv": _AT_LEAST_2,
-    "float xwidth": _HALF,
-    "float ywidth": _HALF,
+    **dict.fromkeys(("integer xresolution", "integer yresolution"), _LEAST_ONE),
+    **dict.fromkeys(("integer pixelsamples", "integer xsamples"), _LEAST_ONE),
+    **dict.fromkeys(("integer nu", "integer nv"), _LEAST_TWO),
+    **dict.fromkeys(("float xwidth", "float ywidth"), (lambda width: width == 0.5, "be 0.5")),
     "integer maxdepth": (lambda depth: depth == 5, "be 5"),
     "float fov": (lambda fov: 0 < fov < 180, "lie between 0 and 180 degrees"),
     "float sigma": (lambda sigma: sigma == 0, "be 0 (rough surfaces are not supported)"),

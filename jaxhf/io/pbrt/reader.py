@@ -27,15 +27,9 @@ from .tokens import Token, located
 
 
 def load_pbrt(path: str | Path, dtype: DTypeLike = np.float32) -> Scene:
-    """The scene that a .pbrt file describes.
+    """The scene that a .pbrt file describes; arguments and errors as those of `load_scene`.
 
-    Args:
-      path: the file. What it includes, and its images, must lie in its folder or below; a name is relative to the file
-        in which it stands.
-      dtype: of the heights. Transforms, lights and the camera are float64.
-
-    Raises:
-      SceneError: anything in the file that is not understood, or not possible, with its file and line.
+    What it includes, and its images, must lie in its folder or below; a name is relative to the file in which it stands.
     """
     path = Path(path)
     reader = _Reader(root=path.parent.resolve(), dtype=np.dtype(dtype))

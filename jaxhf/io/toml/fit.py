@@ -113,17 +113,7 @@ class _Base(NamedTuple):
 
 
 def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
-    """Reads a .toml file with pictures, and the files that it names.
-
-    Args:
-      path: the file; those that it names lie in its folder or below.
-      dtype: of the heights, and thereby the precision of the fit: float32, or float64, which needs JAX's x64 mode.
-
-    Raises:
-      FileNotFoundError: `path` is not there.
-      ValueError: its ending or `dtype` is another, or x64 mode is off for float64.
-      SceneError: something is wrong in the file; the message gives its line.
-    """
+    """Reads a .toml file with pictures, and the files that it names; arguments and errors as those of `load_scene`."""
     dtype, path = require_precision(dtype), require_file(path)
     by_ending({".toml": None}, path, "read what to fit from")
     part = open_toml(path)

@@ -33,15 +33,7 @@ from .values import word
 
 
 def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
-    """Reads a scene.
-
-    Args:
-      path: a .toml file; the files that it names lie in its folder or below.
-      dtype: of the heights, and thereby the precision of the picture.
-
-    Raises:
-      SceneError: anything is wrong in it; with its line.
-    """
+    """The scene that a .toml file describes; arguments and errors as those of `load_scene`."""
     part = open_toml(path)
     values = read_scene(part)
     camera = read_camera(part.at("camera"))
