@@ -52,7 +52,8 @@ maps: maps/shadows.py -> maps/test_shadows.py
 maps: maps/skyview.py maps/windows.py -> maps/test_skyview.py
 mujoco: mujoco/[hprs]*[dreys].py -> mujoco/test_sensors.py mujoco/test_ray.py --optimised
 mujoco: mujoco/scan.py -> mujoco/test_scan.py mujoco/test_scan_beneath.py --optimised
-io: io/images.py io/exr.py io/files.py io/films.py io/png.py -> io/test_images.py io/test_files.py io/test_full_disk.py
+io: io/images.py io/codecs.py io/exr.py io/png.py -> io/test_images.py io/test_full_disk.py
+io: io/files.py io/films.py -> io/test_images.py io/test_files.py io/test_full_disk.py
 scene: scene/procedural.py -> scene/test_procedural.py
 io: io/pbrt/*.py -> io/test_pbrt.py
 io: io/toml/*.py io/scenes.py -> io/test_toml.py io/test_fit_case.py

@@ -11,11 +11,11 @@ import numpy as np
 
 from ..core.errors import ArgumentError
 from ..core.extras import import_extra
+from .codecs import write_png
 from .errors import FileError
 from .files import PathLike, replacing, require_writable, write_npy
 from .gdal import opened
 from .georeference import Georeference, coordinate_system
-from .images import write_png
 from .sidecars import beside
 from .terrain import Terrain, heights_of
 

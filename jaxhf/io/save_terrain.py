@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .codecs import write_png
 from .errors import FileError
 from .exr import write_channels
 from .files import PathLike, reading, replacing, require_file, require_writable, write_npy
 from .grids import write_asc
-from .images import write_png
 from .rasters import georeference_of, geotiff
 from .sidecars import beside
 from .terrain import Terrain
