@@ -313,3 +313,8 @@ def test_what_fit_refuses_is_named_with_its_line(folder, text, message):
     with pytest.raises(jaxhf.ArgumentError, match=r"^fit: ") as refused:
         jaxhf.fit(given.scenes, given.targets, weights=given.weights, noise=given.noise, **given.options)
     assert str(given.located(refused.value)).startswith(f"{folder}/case.toml{message}")
+
+
+def test_what_fit_refuses_though_no_file_says_it(folder):
+    error = case(folder, WHOLE).located(jaxhf.ArgumentError("fit", "max_steps", "must be more"))
+    assert str(error) == f"{folder}/case.toml: fit.max_steps must be more"

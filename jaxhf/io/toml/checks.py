@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from ...core.errors import ArgumentError, UserError
 from ..errors import SceneError, nearest
-from .lines import Where, line_of
+from .lines import Where, follow, line_of
 from .tables import Keys
 
 
@@ -21,10 +21,9 @@ class Part(NamedTuple):
 
     def at(self, *steps: str | int) -> "Part":
         """What stands in this table under `steps`; what is missing there, or is no table, is an empty one."""
-        inner: Any = self.table
-        for step in steps:
-            inner = inner.get(step) if isinstance(inner, dict) else inner[step]
-        return self._replace(where=(*self.where, *steps), table=inner if isinstance(inner, dict) else {})
+        depth, inner = follow(self.table, steps)
+        is_table = depth == len(steps) and isinstance(inner, dict)
+        return self._replace(where=(*self.where, *steps), table=inner if is_table else {})
 
     def all(self, name: str) -> list["Part"]:
         """The tables in the list `name`; none where it is missing."""

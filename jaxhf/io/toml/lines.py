@@ -20,7 +20,7 @@ def line_of(text: str, where: Where) -> int | None:
         if line.rstrip().endswith(",") and "#" not in line:  # the row of an array, of which there may be many
             continue
         try:
-            depth = _depth(tomllib.loads("\n".join(lines[:end])), where)
+            depth, _ = follow(tomllib.loads("\n".join(lines[:end])), where)
         except tomllib.TOMLDecodeError:  # inside a value of several lines
             continue
         if depth > deepest:
@@ -31,11 +31,11 @@ def line_of(text: str, where: Where) -> int | None:
     return found
 
 
-def _depth(content: Any, where: Where) -> int:
-    """How many steps of the way there are."""
+def follow(content: Any, where: Where) -> tuple[int, Any]:
+    """How many steps of the way there are, and what stands behind them."""
     for depth, step in enumerate(where):
         try:
             content = content[step]
         except (KeyError, IndexError, TypeError):
-            return depth
-    return len(where)
+            return depth, content
+    return len(where), content
