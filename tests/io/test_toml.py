@@ -229,6 +229,7 @@ MISTAKES = [
     ("x = " + "[" * 5000, None, "this is not TOML"),
     # Keys.
     (f"sampels = 4\n{CAMERA}{FIELD}", 1, "unknown key 'sampels'; did you mean 'samples'?"),
+    (f"samples = 1\ntexture.uv = {{ size = [2, 2] }}\n{CAMERA}{FIELD}", 2, "unknown key 'texture'; did you mean 'textures'?"),
     (f"{CAMERA}extent = 3\n{FIELD}", 6, "unknown key 'extent' in camera"),
     (surface("albdeo = 1"), 10, "unknown key 'albdeo' in objects[0]; did you mean 'albedo'?"),
     (field("hieghts = [[0, 0], [0, 0]]"), 8, "unknown key 'hieghts' in objects[0]; did you mean 'heights'?"),

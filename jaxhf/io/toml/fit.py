@@ -133,28 +133,29 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         if isinstance(options.get(name), str):
             known = known_deviations if name == "prior_std" else known_heights
             options[name] = _read(chosen, name, partial(known, base.sought), options[name])
-    scenes, targets, weights, noises, names = [], [], [], [], []
-    for picture in part.all("pictures"):
-        given = picture.read(_PICTURE)
-        target = _read(picture, "image", partial(load_image, transfer=transfer_of(picture)), given["image"])
-        lights = base.lights if given["lights"] is None else read_lights(picture, base.sought.stored)
-        camera = _camera(picture, base, target.shape[:2])
-        scenes.append(picture.made(Scene, base.objects, camera, lights, base.samples))
-        targets.append(target)
-        weights.append(_weights(picture, given, target))
-        noises.append(noise if given["noise"] is None else given["noise"])
-        names.append(given["image"])
-        if noises[-1] is not None and not noises[-1] > 0:
-            place = (chosen if given["noise"] is None else picture).at("noise")
-            raise place.error(f"{place.name} must be positive, it is {noises[-1]:g}")
+    pictures = [_picture(picture, base, chosen, noise) for picture in part.all("pictures")]
+    scenes, targets, weights, noises, names = zip(*pictures, strict=True)
     known = [value for value in noises if value is not None]
     if known and len(known) < len(noises):
         place = part.at("pictures", noises.index(None))
         raise place.error(f"{place.name} must have a noise, as another picture has one; or none, then it is estimated")
-    return Case(
-        tuple(scenes), tuple(targets), tuple(weights), tuple(known) or None, settings, options, tuple(names),
-        base.sought.like, part,
-    )  # fmt: skip
+    return Case(scenes, targets, weights, tuple(known) or None, settings, options, names, base.sought.like, part)
+
+
+def _picture(
+    part: Part, base: _Base, chosen: Part, noise: float | None
+) -> tuple[Scene, np.ndarray, np.ndarray | None, float | None, str]:
+    """A picture's scene, radiance, weights, noise and name; `noise` is that of the table `chosen`, for all pictures."""
+    given = part.read(_PICTURE)
+    target = _read(part, "image", partial(load_image, transfer=transfer_of(part)), given["image"])
+    lights = base.lights if given["lights"] is None else read_lights(part, base.sought.stored)
+    scene = part.made(Scene, base.objects, _camera(part, base, target.shape[:2]), lights, base.samples)
+    weights = _weights(part, given, target)
+    place, noise = (chosen, noise) if given["noise"] is None else (part, given["noise"])
+    if noise is not None and not noise > 0:
+        place = place.at("noise")
+        raise place.error(f"{place.name} must be positive, it is {noise:g}")
+    return scene, target, weights, noise, given["image"]
 
 
 def _given(part: Part, keys: Keys) -> dict[str, Any]:
