@@ -16,7 +16,7 @@ from benchmark import SOURCES, have
 from peers import common_work, mitsuba_picture
 
 import jaxhf
-from jaxhf.io.procedural import bumps, fractal
+from jaxhf.scene.procedural import bumps, fractal
 
 LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6), (-0.3, -0.5, 0.6))
 SAMPLES = 1024  # a pixel, of Mitsuba's pictures

@@ -66,7 +66,7 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
     import jax.numpy as jnp
 
     import jaxhf
-    from jaxhf.io.procedural import fractal
+    from jaxhf.scene.procedural import fractal
 
     heights = fractal([size, size], seed=3, exponent=2.4, range=(0.0, 0.15)).astype(np.float32)
     if name in ("linearise", "step"):

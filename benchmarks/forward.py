@@ -23,9 +23,9 @@ from peers import embree_frame, mitsuba_scene, need_fast_mitsuba, povray_seconds
 
 import jaxhf
 from jaxhf.core.vector import dot, unit
-from jaxhf.io.procedural import fractal
 from jaxhf.rendering.tiles import Tiling
 from jaxhf.scene.localise import localise
+from jaxhf.scene.procedural import fractal
 from jaxhf.trace.ceiling import clears
 from jaxhf.trace.world import first_hit, make_world, resolve_settings
 

@@ -7,7 +7,7 @@ import numpy as np
 from cases import Case, Definition, Sources, by_mitsuba, smoothed, suns, viewed
 
 import jaxhf
-from jaxhf.io.procedural import bumps, fractal
+from jaxhf.scene.procedural import bumps, fractal
 
 SAMPLES = 256  # a pixel
 

@@ -27,7 +27,7 @@ from held_out import held_out
 import jaxhf
 from jaxhf.core.affine import rotate
 from jaxhf.fitting.view import differences
-from jaxhf.io.procedural import fractal
+from jaxhf.scene.procedural import fractal
 
 FEWER = 1.5  # times less than the table's ratio is what a case may reach
 APART = (10, 6)  # percent by which the shares within one and two deviations may differ from the table's

@@ -21,7 +21,7 @@ from peers import View
 from scalar import Arrays, matte, mesh, mitsuba, picture, texture, traced
 
 import jaxhf
-from jaxhf.io.procedural import bumps, fractal, grid, waves
+from jaxhf.scene.procedural import bumps, fractal, grid, waves
 
 FOLDER = Path(__file__).parents[1] / "tests" / "references"
 

@@ -24,8 +24,8 @@ from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 
 import jaxhf
 from jaxhf.cli.main import main
-from jaxhf.io.procedural import fractal
 from jaxhf.io.toml.fit import load_case
+from jaxhf.scene.procedural import fractal
 from jaxhf.xla.machine import available_bytes
 
 ROOT = Path(__file__).parents[1]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from ..core.errors import ArgumentError, require_kind
+from ..core.extras import import_extra
 from .errors import FileError, nearest
 
 MAX_PIXELS = 2**28  # 16384 x 16384, for images and for grids of heights
@@ -170,12 +171,42 @@ def _synchronise_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def require_writable_text(path: PathLike, ending: str) -> Path:
-    """Checks that `save_text` can write to `path`, and that it has this ending; errors as those of `require_folder`."""
-    path = file_path("save_text", path)
-    by_ending({ending: None}, path, "write a page with")
-    require_folder(path, "a page")
+_NEEDS = {  # the package that writes a format, and the extra that installs it
+    ".exr": ("OpenEXR", "exr"),
+    ".mp4": ("av", "video"),
+    **dict.fromkeys((".tif", ".tiff"), ("rasterio", "geo")),
+    **dict.fromkeys((".glb", ".obj", ".ply"), ("trimesh", "mesh")),
+}
+
+
+def require_writable(owner: str, what: str, endings: Iterable[str], path: PathLike) -> Path:
+    """Checks that a file can be written, so that nobody renders or fits for an hour first.
+
+    Args:
+      owner: the function that writes it, as errors say it.
+      what: it will hold, "an image".
+      endings: those that hold this.
+      path: the file.
+
+    Raises:
+      FileError: another ending, a package for it that is missing, or `path` is a folder.
+      FileNotFoundError: the folder does not exist.
+      PermissionError: the folder cannot be written to.
+    """
+    path = file_path(owner, path)
+    by_ending(dict.fromkeys(endings), path, f"write {what} with")
+    require_folder(path, what)
+    ending = path.suffix.lower()
+    if ending in _NEEDS:
+        with reading(path):
+            package, extra = _NEEDS[ending]
+            import_extra(package, f"writing {ending} needs", extra)
     return path
+
+
+def require_writable_text(path: PathLike, ending: str) -> Path:
+    """As `require_writable`, for `save_text` and one ending."""
+    return require_writable("save_text", "a page", (ending,), path)
 
 
 def save_text(path: PathLike, text: str) -> None:

@@ -2,36 +2,19 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import UInt8
 
-from ..core.extras import import_extra
-from .files import PathLike, by_ending, file_path, reading, replacing, require_folder
+from .files import PathLike, replacing, require_writable
 
 Add = Callable[[UInt8[np.ndarray, "h w 3"]], None]
 
 FILMS = (".gif", ".mp4")
-
-
-def require_writable_film(path: PathLike) -> Path:
-    """Checks that `writing_film` can write to `path`.
-
-    Raises:
-      ValueError: the ending is neither .gif nor .mp4, PyAV is missing for the latter, or `path` is a folder.
-      FileNotFoundError: the folder does not exist.
-      PermissionError: the folder cannot be written to.
-    """
-    path = file_path("writing_film", path)
-    by_ending(dict.fromkeys(FILMS), path, "write a film with")
-    require_folder(path, "a film")
-    if path.suffix.lower() == ".mp4":
-        with reading(path):
-            import_extra("av", "writing .mp4 needs", "video")
-    return path
+require_writable_film = partial(require_writable, "writing_film", "a film", FILMS)
 
 
 @contextlib.contextmanager

@@ -1,41 +1,22 @@
 """Image files to linear radiance and back.
 
-In memory every image is linear, shape (h, w, 3), top row first. Sizes that a file declares are checked against its
-length and against `MAX_PIXELS` before anything is decoded.
+In memory every image is linear, shape (h, w, 3), top row first.
 """
 
-import contextlib
-import errno
-import re
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
-import imageio.v3 as imageio
 import numpy as np
-from jaxtyping import Float32, UInt8
-from PIL import Image
+from jaxtyping import Float32
 
 from ..core.errors import ArgumentError
-from ..core.extras import import_extra
+from . import files
+from .codecs import OF_BYTES, READERS, WRITERS
 from .errors import FileError
-from .files import (
-    PathLike,
-    by_ending,
-    file_path,
-    read_npy,
-    reading,
-    replacing,
-    require_file,
-    require_folder,
-    require_pixels,
-    utf8_name,
-    write_npy,
-)
-from .gdal import opened
-from .png import require_whole
+from .exr import channels_of, write_channels
+from .files import PathLike, by_ending, reading, replacing, require_file
 
 
 def load_image(path: PathLike, *, transfer: str | None = None) -> Float32[np.ndarray, "h w 3"]:
@@ -67,7 +48,7 @@ def load_numbers(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
 def _load(path: PathLike, transfer: str | None, left_out: float) -> np.ndarray:
     require_transfer("load_image", transfer or "srgb")
     path = require_file(path)
-    reader = by_ending(_READERS, path, "read an image with")
+    reader = by_ending(READERS, path, "read an image with")
     with reading(path):
         stored = reader(path)
     image = np.ma.getdata(stored)
@@ -122,12 +103,15 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         raise FileError(f"{path}: an image must have shape (h, w, 3) or (h, w), this one has {pixels.shape}")
     if aovs and path.suffix.lower() != ".exr":
         raise ArgumentError("save_image", "aovs", f"are layers of an .exr, {path} is none")
-    layers = _layers(aovs or {}, pixels.shape[:2])
+    ending, layers = path.suffix.lower(), _layers(aovs or {}, pixels.shape[:2])
+    if ending in OF_BYTES:
+        shares = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
+        pixels = (TRANSFERS[transfer][0](shares) * 255 + 0.5).astype(np.uint8)
     with replacing(path) as temporary:
         if layers:
-            write_exr(temporary, _planes(pixels) | layers)
+            write_channels(temporary, channels_of(pixels) | layers)
         else:
-            _WRITERS[path.suffix.lower()](temporary, pixels, TRANSFERS[transfer][0])
+            WRITERS[ending](temporary, pixels)
 
 
 def _layers(aovs: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
@@ -144,23 +128,6 @@ def _layers(aovs: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, np.nda
     return found
 
 
-def require_writable(path: PathLike) -> Path:
-    """Checks that `save_image` can write to `path`, so that nobody renders for an hour first.
-
-    Raises:
-      ValueError: the ending is not known, a package for it is missing, or `path` is a folder.
-      FileNotFoundError: the folder does not exist.
-      PermissionError: the folder cannot be written to.
-    """
-    path = file_path("save_image", path)
-    by_ending(_WRITERS, path, "write an image with")
-    require_folder(path, "an image")
-    if path.suffix.lower() == ".exr":
-        with reading(path):
-            import_extra("OpenEXR", "writing .exr needs", "exr")
-    return path
-
-
 def linear_from_srgb(encoded: np.ndarray) -> np.ndarray:
     """IEC 61966-2-1: encoded values in 0..1 to linear ones."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
@@ -171,224 +138,8 @@ def srgb_from_linear(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-# One reader a format: a path to shape (h, w, 3) or (h, w), float32 or, where values are encoded, uint8 or uint16.
-
-
-def read_png(path: Path) -> np.ndarray:
-    """What a .png stores: uint8 of shape (h, w, 3), or uint16 of shape (h, w) for 16-bit grey."""
-    data = path.read_bytes()
-    channels, depth = require_whole(data)
-    if depth < 16:
-        return _decoded(data, "RGBA")[:, :, :3]
-    if channels > 1:  # Pillow would cut them down to 8 bits
-        raise FileError(f"a PNG of 16 bits must be grey, it has {channels} channels")
-    return _decoded(data)
-
-
-def read_grey(path: Path) -> np.ndarray:
-    """What a picture of one channel stores, .png, .exr or .pfm: shape (h, w), in the numbers of the file."""
-    ending = path.suffix.lower()
-    if ending == ".exr":
-        channels = _exr_channels(path)
-        if len(channels) > 1:
-            raise FileError(f"heights must be one channel, it has {', '.join(channels)}")
-        return next(iter(channels.values()))
-    if ending == ".pfm":
-        pixels = _read_pfm(path)
-        if pixels.ndim > 2:
-            raise FileError("heights must be one channel, it has red, green and blue")
-        return pixels
-    data = path.read_bytes()
-    require_whole(data)
-    depth, colour = data[24:26]
-    if colour != 0 or depth < 8:
-        kinds = {0: "grey", 2: "red, green and blue", 3: "a palette", 4: "grey with opacity", 6: "colours with opacity"}
-        raise FileError(f"heights must be grey of 8 or 16 bits, it has {kinds[colour]} of {depth} bits")
-    return _decoded(data)
-
-
-def _read_jpeg(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    data = path.read_bytes()
-    if not data.startswith(b"\xff\xd8\xff"):
-        raise FileError("it is not a JPEG")
-    return _decoded(data, "RGB")
-
-
-def _decoded(data: bytes, mode: str | None = None) -> np.ndarray:
-    with _any_size():
-        require_pixels(*imageio.improps(data, index=0, plugin="pillow").shape[:2])
-        return imageio.imread(data, index=0, mode=mode, plugin="pillow", writeable_output=False)
-
-
-_LIMIT = threading.Lock()
-
-
-@contextlib.contextmanager
-def _any_size() -> Iterator[None]:
-    """Lifts Pillow's limit, which is one for the whole process and refuses 16384 x 16384: sizes are checked here."""
-    with _LIMIT:
-        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-        try:
-            yield
-        finally:
-            Image.MAX_IMAGE_PIXELS = limit
-
-
-def _exr_channels(path: Path) -> dict[str, np.ndarray]:
-    """The channels of an .exr by their names, float32."""
-    exr = import_extra("OpenEXR", "reading .exr needs", "exr")
-    try:
-        with utf8_name(path) as name:
-            with exr.File(name, separate_channels=True, header_only=True) as file:
-                (x0, y0), (x1, y1) = file.header()["dataWindow"]
-            require_pixels(int(y1) - int(y0) + 1, int(x1) - int(x0) + 1)
-            with exr.File(name, separate_channels=True) as file:
-                return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except RuntimeError as error:
-        raise FileError("it is not an OpenEXR file, or damaged") from error
-    except ValueError as error:
-        if "part index" not in str(error):
-            raise
-        raise FileError("it is cut off or damaged: pixels are missing") from error
-
-
-def _read_exr(path: Path) -> np.ndarray:
-    channels = _exr_channels(path)
-    names = next((names for names in ("RGB", "Y") if set(names) <= set(channels)), None)
-    if names is None:
-        raise FileError(f"its channels must be R, G, B or Y, they are {', '.join(channels)}")
-    shapes = {channels[name].shape for name in names}
-    if len(shapes) > 1:
-        raise FileError(f"its channels must have one size, they have {sorted(shapes)}")
-    return np.stack([channels[name] for name in names], axis=-1) if len(names) == 3 else channels[names]
-
-
-def _read_pfm(path: Path) -> np.ndarray:
-    """Paul Debevec's format: `PF` or `Pf`, width and height, a scale whose sign gives the byte order, rows from below."""
-    data = path.read_bytes()
-    header = re.match(rb"(P[Ff])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]+)\s", data)
-    if header is None:
-        raise FileError("it is not a PFM")
-    channels, width, height = 3 if header[1] == b"PF" else 1, int(header[2]), int(header[3])
-    scale = float(header[4])
-    if scale == 0:
-        raise FileError("its scale must not be 0: the sign gives the byte order")
-    require_pixels(height, width)
-    declared, present = 4 * channels * width * height, len(data) - header.end()
-    if declared != present:
-        raise FileError(f"it is cut off or damaged: {width} x {height} pixels take {declared} bytes, {present} are there")
-    pixels = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end())
-    return pixels.astype(np.float32).reshape((height, width, 3)[: 3 if channels == 3 else 2])[::-1].copy()
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    with path.open("rb") as file:
-        image = read_npy(file, path.stat().st_size)
-    if image.dtype.kind != "f":
-        raise FileError(f"its array must hold linear radiance in floats, it holds {image.dtype}")
-    if image.ndim not in (2, 3) or image.shape[2:] not in ((), (3,)):
-        raise FileError(f"its array must have shape (h, w, 3) or (h, w), it has {image.shape}")
-    return image.astype(np.float32)
-
-
-def _read_tiff(path: Path) -> np.ma.MaskedArray:
-    """A GeoTIFF's first three bands, or its only one, or its palette's colours; masked where it says that there is nothing."""
-    with opened(path) as dataset:
-        kinds, words = set(dataset.dtypes), [found.name for found in dataset.colorinterp]
-        if len(kinds) > 1 or not kinds <= {"uint8", "uint16", "float32", "float64"}:
-            raise FileError(f"a picture must be of uint8, uint16, float32 or float64, it is of {', '.join(sorted(kinds))}")
-        if dataset.count > 4 or (dataset.count == 2 and words[1] != "alpha"):
-            raise FileError(f"a picture must have 1, 3 or 4 bands, it has {dataset.count} (gdal_translate -b takes some)")
-        pixels, there = dataset.read([1, 2, 3] if dataset.count > 2 else [1]), dataset.dataset_mask() > 0
-        palette = dataset.colormap(1) if words[0] == "palette" else None
-    image = np.moveaxis(pixels, 0, -1) if len(pixels) > 1 else pixels[0]
-    if palette is not None:
-        image = np.array([palette.get(k, (0, 0, 0))[:3] for k in range(max(palette) + 1)], np.uint8)[image]
-    image = image.astype(np.float32) if image.dtype.kind == "f" else image
-    return np.ma.array(image, mask=np.broadcast_to(~there if image.ndim == 2 else ~there[..., None], image.shape))
-
-
-_MOST_OF_JPEG = 65500  # of libjpeg
-
-# One writer a format; the last argument maps linear values in 0..1 to those that a .png or .jpg holds.
-
-
-def _write_png(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> None:
-    write_png(path, _in_bytes(pixels, encode))
-
-
-def _write_jpeg(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> None:
-    if max(pixels.shape[:2]) > _MOST_OF_JPEG:
-        raise FileError(f"a JPEG has at most {_MOST_OF_JPEG} pixels a side, this has {pixels.shape[1]} x {pixels.shape[0]}")
-    with path.open("wb") as file:
-        imageio.imwrite(file, _in_bytes(pixels, encode), plugin="pillow", extension=".jpg", quality=95, subsampling=0)
-
-
-def _in_bytes(pixels: np.ndarray, encode: Callable[[np.ndarray], np.ndarray]) -> UInt8[np.ndarray, "..."]:
-    clipped = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
-    return (encode(clipped) * 255 + 0.5).astype(np.uint8)
-
-
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Bytes of shape (h, w), (h, w, 3) or (h, w, 4), or uint16 of shape (h, w), as they are, top row first."""
-    with path.open("wb") as file:
-        imageio.imwrite(file, np.ascontiguousarray(pixels), plugin="pillow", extension=".png")
-
-
-def _write_exr(path: Path, pixels: np.ndarray, _: Any) -> None:
-    write_exr(path, _planes(pixels))
-
-
-def _planes(pixels: np.ndarray) -> dict[str, np.ndarray]:
-    return {"Y": pixels} if pixels.ndim == 2 else {name: pixels[:, :, c] for c, name in enumerate("RGB")}
-
-
-def write_exr(path: Path, planes: Mapping[str, np.ndarray]) -> None:
-    """Channels of shape (h, w) by their names, top row first, in float32.
-
-    Raises:
-      OSError: what is found in the file is something else: OpenEXR does not say when a disk is full.
-    """
-    exr = import_extra("OpenEXR", "writing .exr needs", "exr")
-    channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
-    options, found = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, {}
-    with contextlib.suppress(FileError, OSError, RuntimeError):
-        with utf8_name(path) as name, exr.File(options, dict(channels)) as file:
-            file.write(name)
-        found = _exr_channels(path)
-    if not all(name in found and np.array_equal(found[name], plane, equal_nan=True) for name, plane in channels.items()):
-        raise OSError(errno.ENOSPC, "OpenEXR left it incomplete, the disk is probably full")
-
-
-def _write_pfm(path: Path, pixels: np.ndarray, _: Any) -> None:
-    h, w = pixels.shape[:2]
-    header = f"{'PF' if pixels.ndim == 3 else 'Pf'}\n{w} {h}\n-1.0\n"
-    path.write_bytes(header.encode() + pixels[::-1].astype("<f4").tobytes())
-
-
-def _write_npy(path: Path, pixels: np.ndarray, _: Any) -> None:
-    write_npy(path, pixels)
-
-
-_READERS: dict[str, Callable[[Path], np.ndarray]] = {
-    ".png": read_png,
-    ".jpg": _read_jpeg,
-    ".jpeg": _read_jpeg,
-    ".exr": _read_exr,
-    ".pfm": _read_pfm,
-    ".npy": _read_npy,
-    ".tif": _read_tiff,
-    ".tiff": _read_tiff,
-}
-_WRITERS: dict[str, Callable[[Path, np.ndarray, Callable[[np.ndarray], np.ndarray]], None]] = {
-    ".png": _write_png,
-    ".jpg": _write_jpeg,
-    ".jpeg": _write_jpeg,
-    ".exr": _write_exr,
-    ".pfm": _write_pfm,
-    ".npy": _write_npy,
-}
-PICTURES = tuple(_WRITERS)  # the endings of what `save_image` writes
+PICTURES = tuple(WRITERS)  # the endings of what `save_image` writes
+require_writable = partial(files.require_writable, "save_image", "an image", PICTURES)
 # How values in 0..1 are encoded in whole numbers, and decoded.
 TRANSFERS: dict[str, tuple[Callable[[np.ndarray], np.ndarray], Callable[[np.ndarray], np.ndarray]]] = {
     "srgb": (srgb_from_linear, linear_from_srgb),

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from ..core.extras import import_extra
+from .codecs import read_grey
 from .errors import FileError
 from .files import PathLike, by_ending, read_npy, reading, require_file
 from .gdal import DRIVERS
 from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
 from .grids import read_asc, read_hgt, read_mujoco
-from .images import read_grey
 from .rasters import read_raster
 from .sidecars import by_world_file
 from .terrain import Terrain, heights_of

@@ -1,6 +1,7 @@
 """Terrain as triangles for other programs, written through trimesh."""
 
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,12 @@ from jaxtyping import Bool, Float, Int
 
 from ..core.errors import ArgumentError, kind_of
 from ..core.extras import import_extra
-from .files import PathLike, by_ending, file_path, reading, replacing, require_folder
+from .files import PathLike, replacing, require_writable
 from .images import linear_from_srgb
 from .terrain import Terrain
 
 MESHES = (".glb", ".obj", ".ply")
+require_writable_mesh = partial(require_writable, "save_mesh", "a mesh", MESHES)
 
 _Triangles = Int[np.ndarray, "m 3"]
 
@@ -68,16 +70,6 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
     mesh = _mesh(path, points, faces, terrain, of, colours, uv)
     with replacing(path) as temporary:
         temporary.write_bytes(mesh)
-
-
-def require_writable_mesh(path: PathLike) -> Path:
-    """Checks that `save_mesh` can write to `path`; errors as there."""
-    path = file_path("save_mesh", path)
-    by_ending(dict.fromkeys(MESHES), path, "write a mesh with")
-    require_folder(path, "a mesh")
-    with reading(path):
-        import_extra("trimesh", f"writing {path.suffix.lower()} needs", "mesh")
-    return path
 
 
 def _corners(shape: tuple[int, ...]) -> list[np.ndarray]:

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import warnings
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,11 @@ import numpy as np
 
 from ..core.errors import ArgumentError
 from ..core.extras import import_extra
+from .codecs import write_png
 from .errors import FileError
-from .files import PathLike, by_ending, file_path, reading, replacing, require_folder, write_npy
+from .files import PathLike, replacing, require_writable, write_npy
 from .gdal import opened
-from .georeference import CoordinateSystem, Georeference, coordinate_system
-from .images import write_png
+from .georeference import Georeference, coordinate_system
 from .sidecars import beside
 from .terrain import Terrain, heights_of
 
@@ -60,32 +61,11 @@ def _placed(heights: np.ndarray, dataset: Any, nodata: float | None) -> Terrain:
     heights = heights[:: 1 if e > 0 else -1, :: 1 if a > 0 else -1]
     x0, y0 = c + (0.5 if a > 0 else nx - 0.5) * a, f + (0.5 if e > 0 else ny - 0.5) * e
     point = dataset.tags().get("AREA_OR_POINT") == "Point"
-    crs = coordinate_system(wkt) if wkt else CoordinateSystem()
+    crs = coordinate_system(wkt)
     return Terrain(heights, abs(a), abs(e), x0, y0, crs, Georeference(wkt, nodata=nodata, point=point))
 
 
-def require_writable_raster(path: PathLike) -> Path:
-    """Checks that `save_raster` can write to `path`.
-
-    Raises:
-      ValueError: the ending is not known, rasterio is missing, or `path` is a folder.
-      FileNotFoundError: the folder does not exist.
-      PermissionError: the folder cannot be written to.
-    """
-    path = file_path("save_raster", path)
-    by_ending(dict.fromkeys((".npy", ".png", ".tif", ".tiff")), path, "write a map with")
-    require_folder(path, "a map")
-    require_extras(path)
-    return path
-
-
-def require_extras(path: Path) -> None:
-    """FileError where writing this file needs a package that is missing."""
-    with reading(path):
-        if path.suffix.lower() in (".tif", ".tiff"):
-            import_extra("rasterio", "writing .tif needs", "geo")
-        if path.suffix.lower() == ".exr":
-            import_extra("OpenEXR", "writing .exr needs", "exr")
+require_writable_raster = partial(require_writable, "save_raster", "a map", (".npy", ".png", ".tif", ".tiff"))
 
 
 def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None = None) -> None:
@@ -102,7 +82,7 @@ def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None
       nodata: the value that means that there is none, for .tif.
 
     Raises:
-      FileNotFoundError, PermissionError, ValueError: as `require_writable_raster`; or `values` are of another shape or kind.
+      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or `values` are of another shape or kind.
     """
     path = require_writable_raster(path)
     values = np.asarray(values)

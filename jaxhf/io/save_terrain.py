@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .codecs import write_png
 from .errors import FileError
-from .files import PathLike, by_ending, file_path, reading, replacing, require_file, require_folder, write_npy
+from .exr import write_channels
+from .files import PathLike, reading, replacing, require_file, require_writable, write_npy
 from .grids import write_asc
-from .images import write_exr, write_png
-from .rasters import georeference_of, geotiff, require_extras
+from .rasters import georeference_of, geotiff
 from .sidecars import beside
 from .terrain import Terrain
 
@@ -35,7 +36,7 @@ def save_heights(path: PathLike, terrain: Terrain | ArrayLike, like: PathLike | 
       like: a GeoTIFF of the same shape, whose place and reference system a .tif takes over.
 
     Raises:
-      FileNotFoundError, PermissionError, ValueError: as `require_writable_heights`; or `terrain` is neither, or `like` has
+      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or `terrain` is neither, or `like` has
         another shape.
     """
     path = require_writable_heights(path)
@@ -71,29 +72,6 @@ def _terrain(path: Path, given: Any) -> Terrain:
     return Terrain(heights)
 
 
-def require_writable_heights(path: PathLike, endings: Iterable[str] | None = None) -> Path:
-    """Checks that `save_heights` can write to `path`, so that nobody fits for an hour first.
-
-    Args:
-      path: the file.
-      endings: those that the caller takes; None: all of `save_heights`.
-
-    Raises:
-      ValueError: the ending is not known, a package for it is missing, or `path` is a folder.
-      FileNotFoundError: the folder does not exist.
-      PermissionError: the folder cannot be written to.
-    """
-    path = file_path("save_heights", path)
-    by_ending(dict.fromkeys(HEIGHTS if endings is None else endings), path, "write heights with")
-    require_folder(path, "heights")
-    require_extras(path)
-    return path
-
-
-def _write_npy(path: Path, terrain: Terrain) -> None:
-    write_npy(path, terrain.heights)
-
-
 def _write_npz(path: Path, terrain: Terrain) -> None:
     place: dict[str, Any] = {name: getattr(terrain, name) for name in ("dx", "dy", "x0", "y0")}
     if (known := terrain.georeference) is not None:
@@ -114,10 +92,6 @@ def _write_tiff(path: Path, terrain: Terrain) -> None:
     path.write_bytes(geotiff(heights, terrain, np.nan if nodata is None else nodata, unit))
 
 
-def _write_exr(path: Path, terrain: Terrain) -> None:
-    write_exr(path, {"Y": terrain.heights[::-1]})
-
-
 def _write_png(path: Path, terrain: Terrain) -> None:
     low, high = (float(bound(terrain.heights)) for bound in (np.min, np.max))
     if not (low >= -0.5 and high < 65535.5):
@@ -128,11 +102,16 @@ def _write_png(path: Path, terrain: Terrain) -> None:
 
 _WRITERS: dict[str, Callable[[Path, Terrain], None]] = {
     ".asc": write_asc,
-    ".exr": _write_exr,
+    ".exr": lambda path, terrain: write_channels(path, {"Y": terrain.heights[::-1]}),
     ".png": _write_png,
-    ".npy": _write_npy,
+    ".npy": lambda path, terrain: write_npy(path, terrain.heights),
     ".npz": _write_npz,
     ".tif": _write_tiff,
     ".tiff": _write_tiff,
 }
 HEIGHTS = tuple(_WRITERS)
+
+
+def require_writable_heights(path: PathLike, endings: Iterable[str] = HEIGHTS) -> Path:
+    """As `require_writable`, for `save_heights` and those endings that the caller takes."""
+    return require_writable("save_heights", "heights", endings, path)

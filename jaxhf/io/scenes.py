@@ -1,4 +1,4 @@
-"""Files: scenes, terrain and images. Everything here runs on the host; nothing is traced."""
+"""Scene files of either format."""
 
 import numpy as np
 from numpy.typing import DTypeLike

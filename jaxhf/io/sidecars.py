@@ -27,7 +27,7 @@ def system_of(path: Path) -> tuple[str, CoordinateSystem]:
     """The well-known text in the .prj beside a file, "" where there is none, and what it says."""
     prj = path.with_suffix(".prj")
     wkt = prj.read_text(encoding="utf-8", errors="replace").strip() if prj.is_file() else ""
-    return wkt, coordinate_system(wkt) if wkt else CoordinateSystem()
+    return wkt, coordinate_system(wkt)
 
 
 def by_world_file(path: Path, heights: np.ndarray) -> Terrain:

@@ -97,7 +97,7 @@ class Terrain:
         own = attrs.get("_FillValue") if own is None else own
         nodata = nodata if nodata is not None or own is None else float(own)
         heights = heights_of(values, nodata, float(attrs.get("scale_factor", 1)), float(attrs.get("add_offset", 0)))
-        crs = coordinate_system(wkt) if wkt else CoordinateSystem()
+        crs = coordinate_system(wkt)
         return cls(heights, abs(dx), abs(dy), x0, y0, crs, Georeference(wkt, nodata=nodata)).in_metres()
 
     @property

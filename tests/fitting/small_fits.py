@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxhf
 from jaxhf.fitting.options import FitOptions
-from jaxhf.io.procedural import fractal
+from jaxhf.scene.procedural import fractal
 
 # No shadows, and a frame that ends inside the terrain: so the interior derivative is that of the picture.
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=1024, edge_samples=0)

@@ -158,13 +158,8 @@ def test_the_map_of_a_geotiff_is_kept_unless_the_scene_puts_it_elsewhere(folder)
     scene = SCENE[: SCENE.index("shape")]
     assert case(folder, scene + field + PICTURE).like == folder / "dem.tif"
     found = case(folder, scene + field + "x0 = 3\n" + PICTURE)
-    assert (found.like, found.options, found.weights, found.noise, found.settings) == (
-        None,
-        {},
-        (None,),
-        None,
-        jaxhf.Settings(),
-    )
+    kept = found.like, found.options, found.weights, found.noise, found.settings
+    assert kept == (None, {}, (None,), None, jaxhf.Settings())
 
 
 def terrain_file(path, place, shape, holes=()):
@@ -272,14 +267,8 @@ def test_a_hole_in_a_prior_is_an_error_where_the_terrain_is(folder):
         case(folder, with_prior("tile.npz", "own.tif", "nodata = 3\n"))
 
 
-def of_picture(line):
-    return f"{WHOLE}{line}\n"
-
-
-def of_fit(line):
-    return f"{WHOLE}\n[fit]\n{line}\n"
-
-
+of_picture = f"{WHOLE}{{}}\n".format
+of_fit = f"{WHOLE}\n[fit]\n{{}}\n".format
 SIZED = WHOLE.replace("up =", "width = 50\nheight = 30\nup =")
 # The text, the line of the mistake (None: no line), and what the message says.
 BAD = [
@@ -324,3 +313,8 @@ def test_what_fit_refuses_is_named_with_its_line(folder, text, message):
     with pytest.raises(jaxhf.ArgumentError, match=r"^fit: ") as refused:
         jaxhf.fit(given.scenes, given.targets, weights=given.weights, noise=given.noise, **given.options)
     assert str(given.located(refused.value)).startswith(f"{folder}/case.toml{message}")
+
+
+def test_what_fit_refuses_though_no_file_says_it(folder):
+    error = case(folder, WHOLE).located(jaxhf.ArgumentError("fit", "max_steps", "must be more"))
+    assert str(error) == f"{folder}/case.toml: fit.max_steps must be more"

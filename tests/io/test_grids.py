@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from alike import placed
 from PIL import Image
 
 from jaxhf import Terrain, load_heights, save_heights, save_image
@@ -12,10 +13,6 @@ from jaxhf.io.load_terrain import read_terrain
 
 UTM = 'LOCAL_CS["a grid of the county",UNIT["metre",1]]'
 HEIGHTS = np.array([[1, 2.5, np.nan], [4, 5, 6]], np.float32)
-
-
-def placed(terrain):
-    return terrain.dx, terrain.dy, terrain.x0, terrain.y0
 
 
 @pytest.mark.parametrize(
@@ -32,6 +29,16 @@ def test_ascii_grid(tmp_path, place, expected):
     np.testing.assert_array_equal(terrain.heights, HEIGHTS)
     assert placed(terrain) == expected
     assert np.isnan(load_heights(tmp_path / "x.asc", nodata=4.0).heights[1, 0])
+
+
+@pytest.mark.parametrize(("dtype", "digits"), [(np.float32, 9), (np.float64, 17)])
+def test_heights_keep_their_bits_in_text(tmp_path, dtype, digits):
+    """And have no more digits than that takes."""
+    heights = (1000 * np.random.default_rng(0).uniform(size=(4, 5))).astype(dtype)
+    save_heights(tmp_path / "heights.asc", Terrain(heights, 2.0, 2.0))
+    words = [line.split() for line in (tmp_path / "heights.asc").read_text().splitlines()[-4:]]
+    np.testing.assert_array_equal(np.array(words, float)[::-1].astype(dtype), heights)
+    assert max(len(word.replace(".", "")) for row in words for word in row) <= digits
 
 
 @pytest.mark.parametrize("value", [-9999, -32768, 65535, np.finfo(np.float32).min])

@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from alike import assert_same
 
-from jaxhf import Cylinder, Directional, Matte, Mirror, Point, SceneError
+import jaxhf
+from jaxhf import Cylinder, Directional, Matte, Mirror, Object, Point, SceneError
 from jaxhf.io.pbrt import reader
 from jaxhf.io.pbrt.reader import load_pbrt
 
@@ -60,34 +62,24 @@ def test_a_whole_scene(tmp_path):
         Shape "heightfield" "integer nu" [3] "integer nv" [2] "float Pz" [0 1 2  3 4 5]
         WorldEnd""",
     )
-    assert (scene.camera.width, scene.camera.height, float(scene.camera.fov)) == (320, 200, 30)
-    assert scene.samples == 5
-    cylinder, field = scene.objects
-    assert isinstance(cylinder.shape, Cylinder)
-    assert isinstance(cylinder.material, Mirror)
-    assert (cylinder.shape.radius, cylinder.shape.z_min, cylinder.shape.z_max) == (2, -3, 4)
-    np.testing.assert_array_equal(cylinder.material.reflectance, [0.9, 0.9, 0.9])
-    assert isinstance(field.material, Matte)
-    np.testing.assert_array_equal(field.material.albedo, [0.4, 0.2, 0.1])
-    np.testing.assert_array_equal(scene.heights, [[0, 1, 2], [3, 4, 5]])
-    assert (field.shape.dx, field.shape.dy, field.shape.x0, field.shape.y0) == (0.5, 1, 0, 0)
-    (light,) = scene.lights
-    assert isinstance(light, Point)
-    np.testing.assert_array_equal(light.intensity, [2, 4, 1.5])
+    field = jaxhf.Heightfield(np.array([[0, 1, 2], [3, 4, 5]], np.float32), dx=0.5, dy=1.0)
+    expected = jaxhf.Scene(
+        [Object(Cylinder(2, -3, 4), Mirror(0.9)), Object(field, Matte((0.4, 0.2, 0.1)))],
+        jaxhf.Perspective(np.eye(4), 30, width=320, height=200),
+        [Point((0, 0, 0), (2, 4, 1.5))],
+        samples=5,
+    )
+    assert_same(scene, expected)
 
 
 @pytest.mark.parametrize("options", ["", 'Film "image" Sampler "bestcandidate"'])
 def test_defaults_are_those_of_pbrt(tmp_path, options):
     world = f'LightSource "point" {FIELD} Material "matte" Shape "cylinder"'
     scene = load(tmp_path, f'{options} Camera "perspective" WorldBegin {world} WorldEnd')
-    assert (scene.camera.width, scene.camera.height, float(scene.camera.fov)) == (640, 480, 90)
-    assert scene.samples == 4
-    for obj in scene.objects:
-        np.testing.assert_array_equal(obj.material.albedo, [0.5, 0.5, 0.5])
-    cylinder = scene.objects[1].shape
-    assert (cylinder.radius, cylinder.z_min, cylinder.z_max) == (1, -1, 1)
-    np.testing.assert_array_equal(scene.lights[0].intensity, [1, 1, 1])
-    np.testing.assert_array_equal(scene.lights[0].p, [0, 0, 0])
+    field = jaxhf.Heightfield(np.array([[0, 1], [2, 3]], np.float32))
+    objects = [Object(field, Matte(0.5)), Object(Cylinder(1, -1, 1), Matte(0.5))]
+    camera = jaxhf.Perspective(np.eye(4), 90, width=640, height=480)
+    assert_same(scene, jaxhf.Scene(objects, camera, [Point((0, 0, 0), 1)], samples=4))
 
 
 def test_the_way_a_file_is_written_does_not_matter(tmp_path):
@@ -196,14 +188,8 @@ def test_lights(tmp_path):
         'LightSource "distant" "color L" [1 2 3] "color scale" [3 2 1] "point from" [0 0 5] "point to" [1 0 0]\n'
         f'LightSource "distant"\n{FIELD}',
     )
-    point, distant, default = scene.lights
-    np.testing.assert_array_equal(point.p, [11, 22, 33])  # pbrt-v2 adds "from" after the transformation
-    assert isinstance(distant, Directional)
-    assert isinstance(default, Directional)
-    np.testing.assert_array_equal(distant.towards, [-2, 0, 10])
-    np.testing.assert_array_equal(distant.irradiance, [3, 4, 3])
-    np.testing.assert_array_equal(default.towards, [0, 0, -2])
-    np.testing.assert_array_equal(default.irradiance, [1, 1, 1])
+    point = Point((11, 22, 33), 1)  # pbrt-v2 adds "from" after the transformation
+    assert_same(scene.lights, (point, Directional((-2, 0, 10), (3, 4, 3)), Directional((0, 0, -2), 1)))
 
 
 def test_stratified_samples_and_a_film_behind_its_camera(tmp_path):

@@ -9,16 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from alike import assert_same
 from PIL import Image
 
 import jaxhf
 from jaxhf import Directional, Heightfield, ImageTexture, Matte, Mirror, Orthographic, Perspective, SceneError, load_scene
 from jaxhf.io.georeference import WGS84_DEGREES, Georeference
-from jaxhf.io.procedural import grid
 from jaxhf.io.toml import tables
 from jaxhf.io.toml.fit import load_case
-from jaxhf.io.toml.lines import line_numbers
+from jaxhf.io.toml.lines import line_of
 from jaxhf.io.toml.values import STEPS
+from jaxhf.scene.procedural import bumps, grid
 
 SCENES = sorted((Path(__file__).parents[2] / "scenes").glob("*.toml"))
 
@@ -52,16 +53,9 @@ def test_our_scenes_are_read(path):
 
 def test_the_smallest_scene(tmp_path):
     scene = read(tmp_path, CAMERA + FIELD)
-    assert isinstance(scene.camera, Perspective)
-    assert (scene.camera.fov, scene.camera.width, scene.camera.height) == (45, 512, 512)
-    np.testing.assert_allclose(scene.camera.world_from_camera[:3, 3], (0, -3, 2))
-    (field,) = scene.heightfields
-    np.testing.assert_array_equal(field.heights, [[0, 1], [2, 3], [4, 5]])
-    assert (field.dx, field.dy, field.x0, field.y0) == (1, 0.5, 0, 0)
-    assert field.heights.dtype == jnp.float32
-    assert (scene.samples, scene.lights, scene.objects[0].world_from_object) == (1, (), None)
-    assert isinstance(scene.objects[0].material, Matte)
-    np.testing.assert_array_equal(np.asarray(scene.objects[0].material.albedo), (0.7, 0.7, 0.7))
+    field = Heightfield(np.array([[0, 1], [2, 3], [4, 5]], np.float32), dx=1.0, dy=0.5)
+    camera = Perspective.look_at((0, -3, 2), (0, 0, 0), fov=45, width=512, height=512)
+    assert_same(scene, jaxhf.Scene([jaxhf.Object(field, Matte(0.7))], camera, [], samples=1))
 
 
 @pytest.mark.parametrize("load", [load_scene, load_case])
@@ -118,27 +112,14 @@ def test_every_part_of_a_scene(tmp_path):
         matrix = [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
         """,
     )
-    assert scene.samples == 9
-    point, sky = scene.lights
-    assert isinstance(point, jaxhf.Point)
-    assert isinstance(sky, jaxhf.Sky)
-    np.testing.assert_array_equal((point.p, point.intensity, sky.radiance), ((1, 2, 3), (4, 4, 4), (0.1, 0.2, 0.3)))
-    assert sky.occlusion == 8
-    assert isinstance(scene.camera, Orthographic)
-    assert (scene.camera.extent, scene.camera.width, scene.camera.height) == (2.5, 40, 30)
-    np.testing.assert_allclose(scene.camera.world_from_camera[:3, 1], (0, 1, 0))
-    land, wall = scene.objects
-    assert isinstance(land.shape, Heightfield)
-    assert (land.shape.dx, land.shape.dy, land.shape.x0, land.shape.y0) == (30, 20, 500000, 5e6)
-    assert (land.shape.heights.shape, float(land.shape.heights.max())) == ((6, 5), 1)
-    assert isinstance(land.material, Matte)
-    assert isinstance(land.material.albedo, ImageTexture)
-    np.testing.assert_array_equal(land.material.albedo.texels, grid([8, 16], lines=2))
-    assert isinstance(wall.shape, jaxhf.Cylinder)
-    assert (wall.shape.radius, wall.shape.z_min, wall.shape.z_max) == (3, 0, 2)
-    assert isinstance(wall.material, Mirror)
-    np.testing.assert_array_equal(wall.material.reflectance, (0.1, 0.2, 45))  # more than one is allowed
-    np.testing.assert_array_equal(wall.world_from_object, [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
+    field = Heightfield(0.5 * bumps([6, 5], range=(0, 2)).astype(np.float32), 30.0, 20.0, 500000.0, 5e6)
+    assert field.heights.max() == 1
+    land = jaxhf.Object(field, Matte(ImageTexture(grid([8, 16], lines=2))))
+    pose = np.array([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
+    wall = jaxhf.Object(jaxhf.Cylinder(3, 0, 2), Mirror((0.1, 0.2, 45)), pose)  # more than one is allowed
+    camera = Orthographic.look_at((0, 0, 9), (0, 0, 0), (0, 1, 0), 2.5, width=40, height=30)
+    lights = [jaxhf.Point((1, 2, 3), 4), jaxhf.Sky((0.1, 0.2, 0.3), occlusion=8)]
+    assert_same(scene, jaxhf.Scene([land, wall], camera, lights, samples=9))
 
 
 @pytest.mark.parametrize(
@@ -153,22 +134,16 @@ def test_every_part_of_a_scene(tmp_path):
 )
 def test_directional_lights(tmp_path, text, towards):
     (light,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "directional"\n{text}\n{FIELD}').lights
-    assert isinstance(light, Directional)
-    np.testing.assert_allclose(light.towards, towards, atol=1e-15)
-    np.testing.assert_array_equal(light.irradiance, (np.pi,) * 3)
+    assert_same(light, Directional(towards, np.pi), atol=1e-15)
 
 
 def test_old_keys_and_cameras_by_calibration(tmp_path):
     with pytest.warns(DeprecationWarning, match=r"scene\.toml:8: lights\[0\]\.radiance is now called irradiance$"):
         (light,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "directional"\nradiance = [1, 2, 3]\n{FIELD}').lights
-    assert isinstance(light, Directional)
-    np.testing.assert_array_equal(light.irradiance, (1, 2, 3))
+    assert_same(light, Directional.from_angles(irradiance=(1, 2, 3)))
     camera = read(tmp_path, view(f"{PINHOLE}fy = 50")).camera
     pose = np.array([[1, 0, 0, 5], [0, -1, 0, 6], [0, 0, -1, 7], [0, 0, 0, 1]])
-    expected = Perspective.from_intrinsics(40, 50, 20, 15, world_from_camera=pose, width=40, height=30)
-    np.testing.assert_array_equal(camera.world_from_camera, expected.world_from_camera)
-    assert isinstance(camera, Perspective)
-    assert (camera.fov, camera.width, camera.height) == (expected.fov, 40, 30)
+    assert_same(camera, Perspective.from_intrinsics(40, 50, 20, 15, world_from_camera=pose, width=40, height=30))
 
 
 def test_a_sun_by_date_stands_over_the_terrain(tmp_path):
@@ -206,12 +181,9 @@ def test_an_image_lies_with_its_top_in_the_north(tmp_path):
     (tmp_path / "maps").mkdir()
     Image.fromarray(np.array([[255, 255], [100, 0]], np.uint8)).save(tmp_path / "maps" / "x.png")
     scene = read(tmp_path, f'{CAMERA}[textures."my map"]\nimage = "maps/x.png"\n{FIELD}albedo = "my map"')
-    (material,) = (obj.material for obj in scene.objects)
-    assert isinstance(material, Matte)
-    assert isinstance(material.albedo, ImageTexture)
     grey = ((100 / 255 + 0.055) / 1.055) ** 2.4
-    np.testing.assert_allclose(material.albedo.texels[:, :, 1], [[grey, 0], [1, 1]], rtol=1e-6)
-    assert material.albedo.wrap == "repeat"
+    texels = np.repeat(np.array([[grey, 0], [1, 1]], np.float32)[..., None], 3, axis=2)
+    assert_same(scene.objects[0].material, Matte(ImageTexture(texels, wrap="repeat")), rtol=1e-6)
     (clamped,) = read(tmp_path, f'{CAMERA}[textures.m]\nimage = "maps/x.png"\nwrap = "clamp"\n{FIELD}albedo = "m"').objects
     assert clamped.material.albedo.wrap == "clamp"  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -229,25 +201,12 @@ def test_terrain_files_keep_their_place_and_their_holes(tmp_path):
     assert (land.dx, land.dy) == (jaxhf.jacksboro().dx, jaxhf.jacksboro().dy)
 
 
-def field(line):
-    return f'{CAMERA}[[objects]]\nshape = "heightfield"\n{line}\n'
-
-
-def surface(line):
-    return f"{CAMERA}{FIELD}{line}\n"
-
-
-def light(line):
-    return f"{CAMERA}{FIELD}[[lights]]\n{line}\n"
-
-
-def texture(line):
-    return f"{CAMERA}{FIELD}[textures.t]\n{line}\n"
-
-
-def view(line):
-    return f"{FIELD}[camera]\n{line}\n"
-
+# Scenes with one more line in one of their tables.
+field = f'{CAMERA}[[objects]]\nshape = "heightfield"\n{{}}\n'.format
+surface = f"{CAMERA}{FIELD}{{}}\n".format
+light = f"{CAMERA}{FIELD}[[lights]]\n{{}}\n".format
+texture = f"{CAMERA}{FIELD}[textures.t]\n{{}}\n".format
+view = f"{FIELD}[camera]\n{{}}\n".format
 
 LOOK = 'type = "perspective"\neye = [0, 0, 1]\ntarget = [0, 0, 0]\nup = [0, 1, 0]\n'
 PINHOLE = """type = "pinhole"
@@ -270,6 +229,7 @@ MISTAKES = [
     ("x = " + "[" * 5000, None, "this is not TOML"),
     # Keys.
     (f"sampels = 4\n{CAMERA}{FIELD}", 1, "unknown key 'sampels'; did you mean 'samples'?"),
+    (f"samples = 1\ntexture.uv = {{ size = [2, 2] }}\n{CAMERA}{FIELD}", 2, "unknown key 'texture'; did you mean 'textures'?"),
     (f"{CAMERA}extent = 3\n{FIELD}", 6, "unknown key 'extent' in camera"),
     (surface("albdeo = 1"), 10, "unknown key 'albdeo' in objects[0]; did you mean 'albedo'?"),
     (field("hieghts = [[0, 0], [0, 0]]"), 8, "unknown key 'hieghts' in objects[0]; did you mean 'heights'?"),
@@ -358,13 +318,14 @@ x.y = 1
 [objects.inner]
 z = 2
 '''
-    found, block = line_numbers(text), ("a", "b.c", "d")
+    block = ("a", "b.c", "d")
     top = {("samples",): 2, ("text",): 3, ("long",): 4, block: 7, (*block, "list"): 8, (*block, "after"): 11}
     first, second = ("objects", 0), ("objects", 1)
     expected = top | {first: 12, (*first, "x", "y"): 13, second: 14, (*second, "inner"): 15, (*second, "inner", "z"): 16}
-    assert {where: found.get(where) for where in expected} == expected
-    assert ("camera",) not in found
-    assert max(found.values()) == 16
+    assert {where: line_of(text, where) for where in expected} == expected
+    assert line_of(text, ("camera",)) is None
+    assert line_of(text, (*block, "none")) == 7
+    assert line_of(text, (*second, "inner", "y", 3)) == 15
 
 
 PAGE = (Path(__file__).parents[2] / "docs" / "guides" / "scene-files.md").read_text(encoding="utf-8")

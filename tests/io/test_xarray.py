@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from alike import placed
 
 from jaxhf import Terrain, load_heights, save_heights
 
@@ -13,10 +14,6 @@ X, Y = [500.0, 530.0, 560.0], [40.0, 60.0]
 
 def on(x, values: np.ndarray = SOUTH_FIRST):
     return xarray.DataArray(values, dims=("y", "x"), coords={"y": Y, "x": x})
-
-
-def placed(terrain):
-    return terrain.dx, terrain.dy, terrain.x0, terrain.y0
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.io.procedural import fractal
+from jaxhf.scene.procedural import fractal
 
 HEIGHTS = fractal([17, 13], seed=2, exponent=2.0, range=(0.0, 0.4)).astype(np.float32)
 SHEET = np.array([[0.6, 0, 0.1, 0.1], [0, 0.6, 0.2, 0.1], [-0.1, 0.1, 1, 0.5], [0, 0, 0, 1]])

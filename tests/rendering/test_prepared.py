@@ -10,8 +10,8 @@ import pytest
 
 import jaxhf
 from jaxhf.core.affine import translate
-from jaxhf.io.procedural import fractal
 from jaxhf.rendering import render
+from jaxhf.scene.procedural import fractal
 from jaxhf.xla.devices import local_mesh
 
 CORNER = (5e6, 4.5e6)  # far from the origin: the camera has to be moved in double precision

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.io.procedural import bumps, fractal, waves
+from jaxhf.scene.procedural import bumps, fractal, waves
 from jaxhf.study.measure import Derivative, Picture
 
 WIDTH, HEIGHT = 128, 96

@@ -12,7 +12,7 @@ import jaxhf
 from jaxhf.core.affine import affine
 from jaxhf.core.ray import Ray
 from jaxhf.core.vector import dot, unit
-from jaxhf.io.procedural import fractal
+from jaxhf.scene.procedural import fractal
 from jaxhf.trace import world as trace_world
 from jaxhf.trace.ceiling import clears, make_ceiling
 from jaxhf.trace.grid import make_grid

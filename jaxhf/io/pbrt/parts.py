@@ -12,62 +12,40 @@ from ...core.precision import fitted
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
 from ...scene.light import Directional, Light, Point
-from .tokens import Arguments, Parameter, Parameters
+from .statements import Arguments, Rule, kinds
 
 Matrix = Float[np.ndarray, "4 4"]
 
-# pbrt-v2's defaults. Depth 5 counts the camera ray: at most four mirrors.
-_DEPTH: Parameters = {"integer maxdepth": Parameter(5)}
-KINDS: Mapping[str, Mapping[str, Parameters]] = {
-    "Film": {
-        "image": {
-            "string filename": Parameter("pbrt.exr"),
-            "integer xresolution": Parameter(640),
-            "integer yresolution": Parameter(480),
-        }
-    },
-    "Sampler": {
-        "bestcandidate": {"integer pixelsamples": Parameter(4)},
-        "stratified": {
-            "integer xsamples": Parameter(2),
-            "integer ysamples": Parameter(2),
-            "bool jitter": Parameter(True),
-        },
-    },
-    "PixelFilter": {"box": {"float xwidth": Parameter(0.5), "float ywidth": Parameter(0.5)}},
-    "SurfaceIntegrator": {"directlighting": _DEPTH, "whitted": _DEPTH},
-    "Camera": {"perspective": {"float fov": Parameter(90.0)}},
-    "LightSource": {
-        "point": {
-            "color I": Parameter(np.ones(3)),
-            "color scale": Parameter(np.ones(3)),
-            "point from": Parameter(np.zeros(3)),
-        },
-        "distant": {
-            "color L": Parameter(np.ones(3)),
-            "color scale": Parameter(np.ones(3)),
-            "point from": Parameter(np.zeros(3)),
-            "point to": Parameter(np.array([0.0, 0.0, 1.0])),
-        },
-    },
-    "Texture": {"imagemap": {"string filename": Parameter(required=True)}},
-    "Material": {
-        "matte": {"color Kd": Parameter(0.5), "texture Kd": Parameter(), "float sigma": Parameter(0.0)},
-        "mirror": {"color Kr": Parameter(0.9)},
-    },
-    "Shape": {
-        "heightfield": {
-            "integer nu": Parameter(required=True),
-            "integer nv": Parameter(required=True),
-            "float Pz": Parameter(required=True, many=True),
-        },
-        "cylinder": {
-            "float radius": Parameter(1.0),
-            "float zmin": Parameter(-1.0),
-            "float zmax": Parameter(1.0),
-            "float phimax": Parameter(360.0),
-        },
-    },
+# Every kind and parameter that is understood, with pbrt-v2's defaults. [] must be given, [...] with any number of values.
+# Depth 5 counts the camera ray: at most four mirrors.
+_DEFAULTS = """
+Film "image" "string filename" "pbrt.exr" "integer xresolution" 640 "integer yresolution" 480
+Sampler "bestcandidate" "integer pixelsamples" 4
+Sampler "stratified" "integer xsamples" 2 "integer ysamples" 2 "bool jitter" "true"
+PixelFilter "box" "float xwidth" 0.5 "float ywidth" 0.5
+SurfaceIntegrator "directlighting" "integer maxdepth" 5
+SurfaceIntegrator "whitted" "integer maxdepth" 5
+Camera "perspective" "float fov" 90
+LightSource "point" "color I" [1 1 1] "color scale" [1 1 1] "point from" [0 0 0]
+LightSource "distant" "color L" [1 1 1] "color scale" [1 1 1] "point from" [0 0 0] "point to" [0 0 1]
+Texture "imagemap" "string filename" []
+Material "matte" "color Kd" [0.5 0.5 0.5] "texture Kd" "" "float sigma" 0
+Material "mirror" "color Kr" [0.9 0.9 0.9]
+Shape "heightfield" "integer nu" [] "integer nv" [] "float Pz" [...]
+Shape "cylinder" "float radius" 1 "float zmin" -1 "float zmax" 1 "float phimax" 360
+"""
+KINDS = kinds(_DEFAULTS)
+_LEAST_ONE: Rule = (lambda count: count >= 1, "be at least 1")
+_LEAST_TWO: Rule = (lambda count: count >= 2, "be at least 2")
+RULES: Mapping[str, Rule] = {
+    **dict.fromkeys(("integer xresolution", "integer yresolution"), _LEAST_ONE),
+    **dict.fromkeys(("integer pixelsamples", "integer xsamples"), _LEAST_ONE),
+    **dict.fromkeys(("integer nu", "integer nv"), _LEAST_TWO),
+    **dict.fromkeys(("float xwidth", "float ywidth"), (lambda width: width == 0.5, "be 0.5")),
+    "integer maxdepth": (lambda depth: depth == 5, "be 5"),
+    "float fov": (lambda fov: 0 < fov < 180, "lie between 0 and 180 degrees"),
+    "float sigma": (lambda sigma: sigma == 0, "be 0 (rough surfaces are not supported)"),
+    "float phimax": (lambda phi: phi == 360, "be 360 (parts of a circle are not supported)"),
 }
 DEFAULT_SAMPLES = 4  # of the "lowdiscrepancy" sampler that pbrt-v2 takes where a scene names none
 
@@ -88,16 +66,10 @@ def _look_at(*numbers: float) -> Matrix:
     return np.linalg.inv(world_from_camera)
 
 
-def _bestcandidate(args: Arguments) -> int:
-    args.require("integer pixelsamples", args["integer pixelsamples"] >= 1, "be at least 1")
-    return args["integer pixelsamples"]
-
-
 def _stratified(args: Arguments) -> int:
     if args["bool jitter"]:
         raise args.error("bool jitter", 'jitter must be "false": jittered samples, the default, are not supported')
     side = args["integer xsamples"]
-    args.require("integer xsamples", side >= 1, "be at least 1")
     args.require("integer ysamples", args["integer ysamples"] == side, f"equal xsamples, {side}")
     return side * side
 
@@ -114,8 +86,6 @@ def _distant_light(args: Arguments, world_from_object: Matrix) -> Directional:
 
 def _heightfield(args: Arguments, dtype: np.dtype) -> Heightfield:
     nu, nv, z = args["integer nu"], args["integer nv"], args["float Pz"]
-    for side in ("integer nu", "integer nv"):
-        args.require(side, args[side] >= 2, "be at least 2")
     if z.size != nu * nv:
         raise args.error("float Pz", f"Pz must hold nu * nv = {nu} * {nv} = {nu * nv} heights, it holds {z.size}")
     with np.errstate(over="ignore"):
@@ -128,20 +98,18 @@ def _heightfield(args: Arguments, dtype: np.dtype) -> Heightfield:
     return Heightfield(fitted(z, dtype).reshape(nv, nu))
 
 
-def _cylinder(args: Arguments, dtype: np.dtype) -> Cylinder:
-    args.require("float phimax", args["float phimax"] == 360, "be 360 (parts of a circle are not supported)")
-    return Cylinder(args["float radius"], args["float zmin"], args["float zmax"])
-
-
 TRANSFORMS: Mapping[str, tuple[int, Callable[..., Any]]] = {
     "LookAt": (9, _look_at),
     "Rotate": (4, rotate),
     "Scale": (3, scale),
     "Translate": (3, translate),
 }
-SAMPLERS: Mapping[str, Callable[[Arguments], int]] = {"bestcandidate": _bestcandidate, "stratified": _stratified}
+SAMPLERS: Mapping[str, Callable[[Arguments], int]] = {
+    "bestcandidate": lambda args: args["integer pixelsamples"],
+    "stratified": _stratified,
+}
 LIGHTS: Mapping[str, Callable[[Arguments, Matrix], Light]] = {"point": _point_light, "distant": _distant_light}
 SHAPES: Mapping[str, Callable[[Arguments, np.dtype], Heightfield | Cylinder]] = {
     "heightfield": _heightfield,
-    "cylinder": _cylinder,
+    "cylinder": lambda args, _: Cylinder(args["float radius"], args["float zmin"], args["float zmax"]),
 }

@@ -8,6 +8,7 @@ which they stand, not to the first one.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -20,20 +21,15 @@ from ...scene.scene import Object, Scene
 from ...scene.texture import ImageTexture
 from ..errors import SceneError, nearest, resolve_inside
 from ..images import load_image
-from .parts import DEFAULT_SAMPLES, KINDS, LIGHTS, SAMPLERS, SHAPES, TRANSFORMS, Matrix
-from .tokens import Arguments, Statement, Token, located, read_arguments, statements
+from .parts import DEFAULT_SAMPLES, KINDS, LIGHTS, RULES, SAMPLERS, SHAPES, TRANSFORMS, Matrix
+from .statements import Arguments, Statement, statements
+from .tokens import Token, located
 
 
 def load_pbrt(path: str | Path, dtype: DTypeLike = np.float32) -> Scene:
-    """The scene that a .pbrt file describes.
+    """The scene that a .pbrt file describes; arguments and errors as those of `load_scene`.
 
-    Args:
-      path: the file. What it includes, and its images, must lie in its folder or below; a name is relative to the file
-        in which it stands.
-      dtype: of the heights. Transforms, lights and the camera are float64.
-
-    Raises:
-      SceneError: anything in the file that is not understood, or not possible, with its file and line.
+    What it includes, and its images, must lie in its folder or below; a name is relative to the file in which it stands.
     """
     path = Path(path)
     reader = _Reader(root=path.parent.resolve(), dtype=np.dtype(dtype))
@@ -55,18 +51,12 @@ def _read_text(path: Path) -> str:
 
 
 @dataclass(frozen=True)
-class _Texture:
-    path: Path
-    place: Token
-
-
-@dataclass(frozen=True)
 class _Graphics:
     """What AttributeBegin saves and AttributeEnd brings back; `world_from_object` is pbrt's current transformation."""
 
     world_from_object: Matrix = field(default_factory=lambda: np.eye(4))
     material: Arguments | None = None
-    textures: Mapping[str, _Texture] = field(default_factory=dict)
+    textures: Mapping[str, tuple[Path, Token]] = field(default_factory=dict)  # the picture, and where it is named
 
 
 @dataclass
@@ -108,15 +98,15 @@ class _Reader:
             raise word.error(f"unknown directive {str(word)!r}; {nearest(word.text[:60], _DIRECTIVES)}")
         if self.block == "end":
             raise word.error(f"{word} must not follow WorldEnd")
-        if directive.block not in ("any", self.block):
+        block, takes, run = directive
+        if block not in ("any", self.block):
             late = self.world is not None
             raise word.error(f"{word} must {'not ' if late else ''}follow WorldBegin")
-        directive.run(self, statement)
+        run(self, takes(statement))
 
     # Blocks, files, attributes.
 
-    def _include(self, statement: Statement) -> None:
-        (name,) = statement.strings(1)
+    def _include(self, name: Token) -> None:
         with located(name):
             path = resolve_inside(self.root, self.files[-1].parent, name.name())
             if path in self.files:
@@ -124,30 +114,25 @@ class _Reader:
             text = _read_text(path)
         self.run(path, text)
 
-    def _world_begin(self, statement: Statement) -> None:
-        statement.strings(0)
+    def _world_begin(self, word: Token) -> None:
         if self.camera is None:
-            raise statement.word.error("there must be a Camera before WorldBegin")
-        self.block, self.world = "world", statement.word
+            raise word.error("there must be a Camera before WorldBegin")
+        self.block, self.world = "world", word
         self._set_transform(np.eye(4))
         self.frames["world"] = np.eye(4)
 
-    def _world_end(self, statement: Statement) -> None:
-        statement.strings(0)
+    def _world_end(self, word: Token) -> None:
         if self.saved:
             begin, _ = self.saved[-1]
             raise begin.error(f"this {begin} has no {begin.text.replace('Begin', 'End')}")
         if not self.objects:
-            raise statement.word.error("there must be a Shape before WorldEnd")
+            raise word.error("there must be a Shape before WorldEnd")
         self.block = "end"
 
-    def _save(self, statement: Statement) -> None:
-        statement.strings(0)
-        self.saved.append((statement.word, self.graphics))
+    def _save(self, begin: Token) -> None:
+        self.saved.append((begin, self.graphics))
 
-    def _restore(self, statement: Statement) -> None:
-        statement.strings(0)
-        end = statement.word
+    def _restore(self, end: Token) -> None:
         opened = end.text.replace("End", "Begin")
         if not self.saved or self.saved[-1][0].text != opened:
             last = f"; the last to be opened is {self.saved[-1][0]} in line {self.saved[-1][0].line}" if self.saved else ""
@@ -176,52 +161,36 @@ class _Reader:
                 require_invertible("", "the current transformation", matrix)
             self._set_transform(matrix)
 
-    def _identity(self, statement: Statement) -> None:
-        statement.strings(0)
+    def _identity(self, _: Token) -> None:
         self._set_transform(np.eye(4))
 
-    def _name_frame(self, statement: Statement) -> None:
-        (name,) = statement.strings(1)
+    def _name_frame(self, name: Token) -> None:
         self.frames[name.name()] = self.graphics.world_from_object
 
-    def _enter_frame(self, statement: Statement) -> None:
-        (name,) = statement.strings(1)
+    def _enter_frame(self, name: Token) -> None:
         if name.name() not in self.frames:
             raise name.error(f"unknown coordinate system {name}; {nearest(name.name(), self.frames)}")
         self._set_transform(self.frames[name.name()])
 
     # The camera and its picture.
 
-    def _film(self, statement: Statement) -> None:
-        args = read_arguments(statement, KINDS["Film"])
-        for side in ("integer xresolution", "integer yresolution"):
-            args.require(side, args[side] >= 1, "be at least 1")
+    def _film(self, args: Arguments) -> None:
         self.resolution = args["integer xresolution"], args["integer yresolution"]
 
-    def _sampler(self, statement: Statement) -> None:
-        args = read_arguments(statement, KINDS["Sampler"])
+    def _sampler(self, args: Arguments) -> None:
         self.samples = SAMPLERS[args.kind](args)
 
-    def _pixel_filter(self, statement: Statement) -> None:
-        args = read_arguments(statement, KINDS["PixelFilter"])
-        for side in ("float xwidth", "float ywidth"):
-            args.require(side, args[side] == 0.5, "be 0.5")
+    def _only_checked(self, args: Arguments) -> None:
+        """Of a directive whose parameters may have one value only."""
 
-    def _integrator(self, statement: Statement) -> None:
-        args = read_arguments(statement, KINDS["SurfaceIntegrator"])
-        args.require("integer maxdepth", args["integer maxdepth"] == 5, "be 5")
-
-    def _camera(self, statement: Statement) -> None:
-        args = read_arguments(statement, KINDS["Camera"])
-        args.require("float fov", 0 < args["float fov"] < 180, "lie between 0 and 180 degrees")
+    def _camera(self, args: Arguments) -> None:
         with located(args.word):
             self.frames["camera"] = np.linalg.inv(self.graphics.world_from_object)
         self.camera = args
 
     # The world.
 
-    def _light_source(self, statement: Statement) -> None:
-        args = read_arguments(statement, KINDS["LightSource"])
+    def _light_source(self, args: Arguments) -> None:
         with located(args.word):
             self.lights.append(LIGHTS[args.kind](args, self.graphics.world_from_object))
 
@@ -229,20 +198,16 @@ class _Reader:
         name, value_type = statement.string(0), statement.string(1)
         if value_type.name() != "color":
             raise value_type.error(f'the type of a Texture must be "color", it is {value_type}')
-        args = read_arguments(statement, KINDS["Texture"], at=2)
+        args = statement.arguments(KINDS["Texture"], RULES, at=2)
         place = args.tokens["string filename"]
         with located(place):
-            texture = _Texture(resolve_inside(self.root, self.files[-1].parent, args["string filename"]), place)
-        self.graphics = replace(self.graphics, textures={**self.graphics.textures, name.name(): texture})
+            path = resolve_inside(self.root, self.files[-1].parent, args["string filename"])
+        self.graphics = replace(self.graphics, textures={**self.graphics.textures, name.name(): (path, place)})
 
-    def _set_material(self, statement: Statement) -> None:
-        args = read_arguments(statement, KINDS["Material"])
-        if args.kind == "matte":
-            args.require("float sigma", args["float sigma"] == 0, "be 0 (rough surfaces are not supported)")
+    def _set_material(self, args: Arguments) -> None:
         self.graphics = replace(self.graphics, material=args)
 
-    def _shape(self, statement: Statement) -> None:
-        args = read_arguments(statement, KINDS["Shape"])
+    def _shape(self, args: Arguments) -> None:
         matrix = self.graphics.world_from_object
         with located(args.word):
             shape = SHAPES[args.kind](args, self.dtype)
@@ -256,52 +221,48 @@ class _Reader:
         with located(args.word):
             if args.kind == "mirror":
                 return Mirror(args.colour("color Kr"))
-            return Matte(args.colour("color Kd") if args["texture Kd"] is None else self._texture(args))
+            return Matte(self._texture(args) if "texture Kd" in args.tokens else args.colour("color Kd"))
 
     def _texture(self, args: Arguments) -> ImageTexture:
         name, known = args["texture Kd"], self.graphics.textures
         if name not in known:
             hint = nearest(name[:60], known) if known else "there is none"
             raise args.error("texture Kd", f"unknown texture {name!r}; {hint}")
-        texture = known[name]
-        if texture.path not in self.images:
-            with located(texture.place):
-                self.images[texture.path] = ImageTexture(load_image(texture.path, transfer="srgb"))
-        return self.images[texture.path]
+        path, place = known[name]
+        if path not in self.images:
+            with located(place):
+                self.images[path] = ImageTexture(load_image(path, transfer="srgb"))
+        return self.images[path]
 
 
-@dataclass(frozen=True)
-class _Directive:
-    """Where a directive may stand ("options", "world", "any") and what it does."""
-
-    block: str
-    run: Callable[[_Reader, Statement], None]
+def _arguments(statement: Statement) -> Arguments:
+    return statement.arguments(KINDS[statement.word.text], RULES)
 
 
-_DIRECTIVES: Mapping[str, _Directive] = {
-    "AttributeBegin": _Directive("world", _Reader._save),
-    "AttributeEnd": _Directive("world", _Reader._restore),
-    "Camera": _Directive("options", _Reader._camera),
-    "ConcatTransform": _Directive("any", _Reader._concatenate),
-    "CoordSysTransform": _Directive("any", _Reader._enter_frame),
-    "CoordinateSystem": _Directive("any", _Reader._name_frame),
-    "Film": _Directive("options", _Reader._film),
-    "Identity": _Directive("any", _Reader._identity),
-    "Include": _Directive("any", _Reader._include),
-    "LightSource": _Directive("world", _Reader._light_source),
-    "LookAt": _Directive("any", _Reader._concatenate),
-    "Material": _Directive("world", _Reader._set_material),
-    "PixelFilter": _Directive("options", _Reader._pixel_filter),
-    "Rotate": _Directive("any", _Reader._concatenate),
-    "Sampler": _Directive("options", _Reader._sampler),
-    "Scale": _Directive("any", _Reader._concatenate),
-    "Shape": _Directive("world", _Reader._shape),
-    "SurfaceIntegrator": _Directive("options", _Reader._integrator),
-    "Texture": _Directive("world", _Reader._declare_texture),
-    "Transform": _Directive("any", _Reader._concatenate),
-    "TransformBegin": _Directive("world", _Reader._save),
-    "TransformEnd": _Directive("world", _Reader._restore),
-    "Translate": _Directive("any", _Reader._concatenate),
-    "WorldBegin": _Directive("options", _Reader._world_begin),
-    "WorldEnd": _Directive("world", _Reader._world_end),
+def _all(statement: Statement) -> Statement:
+    return statement
+
+
+# Where a directive may stand ("options", "world", "any"), what it takes, and what it does.
+_DIRECTIVES: Mapping[str, tuple[str, Callable[[Statement], Any], Callable[[_Reader, Any], None]]] = {
+    "AttributeBegin": ("world", Statement.nothing, _Reader._save),
+    "AttributeEnd": ("world", Statement.nothing, _Reader._restore),
+    "Camera": ("options", _arguments, _Reader._camera),
+    "CoordSysTransform": ("any", Statement.name, _Reader._enter_frame),
+    "CoordinateSystem": ("any", Statement.name, _Reader._name_frame),
+    "Film": ("options", _arguments, _Reader._film),
+    "Identity": ("any", Statement.nothing, _Reader._identity),
+    "Include": ("any", Statement.name, _Reader._include),
+    "LightSource": ("world", _arguments, _Reader._light_source),
+    "Material": ("world", _arguments, _Reader._set_material),
+    "PixelFilter": ("options", _arguments, _Reader._only_checked),
+    "Sampler": ("options", _arguments, _Reader._sampler),
+    "Shape": ("world", _arguments, _Reader._shape),
+    "SurfaceIntegrator": ("options", _arguments, _Reader._only_checked),
+    "Texture": ("world", _all, _Reader._declare_texture),
+    "TransformBegin": ("world", Statement.nothing, _Reader._save),
+    "TransformEnd": ("world", Statement.nothing, _Reader._restore),
+    "WorldBegin": ("options", Statement.nothing, _Reader._world_begin),
+    "WorldEnd": ("world", Statement.nothing, _Reader._world_end),
+    **dict.fromkeys(("ConcatTransform", "Transform", *TRANSFORMS), ("any", _all, _Reader._concatenate)),
 }

@@ -1,27 +1,33 @@
 """Checks on the tables of a TOML scene; each of them ends with the line on which things went wrong."""
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...core.errors import ArgumentError, UserError
 from ..errors import SceneError, nearest
-from .lines import Where
+from .lines import Where, follow, line_of
 from .tables import Keys
 
 
 class Part(NamedTuple):
-    """A table of the file `path`, and where in it the table stands."""
+    """A table of the file `path`, which holds `text`, and where in it the table stands."""
 
     path: Path
-    lines: Mapping[Where, int]
+    text: str
     where: Where
     table: dict[str, Any]
 
-    def at(self, *steps: str | int, table: dict[str, Any] | None = None) -> "Part":
-        """What stands in this table under `steps`."""
-        return self._replace(where=(*self.where, *steps), table={} if table is None else table)
+    def at(self, *steps: str | int) -> "Part":
+        """What stands in this table under `steps`; what is missing there, or is no table, is an empty one."""
+        depth, inner = follow(self.table, steps)
+        is_table = depth == len(steps) and isinstance(inner, dict)
+        return self._replace(where=(*self.where, *steps), table=inner if is_table else {})
+
+    def all(self, name: str) -> list["Part"]:
+        """The tables in the list `name`; none where it is missing."""
+        return [self.at(name, k) for k in range(len(self.table.get(name, ())))]
 
     @property
     def name(self) -> str:
@@ -29,9 +35,8 @@ class Part(NamedTuple):
         return "".join(f"[{step}]" if isinstance(step, int) else f".{step}" for step in self.where).lstrip(".")
 
     def error(self, message: str) -> SceneError:
-        """An error on the line of this part, or of the nearest one around it whose line is known."""
-        around = (self.where[:k] for k in range(len(self.where), 0, -1))
-        return SceneError(self.path, next((self.lines[where] for where in around if where in self.lines), None), message)
+        """An error on the line of this part, or of the nearest one around it."""
+        return SceneError(self.path, line_of(self.text, self.where), message)
 
     def read(self, keys: Keys) -> dict[str, Any]:
         """The values of all `keys`, by their kinds; SceneError on any other key, and on one that is missing."""
@@ -79,6 +84,13 @@ class Part(NamedTuple):
             has = f"it has {' and '.join(present)}" if present else "it has none"
             raise self.at(*present[1:2]).error(f"{self.name} must have exactly one of {', '.join(names)}; {has}")
         return present[0]
+
+    def at_most_one(self, first: str, second: str) -> str | None:
+        """Which of two keys the table has; None: neither."""
+        present = [name for name in (first, second) if name in self.table]
+        if len(present) > 1:
+            raise self.at(second).error(f"{self.name} must have {first} or {second}, it has both")
+        return present[0] if present else None
 
     def made(self, function: Callable[..., Any], *args: Any, **values: Any) -> Any:
         """function(*args, **values); what the user got wrong becomes a SceneError, on the line of the key that is to blame."""

@@ -24,7 +24,7 @@ from ..terrain import Terrain
 from .checks import Part
 from .priors import Sought, known_deviations, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene, transfer_of
-from .tables import SCENE, Key, Keys
+from .tables import SCENE, Key, Keys, optional
 from .values import flag, number, number_list, numbers, or_word, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
@@ -39,29 +39,23 @@ _CASE: Keys = {
 }
 _PICTURE: Keys = {
     "image": Key(word),
-    "transfer": Key(word, None),
-    "mask": Key(word, None),
-    "weights": Key(word, None),
-    "noise": Key(number, None),
-    "camera": Key(table, None),
-    "lights": Key(tables, None),
+    **optional("transfer", "mask", "weights", kind=word),
+    **optional("noise", kind=number),
+    **optional("camera", kind=table),
+    **optional("lights", kind=tables),
 }
 _ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argument of `fit` is in such a table
 # Those of `fit` and of `Settings`, whose defaults they have and who check their values.
 _FIT: Keys = {
-    "noise": Key(number, None),
-    **{name: Key(or_word(number), None) for name in ("start", "prior", "prior_std")},
-    **{
-        name: Key(number, None)
-        for name in ("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", "loss_scale", "tolerance")
-    },
-    **{name: Key(word, None) for name in ("albedo", "loss", "solver")},
-    **{name: Key(flag, None) for name in ("exposures", "offsets")},
-    "light_std": Key(number, None),
-    "camera_std": Key(numbers(2), None),
-    **{name: Key(whole, None) for name in ("max_steps", "inner_steps", "checkpoint_every")},
-    "levels": Key(number_list, None),
-    "uncertainty": Key(or_word(whole), None),
+    **optional("start", "prior", "prior_std", kind=or_word(number)),
+    **optional("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", kind=number),
+    **optional("noise", "light_std", "loss_scale", "tolerance", kind=number),
+    **optional("albedo", "loss", "solver", kind=word),
+    **optional("exposures", "offsets", kind=flag),
+    **optional("camera_std", kind=numbers(2)),
+    **optional("max_steps", "inner_steps", "checkpoint_every", kind=whole),
+    **optional("levels", kind=number_list),
+    **optional("uncertainty", kind=or_word(whole)),
 }
 _WHOLE_OR_FLAG = {int: whole, int | None: whole, bool: flag}
 _SETTINGS: Keys = {
@@ -119,17 +113,7 @@ class _Base(NamedTuple):
 
 
 def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
-    """Reads a .toml file with pictures, and the files that it names.
-
-    Args:
-      path: the file; those that it names lie in its folder or below.
-      dtype: of the heights, and thereby the precision of the fit: float32, or float64, which needs JAX's x64 mode.
-
-    Raises:
-      FileNotFoundError: `path` is not there.
-      ValueError: its ending or `dtype` is another, or x64 mode is off for float64.
-      SceneError: something is wrong in the file; the message gives its line.
-    """
+    """Reads a .toml file with pictures, and the files that it names; arguments and errors as those of `load_scene`."""
     dtype, path = require_precision(dtype), require_file(path)
     by_ending({".toml": None}, path, "read what to fit from")
     part = open_toml(path)
@@ -137,41 +121,41 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         part.require_known(_CASE)
         raise part.error("a fit must have 'pictures', those that were measured; this is a scene, for `jaxhf render`")
     values = part.read(_CASE)
-    settings = _given(part.at("settings", table=values["settings"]), _SETTINGS)
-    settings = part.at("settings", table=values["settings"]).made(Settings, **settings)
+    chosen = part.at("settings")
+    settings = chosen.made(Settings, **_given(chosen, _SETTINGS))
     base = _base(part, values, dtype)
     if not values["pictures"]:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
-    chosen = part.at("fit", table=values["fit"])
+    chosen = part.at("fit")
     options = _given(chosen, _FIT)
     noise = options.pop("noise", None)
     for name in ("start", "prior", "prior_std"):
         if isinstance(options.get(name), str):
             known = known_deviations if name == "prior_std" else known_heights
             options[name] = _read(chosen, name, partial(known, base.sought), options[name])
-    scenes, targets, weights, noises, names = [], [], [], [], []
-    for k, picture_table in enumerate(values["pictures"]):
-        picture = part.at("pictures", k, table=picture_table)
-        given = picture.read(_PICTURE)
-        target = _read(picture, "image", partial(load_image, transfer=transfer_of(picture)), given["image"])
-        lights = base.lights if given["lights"] is None else read_lights(picture, given["lights"], base.sought.stored)
-        camera = _camera(picture, given["camera"], base, target.shape[:2])
-        scenes.append(picture.made(Scene, base.objects, camera, lights, base.samples))
-        targets.append(target)
-        weights.append(_weights(picture, given, target))
-        noises.append(noise if given["noise"] is None else given["noise"])
-        names.append(given["image"])
-        if noises[-1] is not None and not noises[-1] > 0:
-            place = (chosen if given["noise"] is None else picture).at("noise")
-            raise place.error(f"{place.name} must be positive, it is {noises[-1]:g}")
+    pictures = [_picture(picture, base, chosen, noise) for picture in part.all("pictures")]
+    scenes, targets, weights, noises, names = zip(*pictures, strict=True)
     known = [value for value in noises if value is not None]
     if known and len(known) < len(noises):
         place = part.at("pictures", noises.index(None))
         raise place.error(f"{place.name} must have a noise, as another picture has one; or none, then it is estimated")
-    return Case(
-        tuple(scenes), tuple(targets), tuple(weights), tuple(known) or None, settings, options, tuple(names),
-        base.sought.like, part,
-    )  # fmt: skip
+    return Case(scenes, targets, weights, tuple(known) or None, settings, options, names, base.sought.like, part)
+
+
+def _picture(
+    part: Part, base: _Base, chosen: Part, noise: float | None
+) -> tuple[Scene, np.ndarray, np.ndarray | None, float | None, str]:
+    """A picture's scene, radiance, weights, noise and name; `noise` is that of the table `chosen`, for all pictures."""
+    given = part.read(_PICTURE)
+    target = _read(part, "image", partial(load_image, transfer=transfer_of(part)), given["image"])
+    lights = base.lights if given["lights"] is None else read_lights(part, base.sought.stored)
+    scene = part.made(Scene, base.objects, _camera(part, base, target.shape[:2]), lights, base.samples)
+    weights = _weights(part, given, target)
+    place, noise = (chosen, noise) if given["noise"] is None else (part, given["noise"])
+    if noise is not None and not noise > 0:
+        place = place.at("noise")
+        raise place.error(f"{place.name} must be positive, it is {noise:g}")
+    return scene, target, weights, noise, given["image"]
 
 
 def _given(part: Part, keys: Keys) -> dict[str, Any]:
@@ -182,7 +166,7 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     if values["scene"] is None:
         if values["objects"] is None:
             raise part.error("a fit must have 'scene', the name of a scene file, or 'objects', both are missing")
-        return _toml_base(part, values, dtype)
+        return _toml_base(part, values["samples"], dtype)
     for name in SCENE:
         if name in part.table:
             raise part.at(name).error(f"{name} must stand without scene, whose file has its own")
@@ -190,18 +174,18 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     path = place.made(named_file, part, values["scene"])
     if place.made(by_ending, {".toml": True, ".pbrt": False}, path, "read a scene from"):
         other = open_toml(path)
-        return _toml_base(other, read_scene(other), dtype)
+        return _toml_base(other, read_scene(other)["samples"], dtype)
     scene = load_pbrt(path, dtype)
     sought = _sought(part, [{}] * len(scene.objects), [(item, None) for item in scene.objects])
     return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, sought)
 
 
-def _toml_base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
-    objects = read_objects(part, values, dtype)
-    camera = None if values["camera"] is None else partial(_sized, part.at("camera", table=values["camera"]))
-    sought = _sought(part, values["objects"], objects)
-    lights = read_lights(part, values["lights"], sought.stored)
-    return _Base(tuple(item for item, _ in objects), tuple(lights), values["samples"], camera, sought)
+def _toml_base(part: Part, samples: int, dtype: np.dtype) -> _Base:
+    objects = read_objects(part, dtype)
+    camera = partial(_sized, part.at("camera")) if "camera" in part.table else None
+    sought = _sought(part, part.table["objects"], objects)
+    lights = read_lights(part, sought.stored)
+    return _Base(tuple(item for item, _ in objects), tuple(lights), samples, camera, sought)
 
 
 def _sought(part: Part, tables: Sequence[dict[str, Any]], objects: Sequence[tuple[Object, Terrain | None]]) -> Sought:
@@ -229,25 +213,23 @@ def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any
 
 
 def _weights(picture: Part, given: dict[str, Any], target: np.ndarray) -> Float32[np.ndarray, "h w"] | None:
-    present = [name for name in ("mask", "weights") if given[name] is not None]
+    present = picture.at_most_one("mask", "weights")
     size = target.shape[:2]
     declares = Path(given["image"]).suffix.lower() in (".tif", ".tiff")  # a nan elsewhere is for `fit` to refuse
     there = ~np.isnan(target[..., 0]) if declares else np.ones(size, bool)
-    if not present:
+    if present is None:
         return None if there.all() else there.astype(np.float32)
-    if len(present) > 1:
-        raise picture.at("weights").error(f"{picture.name} must have mask or weights, it has both")
-    weights = _read(picture, present[0], load_numbers, given[present[0]]).mean(axis=-1)
+    weights = _read(picture, present, load_numbers, given[present]).mean(axis=-1)
     if weights.shape != size:
-        place = picture.at(present[0])
+        place = picture.at(present)
         raise place.error(f"{place.name} must have the size of the image, {_by(size)}; it is {_by(weights.shape)}")
-    weights = (weights > 0).astype(np.float32) if present[0] == "mask" else weights
+    weights = (weights > 0).astype(np.float32) if present == "mask" else weights
     return np.where(there, weights, np.zeros_like(weights))
 
 
-def _camera(picture: Part, view: dict[str, Any] | None, base: _Base, size: tuple[int, ...]) -> Camera:
-    if view is not None:
-        camera = _sized(picture.at("camera", table=view), size)
+def _camera(picture: Part, base: _Base, size: tuple[int, ...]) -> Camera:
+    if "camera" in picture.table:
+        camera = _sized(picture.at("camera"), size)
     elif base.camera is not None:
         camera = base.camera(size)
     else:

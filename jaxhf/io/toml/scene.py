@@ -16,38 +16,29 @@ from numpy.typing import DTypeLike
 from ...core.affine import require_invertible
 from ...core.errors import ArgumentError
 from ...core.precision import fitted
+from ...scene import procedural
 from ...scene.camera import Camera
 from ...scene.cylinder import Cylinder
 from ...scene.heightfield import Heightfield
 from ...scene.light import Directional, Light
 from ...scene.scene import Object, Scene
 from ...scene.texture import ImageTexture, Wrap
-from .. import procedural
 from ..errors import SceneError, nearest, resolve_inside
 from ..images import TRANSFERS, load_image
 from ..load_terrain import jacksboro_file, read_terrain
 from ..terrain import Terrain
 from .checks import Part
-from .lines import line_numbers
 from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, OBJECT, ORIGINS, SCENE, TEXTURES, Key, Keys
 from .values import word
 
 
 def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
-    """Reads a scene.
-
-    Args:
-      path: a .toml file; the files that it names lie in its folder or below.
-      dtype: of the heights, and thereby the precision of the picture.
-
-    Raises:
-      SceneError: anything is wrong in it; with its line.
-    """
+    """The scene that a .toml file describes; arguments and errors as those of `load_scene`."""
     part = open_toml(path)
     values = read_scene(part)
-    camera = read_camera(part.at("camera", table=values["camera"]))
-    objects = read_objects(part, values, np.dtype(dtype))
-    lights = read_lights(part, values["lights"], next((stored for _, stored in objects if stored is not None), None))
+    camera = read_camera(part.at("camera"))
+    objects = read_objects(part, np.dtype(dtype))
+    lights = read_lights(part, next((stored for _, stored in objects if stored is not None), None))
     return part.made(Scene, [item for item, _ in objects], camera, lights, samples=values["samples"])
 
 
@@ -63,7 +54,7 @@ def open_toml(path: Path) -> Part:
         raise SceneError(path, int(at[1]) if at else len(text.splitlines()), f"this is not TOML: {message}") from error
     except (UnicodeDecodeError, RecursionError) as error:
         raise SceneError(path, None, f"this is not TOML: {error}") from error
-    return Part(path, line_numbers(text), (), content)
+    return Part(path, text, (), content)
 
 
 def read_scene(part: Part) -> dict[str, Any]:
@@ -78,9 +69,9 @@ def read_camera(part: Part) -> Camera:
     return _variant(part, "type", CAMERAS)
 
 
-def read_lights(part: Part, tables: list[dict[str, Any]], terrain: Terrain | None) -> list[Light]:
+def read_lights(part: Part, terrain: Terrain | None) -> list[Light]:
     """The lights in the list `lights` of `part`; those by date alone stand where they do over the terrain."""
-    return [_light(part.at("lights", k, table=table), terrain) for k, table in enumerate(tables)]
+    return [_light(light, terrain) for light in part.all("lights")]
 
 
 def _light(part: Part, terrain: Terrain | None) -> Light:
@@ -98,10 +89,10 @@ def _light(part: Part, terrain: Terrain | None) -> Light:
     return light
 
 
-def read_objects(part: Part, values: dict[str, Any], dtype: np.dtype) -> list[tuple[Object, Terrain | None]]:
+def read_objects(part: Part, dtype: np.dtype) -> list[tuple[Object, Terrain | None]]:
     """The objects of a scene with its textures; beside those from a terrain file, this file in its own coordinates."""
-    textures = {name: _texture(part.at("textures", name, table=table)) for name, table in values["textures"].items()}
-    return [_object(part.at("objects", k, table=table), textures, dtype) for k, table in enumerate(values["objects"])]
+    textures = {name: _texture(part.at("textures", name)) for name in part.table.get("textures", {})}
+    return [_object(item, textures, dtype) for item in part.all("objects")]
 
 
 def _variant(part: Part, key: str, variants: Any) -> Any:
@@ -148,13 +139,11 @@ def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> t
 
 
 def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
-    given = [name for name in ("transform", "matrix") if values[name] is not None]
-    if not given:
+    given = part.at_most_one("transform", "matrix")
+    if given is None:
         return None
-    if len(given) > 1:
-        raise part.at("matrix").error(f"{part.name} must have transform or matrix, it has both")
-    part.made(require_invertible, "", given[0], values[given[0]])
-    return values[given[0]]
+    part.made(require_invertible, "", given, values[given])
+    return values[given]
 
 
 def _painted(part: Part, value: Any, textures: dict[str, ImageTexture]) -> Any:

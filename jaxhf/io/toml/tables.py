@@ -6,37 +6,27 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from ...core.errors import ArgumentError
+from ...scene import procedural
 from ...scene.camera import Camera, Orthographic, Perspective
+from ...scene.cylinder import Cylinder
 from ...scene.light import Directional, Light, Point, Sky, Sun
 from ...scene.material import Material, Matte, Mirror
-from .. import procedural
-from .values import (
-    angle_above_horizon,
-    colour,
-    grid,
-    instant,
-    matrix,
-    number,
-    numbers,
-    or_word,
-    size,
-    steps,
-    table,
-    table_of_tables,
-    tables,
-    whole,
-    word,
-)
+from . import values as kinds
 
 
 class Key(NamedTuple):
     """What a key takes. Without a `default` it must be there; where that is None, the reader decides."""
 
-    kind: Callable[[Any], Any]
+    kind: kinds.Kind
     default: Any = ...
 
 
 Keys = Mapping[str, Key]
+
+
+def optional(*names: str, kind: kinds.Kind | None = None) -> Keys:
+    """Keys that may be missing, of one kind or, where that is None, of those that their names say."""
+    return {name: Key(kind or _KINDS[name], None) for name in names}
 
 
 def _directional(irradiance, radiance=None, kind: type[Directional] = Directional, **given) -> Directional:
@@ -62,85 +52,70 @@ def _point(position, intensity) -> Point:
     return Point(position, intensity)
 
 
-SCENE: Keys = {
-    "samples": Key(whole, 1),
-    "camera": Key(table),
-    "lights": Key(tables, []),
-    "textures": Key(table_of_tables, {}),
-    "objects": Key(tables),
+# What each parameter takes of the functions and classes that make the parts of a scene.
+_KINDS: Mapping[str, kinds.Kind] = {
+    "albedo": kinds.or_word(kinds.colour, ", or the name of a texture"),
+    "altitude": kinds.angle_above_horizon,
+    "convention": kinds.word,
+    "size": kinds.size,
+    "time": kinds.instant,
+    "world_from_camera": kinds.matrix,
+    **dict.fromkeys(("eye", "target", "up", "towards", "position"), kinds.numbers(3)),
+    **dict.fromkeys(("range", "lengths", "sun"), kinds.numbers(2)),
+    **dict.fromkeys(("width", "height", "chords", "occlusion", "seed", "count", "lines", "squares"), kinds.whole),
+    **dict.fromkeys(("fov", "extent", "fx", "fy", "cx", "cy"), kinds.number),
+    **dict.fromkeys(("azimuth", "latitude", "longitude", "angular_diameter", "radius", "z_min", "z_max"), kinds.number),
+    **dict.fromkeys(("exponent", "level", "direction", "spread", "sun_radius", "clouds"), kinds.number),
+    **dict.fromkeys(("irradiance", "intensity", "radiance", "reflectance"), kinds.colour),
+    **dict.fromkeys(("zenith", "horizon", "sun_radiance", "first", "second"), kinds.colour),
 }
-_VIEW: Keys = {
-    "eye": Key(numbers(3)),
-    "target": Key(numbers(3)),
-    "up": Key(numbers(3), [0.0, 0.0, 1.0]),
-    "width": Key(whole, 512),
-    "height": Key(whole, 512),
+
+
+def _keys(function: Callable[..., Any], **defaults: Any) -> Keys:
+    """The parameters of a function, with its defaults where there are no others."""
+    given = inspect.signature(function).parameters.values()
+    own = {p.name: ... if p.default is p.empty else p.default for p in given}
+    return {name: Key(_KINDS[name], default) for name, default in {**own, **defaults}.items()}
+
+
+SCENE: Keys = {
+    "samples": Key(kinds.whole, 1),
+    "camera": Key(kinds.table),
+    "lights": Key(kinds.tables, []),
+    "textures": Key(kinds.table_of_tables, {}),
+    "objects": Key(kinds.tables),
 }
 CAMERAS: dict[str, tuple[Callable[..., Camera], Keys]] = {
-    "perspective": (Perspective.look_at, {**_VIEW, "fov": Key(number, 45.0)}),
-    "orthographic": (Orthographic.look_at, {**_VIEW, "extent": Key(number)}),
-    "pinhole": (
-        Perspective.from_intrinsics,
-        {
-            **{name: Key(number) for name in ("fx", "fy", "cx", "cy")},
-            "world_from_camera": Key(matrix),
-            "convention": Key(word, "opencv"),
-            **{name: Key(whole) for name in ("width", "height")},
-        },
-    ),
+    "perspective": (Perspective.look_at, _keys(Perspective.look_at)),
+    "orthographic": (Orthographic.look_at, _keys(Orthographic.look_at, extent=...)),
+    "pinhole": (Perspective.from_intrinsics, _keys(Perspective.from_intrinsics)),
 }
-_DIRECTION: Keys = {
-    "towards": Key(numbers(3), None),
-    "azimuth": Key(number, None),
-    "altitude": Key(angle_above_horizon, None),
-    "time": Key(instant, None),
-    **{name: Key(number, None) for name in ("latitude", "longitude")},
-    "irradiance": Key(colour, None),
-}
+_DIRECTION = optional("towards", "azimuth", "altitude", "time", "latitude", "longitude", "irradiance")
 LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
-    "directional": (_directional, {**_DIRECTION, "radiance": Key(colour, None)}),  # the old name of irradiance
-    "sun": (
-        functools.partial(_directional, kind=Sun),
-        {**_DIRECTION, "angular_diameter": Key(number, None), "chords": Key(whole, None)},
-    ),
-    "point": (_point, {"position": Key(numbers(3)), "intensity": Key(colour)}),
-    "sky": (Sky, {"radiance": Key(colour), "occlusion": Key(whole, None)}),
+    "directional": (_directional, {**_DIRECTION, **optional("radiance")}),  # the old name of irradiance
+    "sun": (functools.partial(_directional, kind=Sun), {**_DIRECTION, **optional("angular_diameter", "chords")}),
+    "point": (_point, _keys(_point)),
+    "sky": (Sky, _keys(Sky)),
 }
 MATERIALS: dict[str, tuple[Callable[..., Material], Keys]] = {
-    "matte": (Matte, {"albedo": Key(or_word(colour, ", or the name of a texture"), 0.7)}),
-    "mirror": (Mirror, {"reflectance": Key(colour, 0.9)}),
+    "matte": (Matte, _keys(Matte, albedo=0.7)),
+    "mirror": (Mirror, _keys(Mirror)),
 }
-
-# The parameters of procedural heights and textures, by their names in `procedural.py`.
-_PARAMETERS: dict[str, Callable[[Any], Any]] = {
-    "size": size,
-    **{name: whole for name in ("seed", "count", "lines", "squares")},
-    **{name: number for name in ("exponent", "level", "direction", "spread", "radius", "sun_radius", "clouds")},
-    **{name: numbers(2) for name in ("range", "lengths", "sun")},
-    **{name: colour for name in ("zenith", "horizon", "sun_radiance", "first", "second")},
-}
-
-
-def _parameters(function: Callable[..., Any]) -> Keys:
-    given = inspect.signature(function).parameters.values()
-    return {p.name: Key(_PARAMETERS[p.name], ... if p.default is p.empty else p.default) for p in given}
-
-
-TEXTURES = {name: (function, _parameters(function)) for name, function in procedural.TEXTURES.items()}
+TEXTURES = {name: (function, _keys(function)) for name, function in procedural.TEXTURES.items()}
 HEIGHTS: dict[str, Keys] = {
     "jacksboro": {},
-    **{name: _parameters(function) for name, function in procedural.HEIGHTS.items()},
+    **{name: _keys(function) for name, function in procedural.HEIGHTS.items()},
 }
 ORIGINS: dict[str, Keys] = {  # where a heightfield comes from
-    "heights": {"heights": Key(grid)},
-    "file": {"file": Key(word), "nodata": Key(number, None)},
-    "source": {"source": Key(word)},
+    "heights": {"heights": Key(kinds.grid)},
+    "file": {"file": Key(kinds.word), **optional("nodata", kind=kinds.number)},
+    "source": {"source": Key(kinds.word)},
 }
-GRID: Keys = {**{name: Key(number, None) for name in ("dx", "dy", "x0", "y0")}, "z_scale": Key(number, 1.0)}
-CYLINDER: Keys = {"radius": Key(number, 1.0), "z_min": Key(number, -1.0), "z_max": Key(number, 1.0)}
+GRID: Keys = {**optional("dx", "dy", "x0", "y0", kind=kinds.number), "z_scale": Key(kinds.number, 1.0)}
+CYLINDER = _keys(Cylinder)
 OBJECT: Keys = {
-    "shape": Key(word),
-    "material": Key(word, "matte"),
-    "transform": Key(steps, None),
-    "matrix": Key(matrix, None),
+    "shape": Key(kinds.word),
+    "material": Key(kinds.word, "matte"),
+    "transform": Key(kinds.steps, None),
+    "matrix": Key(kinds.matrix, None),
 }

@@ -16,6 +16,52 @@ from ..errors import nearest
 _FARTHEST = 1e18  # of a position: squares of distances are numbers in single precision
 
 
+Kind = Callable[[Any], Any]
+
+
+def _kind(holds: Callable[[Any], bool], must_be: str) -> Kind:
+    def kind(value: Any) -> Any:
+        if not holds(value):
+            raise ValueError(must_be)
+        return value
+
+    return kind
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) is int or (isinstance(value, float) and math.isfinite(value))
+
+
+def _is_whole(value: Any) -> bool:
+    return type(value) is int  # exactly: True is an int
+
+
+def _is_list(value: Any, count: int, of: Callable[[Any], bool]) -> bool:
+    return isinstance(value, list) and len(value) == count and all(map(of, value))
+
+
+def _in_range(value: Any, most: float = MOST) -> float:
+    if not -most <= value <= most:
+        raise ValueError(f"within -{most:g} and {most:g}")
+    return float(value)
+
+
+whole = _kind(_is_whole, "a whole number")
+word = _kind(lambda value: isinstance(value, str), "a string")
+flag = _kind(lambda value: isinstance(value, bool), "true or false")
+instant = _kind(
+    lambda value: isinstance(value, datetime) and value.tzinfo is not None,
+    "a date and time with its offset from UTC, without quotes, such as 2026-06-21T12:00:00Z",
+)
+size = _kind(lambda value: _is_list(value, 2, _is_whole), "a list of 2 whole numbers, rows and columns")
+table = _kind(lambda value: isinstance(value, dict), "a table")
+tables = _kind(lambda value: isinstance(value, list) and all(isinstance(item, dict) for item in value), "a list of tables")
+
+
+def table_of_tables(value: Any) -> dict[str, dict[str, Any]]:
+    return {name: table(item) for name, item in table(value).items()}
+
+
 def number(value: Any) -> float:
     if not _is_number(value):
         raise ValueError("a finite number")
@@ -28,31 +74,7 @@ def angle_above_horizon(value: Any) -> float:
     return float(value)
 
 
-def whole(value: Any) -> int:
-    if not _is_whole(value):
-        raise ValueError("a whole number")
-    return value
-
-
-def instant(value: Any) -> datetime:
-    if not isinstance(value, datetime) or value.tzinfo is None:
-        raise ValueError("a date and time with its offset from UTC, without quotes, such as 2026-06-21T12:00:00Z")
-    return value
-
-
-def word(value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError("a string")
-    return value
-
-
-def flag(value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise ValueError("true or false")
-    return value
-
-
-def or_word(kind: Callable[[Any], Any], tail: str = " or a string") -> Callable[[Any], Any]:
+def or_word(kind: Kind, tail: str = " or a string") -> Kind:
     """A string, or what `kind` takes; `tail` goes behind what that must be."""
 
     def either(value: Any) -> Any:
@@ -70,19 +92,13 @@ def number_list(value: Any) -> list[float]:
     return [_in_range(item, _FARTHEST) for item in value]
 
 
-def numbers(count: int) -> Callable[[Any], list[float]]:
+def numbers(count: int) -> Kind:
     def kind(value: Any) -> list[float]:
         if not _is_list(value, count, _is_number):
             raise ValueError(f"a list of {count} finite numbers")
         return number_list(value)
 
     return kind
-
-
-def size(value: Any) -> list[int]:
-    if not _is_list(value, 2, _is_whole):
-        raise ValueError("a list of 2 whole numbers, rows and columns")
-    return value
 
 
 def factors(value: Any) -> list[float]:
@@ -133,7 +149,7 @@ def steps(value: Any) -> Float[np.ndarray, "4 4"]:
     return product
 
 
-STEPS: dict[str, tuple[Callable[[Any], list[float]], Callable[..., np.ndarray]]] = {
+STEPS: dict[str, tuple[Kind, Callable[..., np.ndarray]]] = {
     "translate": (numbers(3), translate),
     "rotate": (numbers(4), rotate),
     "scale": (factors, scale),
@@ -144,37 +160,3 @@ def matrix(value: Any) -> Float[np.ndarray, "4 4"]:
     if not isinstance(value, list) or len(value) != 4:
         raise ValueError("a list of 4 rows of 4 numbers")
     return np.array([numbers(4)(row) for row in value])
-
-
-def table(value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError("a table")
-    return value
-
-
-def tables(value: Any) -> list[dict[str, Any]]:
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise ValueError("a list of tables")
-    return value
-
-
-def table_of_tables(value: Any) -> dict[str, dict[str, Any]]:
-    return {name: table(item) for name, item in table(value).items()}
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) is int or (isinstance(value, float) and math.isfinite(value))
-
-
-def _in_range(value: Any, most: float = MOST) -> float:
-    if not -most <= value <= most:
-        raise ValueError(f"within -{most:g} and {most:g}")
-    return float(value)
-
-
-def _is_whole(value: Any) -> bool:
-    return type(value) is int  # exactly: True is an int
-
-
-def _is_list(value: Any, count: int, of: Callable[[Any], bool]) -> bool:
-    return isinstance(value, list) and len(value) == count and all(map(of, value))

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, UserError
-from .files import require_pixels
+from .heightfield import MOST_CELLS
 
 Pair = Sequence[float]
 Colour = Sequence[float]
@@ -176,7 +176,9 @@ def _generator(seed: int) -> np.random.Generator:
 def _require_size(size: Sequence[int], least: int) -> None:
     if min(size) < least:
         raise ArgumentError("", "size", f"must be at least {least} x {least}, it is {list(size)}")
-    require_pixels(size[0], size[1])
+    rows, columns = size
+    if rows * columns > MOST_CELLS:
+        raise ArgumentError("", "size", f"must hold at most {MOST_CELLS} pixels, it declares {columns} x {rows}")
 
 
 def _noise(size: Sequence[int], seed: int, exponent: float) -> np.ndarray:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxhf.io.files import MAX_PIXELS
-from jaxhf.io.procedural import HEIGHTS, TEXTURES, bumps, checker, fractal, grid, sky, waves
+from jaxhf.scene.heightfield import MOST_CELLS
+from jaxhf.scene.procedural import HEIGHTS, TEXTURES, bumps, checker, fractal, grid, sky, waves
 
 
 @pytest.mark.parametrize("make", HEIGHTS.values(), ids=HEIGHTS)
@@ -82,7 +82,7 @@ def test_sky_is_bright_at_the_sun_and_blue_at_the_top():
     ("make", "parameters", "message"),
     [
         (fractal, {"size": [1, 5]}, r"size must be at least 2 x 2, it is \[1, 5\]"),
-        (waves, {"size": [2**15, 2**15]}, f"at most {MAX_PIXELS} pixels"),
+        (waves, {"size": [2**15, 2**15]}, f"at most {MOST_CELLS} pixels"),
         (fractal, {"range": (1.0, 0.0)}, r"range must be \(lowest, highest\), it is \[1.0, 0.0\]"),
         (fractal, {"seed": -1}, "non-negative"),
         (waves, {"count": 0}, "count must be from 1 on, it is 0"),

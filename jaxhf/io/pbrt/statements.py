@@ -1,0 +1,190 @@
+"""The tokens of a .pbrt file as directives with what they take: numbers, a name, or a kind and its typed parameters."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import SceneError, nearest
+from .tokens import Token, Values, tokenize
+
+Parameters = Mapping[str, Token]  # the defaults of a kind's parameters, by the keys of the file such as "float fov"
+Kinds = Mapping[str, Parameters]
+Rule = tuple[Callable[[Any], bool], str]  # whether a value is allowed, and what it must be
+
+_REQUIRED, _MANY = "[]", "[...]"  # in place of a default
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """The parameters of one statement: `values` of all that there are, the `tokens` of those that were given."""
+
+    word: Token
+    kind: str
+    values: Mapping[str, Any]
+    tokens: Mapping[str, Token]
+
+    def __getitem__(self, declared: str) -> Any:
+        return self.values[declared]
+
+    def error(self, declared: str, message: str, k: int | None = None) -> SceneError:
+        """An error where that parameter's value stands, else at the directive."""
+        return self.tokens.get(declared, self.word).error(message, k)
+
+    def require(self, declared: str, valid: bool, rule: str) -> None:
+        if not valid:
+            raise self.error(declared, f"{declared.split()[1]} must {rule}, it is {self.values[declared]}")
+
+    def colour(self, declared: str) -> Any:
+        """Of a light or a surface: SceneError where it is negative."""
+        self.require(declared, bool(np.all(self[declared] >= 0)), "be 0 or more")
+        return self[declared]
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A directive and all that stands before the next one."""
+
+    word: Token
+    rest: tuple[Token, ...]
+
+    def nothing(self) -> Token:
+        """The directive itself, behind which nothing may stand."""
+        self._exactly(0, "string", "nothing")
+        return self.word
+
+    def name(self) -> Token:
+        """The string that follows the directive, and nothing else."""
+        return self._exactly(1, "string", "a name in quotes")[0]
+
+    def numbers(self, n: int) -> list[float]:
+        """The n bare numbers that follow the directive, and nothing else."""
+        tokens = self._exactly(n, "number", f"{n} numbers")
+        values = [float(token.text) for token in tokens]
+        for token, value in zip(tokens, values, strict=True):
+            if not np.isfinite(value):
+                raise token.error(f"{self.word} takes finite numbers, found {token}")
+        return values
+
+    def matrix(self) -> Float[np.ndarray, "4 4"]:
+        """The 16 numbers in brackets that follow the directive, column by column as pbrt writes them."""
+        (token,) = self._exactly(1, "block", "16 numbers in brackets")
+        values = token.values()
+        if isinstance(values, tuple) or len(values) != 16:
+            raise token.error(f"{self.word} takes 16 numbers, found {_counted(values)}")
+        return values.reshape(4, 4).T
+
+    def string(self, k: int) -> Token:
+        """The k-th token, which has to be a string; parameters may follow."""
+        place, found = (self.rest[k], str(self.rest[k])) if k < len(self.rest) else (self.word, "nothing")
+        if place.kind != "string":
+            raise place.error(f"{self.word} takes a name in quotes here, found {found}")
+        return place
+
+    def _exactly(self, n: int, kind: Literal["number", "string", "block"], what: str) -> tuple[Token, ...]:
+        for k, token in enumerate(self.rest):
+            if k >= n or token.kind != kind:
+                raise token.error(f"{self.word} takes {what}, found {token}")
+        if len(self.rest) < n:
+            raise self.word.error(f"{self.word} takes {what}, found {len(self.rest)}")
+        return self.rest
+
+    def arguments(self, kinds: Kinds, rules: Mapping[str, Rule], at: int = 0) -> Arguments:
+        """The kind of a `Shape "kind" "type name" value ...` and its parameters; `at`: how many strings precede the kind."""
+        word, kind = self.word, self.string(at)
+        defaults = kinds.get(kind.name())
+        if defaults is None:
+            raise kind.error(f"unknown {word} {kind}; {nearest(kind.name()[:60], kinds)}")
+        values: dict[str, Any] = {}
+        tokens: dict[str, Token] = {}
+        pairs = self.rest[at + 1 :]
+        for k in range(0, len(pairs), 2):
+            declared = _declared(f"{word} {kind}", pairs[k], defaults)
+            if declared in tokens:
+                raise pairs[k].error(f"{declared!r} is given twice")
+            if k + 1 == len(pairs):
+                raise pairs[k].error(f"{declared!r} has no value")
+            tokens[declared] = pairs[k + 1]
+            values[declared] = _value(declared, pairs[k + 1], defaults[declared].text == _MANY)
+        for declared, default in defaults.items():
+            if declared not in tokens:
+                if default.text in (_REQUIRED, _MANY):
+                    raise word.error(f"{word} {kind} must have a parameter {declared!r}")
+                values[declared] = _value(declared, default, False)
+        found = Arguments(word, kind.name(), values, tokens)
+        for declared, (holds, rule) in rules.items():
+            if declared in values:
+                found.require(declared, holds(values[declared]), rule)
+        return found
+
+
+def statements(path: Path, text: str) -> Iterator[Statement]:
+    """Splits `text` at its directives, known or not."""
+    word, rest = None, []
+    for token in tokenize(path, text):
+        if token.kind != "word":
+            if word is None:
+                raise token.error(f"a directive must come first, found {token}")
+            rest.append(token)
+            continue
+        if word is not None:
+            yield Statement(word, tuple(rest))
+        word, rest = token, []
+    if word is not None:
+        yield Statement(word, tuple(rest))
+
+
+def kinds(text: str) -> Mapping[str, Kinds]:
+    """The kinds of each directive in statements that give every parameter its default."""
+    found: dict[str, dict[str, Parameters]] = {}
+    for statement in statements(Path(), text):
+        kind, *pairs = statement.rest
+        defaults = {name.name(): value for name, value in zip(pairs[::2], pairs[1::2], strict=True)}
+        found.setdefault(statement.word.text, {})[kind.name()] = defaults
+    return found
+
+
+def _declared(place: str, token: Token, table: Parameters) -> str:
+    """The key in `table` that `token` declares."""
+    if token.kind != "string":
+        raise token.error(f"{place} takes a parameter such as {next(iter(table))!r} here, found {token}")
+    declared = " ".join(token.name().split())
+    if declared in table:
+        return declared
+    same_name = [known for known in table if known.split()[1] == declared.split()[-1]] if declared else []
+    if same_name:
+        raise token.error(f"{place} takes {' or '.join(map(repr, same_name))}, not {declared!r}")
+    raise token.error(f"unknown parameter {declared!r} of {place}; {nearest(declared[:60], table)}")
+
+
+def _value(declared: str, token: Token, many: bool) -> Any:
+    """The value of a parameter: one of Python's, an array where it has three numbers or more, or a string."""
+    kind = declared.split()[0]
+    values, count, is_text = token.values(), 3 if kind in ("color", "point") else 1, kind in ("string", "texture", "bool")
+    if isinstance(values, tuple) != is_text or not (many or len(values) == count):
+        raise token.error(f"{declared!r} takes {_amount(None if many else count, is_text)}, found {_counted(values)}")
+    if isinstance(values, tuple):
+        if kind == "bool" and values[0] not in ("true", "false"):
+            raise token.error(f'{declared!r} must be "true" or "false", it is {values[0]!r}')
+        return values[0] == "true" if kind == "bool" else values[0]
+    if many:
+        return values
+    if not np.isfinite(values).all():
+        raise token.error(f"{declared!r} must be finite, it is {token}")
+    if kind == "integer" and not values[0].is_integer():
+        raise token.error(f"{declared!r} must be a whole number, it is {values[0]}")
+    if count > 1:
+        return values
+    return int(values[0]) if kind == "integer" else float(values[0])
+
+
+def _amount(count: int | None, is_text: bool) -> str:
+    noun = ("string" if is_text else "number") + ("" if count == 1 else "s")
+    return noun if count is None else f"{count} {noun}"
+
+
+def _counted(values: Values) -> str:
+    return _amount(len(values), isinstance(values, tuple))
