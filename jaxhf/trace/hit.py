@@ -1,11 +1,18 @@
 """Where a ray met a surface."""
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax
 from jaxtyping import Int
 
 from ..core.types import Index, Point2, Scalar, Vector
 from ..core.vector import dot, unit
+
+if TYPE_CHECKING:  # who has a hit of `cast` has its tangents
+    _Tangent = Vector
+else:
+    _Tangent = Vector | None
 
 
 class Hit(eqx.Module):
@@ -39,10 +46,10 @@ class Hit(eqx.Module):
     cell: Int[jax.Array, "2"]
     triangle: Index
     side: Index
-    dp_du: Vector | None = None
-    dp_dv: Vector | None = None
-    dn_du: Vector | None = None
-    dn_dv: Vector | None = None
+    dp_du: _Tangent = eqx.field(default=None)
+    dp_dv: _Tangent = eqx.field(default=None)
+    dn_du: _Tangent = eqx.field(default=None)
+    dn_dv: _Tangent = eqx.field(default=None)
     steps: Index | None = None
 
 
