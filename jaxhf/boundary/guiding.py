@@ -14,10 +14,9 @@ from ..core.types import Index, Scalar
 from ..core.vector import unit
 from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sun, casts_sharp_shadows
+from ..trace.cylinder import Tube
 from ..trace.grid import Grid
-from ..trace.skirt import Walls
 from ..trace.world import World
-from . import outline
 from .silhouette import EdgeFlags, EdgeWeights, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
@@ -41,19 +40,21 @@ class EdgeSet(NamedTuple):
 
 
 def edge_sets(world: World) -> tuple[EdgeSet, ...]:
-    """All edges of the scene that may bound something, in one numbering; for skirts see `outline`. A cylinder has none."""
+    """All edges of the scene that may bound something, in one numbering. A cylinder has none."""
     found, first = [], 0
     casting = (
         [number for number, light in enumerate(world.lights) if casts_sharp_shadows(light)] if world.settings.shadows else []
     )
-    for k, surface in enumerate(world.surfaces):
-        if not isinstance(surface, Grid | Walls):
-            continue
+    for k, grid, _ in world.grids:
         for light in (None, *casting):
-            ny, nx = surface.shape if isinstance(surface, Grid) else (2, outline.columns(surface))
-            found.append(EdgeSet(k, light, first, ny, nx))
+            found.append(EdgeSet(k, light, first, *grid.shape))
             first = found[-1].end
     return tuple(found)
+
+
+def has_edges(world: World) -> bool:
+    """Whether a derivative draws points on edges: a cylinder has none, and to draw those of a skirt is refused."""
+    return bool(world.settings.edge_samples) and any(not isinstance(surface, Tube) for surface in world.surfaces)
 
 
 def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
@@ -62,18 +63,14 @@ def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
     standing = [*lights.values(), *(view for light in world.lights if isinstance(light, Sun) for view in _ends_of(light))]
     weights = []
     for edges in edge_sets(world):
-        surface = world.surfaces[edges.surface]
-        if isinstance(surface, Walls):
-            lengths = _outline_lengths(world, surface, camera, None if edges.light is None else lights[edges.light])
-            weights.append(_shares(lengths))
-            continue
-        assert isinstance(surface, Grid)
+        grid = world.surfaces[edges.surface]
+        assert isinstance(grid, Grid)
         if edges.light is None:
-            flags = _standing(surface, camera, standing, world.settings.shading)
-            lengths = seen_lengths(surface, camera)
+            flags = _standing(grid, camera, standing, world.settings.shading)
+            lengths = seen_lengths(grid, camera)
         else:
-            flags = silhouettes(surface, lights[edges.light])
-            lengths = lit_lengths(surface, lights[edges.light])
+            flags = silhouettes(grid, lights[edges.light])
+            lengths = lit_lengths(grid, lights[edges.light])
         weights.append(_shares(jnp.where(flags, lengths, 0)))
     return jnp.concatenate(weights)
 
@@ -87,13 +84,6 @@ def _shares(lengths: EdgeWeights) -> Float[jax.Array, " edges"]:
     return lengths / jnp.where(total > 0, total, 1)
 
 
-def _outline_lengths(world: World, walls: Walls, camera: Camera, light: Viewpoint | None) -> EdgeWeights:
-    """Of the edges of a skirt that may bound what is seen, as seen; or those that throw a shadow, as lit."""
-    if light is None:
-        return jnp.where(outline.outline(world, walls), outline.seen_lengths(walls, camera), 0)
-    return jnp.where(outline.shading_edges(world, walls, light), outline.lit_lengths(walls, light), 0)
-
-
 def boundary_length(world: World, camera: Camera) -> Scalar:
     """How long boundaries may be in the picture, pixels: silhouettes, the terrain's border and edges of shadows.
 
@@ -101,14 +91,12 @@ def boundary_length(world: World, camera: Camera) -> Scalar:
     edge that throws it. Zero where nothing in the picture has a boundary.
     """
     total = jnp.zeros((), camera.world_from_camera.dtype)
-    for surface in world.surfaces:
-        if not isinstance(surface, Grid):
-            continue
-        lengths = seen_lengths(surface, camera)
-        total = total + jnp.sum(jnp.where(silhouettes(surface, Viewpoint(*camera.viewpoint())), lengths, 0))
+    for _, grid, _ in world.grids:
+        lengths = seen_lengths(grid, camera)
+        total = total + jnp.sum(jnp.where(silhouettes(grid, Viewpoint(*camera.viewpoint())), lengths, 0))
         for light in world.lights if world.settings.shadows else ():
             if casts_sharp_shadows(light):
-                total = total + jnp.sum(jnp.where(folds(surface, _viewpoint(light)), lengths, 0))
+                total = total + jnp.sum(jnp.where(folds(grid, _viewpoint(light)), lengths, 0))
     return total
 
 

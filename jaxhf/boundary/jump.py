@@ -17,12 +17,11 @@ from ..scene.camera import Camera
 from ..shade.radiance import radiance_from, shadowed_radiance
 from ..trace.hit import Hit
 from ..trace.intersect import hit_on_triangle
-from ..trace.skirt import hit_on_side
 from ..trace.status import Status
 from ..trace.world import World, no_hit
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
-from .fold import Fold, Probe, fold_at, meet, probe, probe_beyond, probe_source, skirts, towards
+from .fold import Fold, Probe, fold_at, meet, probe, probe_beyond, probe_source, towards
 from .sample import BoundarySample, picture_point
 
 
@@ -151,18 +150,9 @@ def _side_radiance(world: World, fold: Fold, beyond: Hit, side: Index, active: F
     """What comes to the eye from the triangle that is near, or from what stands beyond: the other triangle, if that is seen."""
     ahead = eqx.tree_at(lambda hit: hit.side, fold.ahead, fold.source_side)
     at = lax.cond(side == 0, lambda ends: ends[0], lambda ends: ends[1], (fold.near, ahead))
-    hit, past, faces = beyond, fold.past, fold.faces
-    if faces is not None:
-        past = Ray(past.o + faces.inwards, past.d)
+    hit = beyond
     for number, grid, _ in world.grids:
         own = ((side == 0) | ~fold.bends) & (at.object == number)
-        here = hit_on_triangle(grid, number, past, at)
+        here = hit_on_triangle(grid, number, fold.past, at)
         hit = jax.tree.map(lambda new, old, own=own: jnp.where(own, new, old), here, hit)
-    if faces is not None:
-        face = jax.tree.map(lambda near, ahead: jnp.where(side == 0, near, ahead), faces.near, faces.ahead)
-        is_face = jnp.where(side == 0, faces.is_near, faces.is_ahead)
-        for number, walls in skirts(world):
-            here = hit_on_side(walls, number, face.cell[0], face.p, past.d)
-            own = is_face & (face.object == number)
-            hit = jax.tree.map(lambda new, old, own=own: jnp.where(own, new, old), here, hit)
     return radiance_from(world, fold.past, hit, active)

@@ -28,12 +28,10 @@ from ..scene.camera import Camera
 from ..scene.light import Point, casts_sharp_shadows
 from ..trace.cylinder import Tube, tube_distance
 from ..trace.grid import Grid
-from ..trace.skirt import Walls, wall_distance
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
 from ..trace.world import World
 from ..xla.materialise import materialise
 from .guiding import GuidingDistribution, edge_sets
-from .outline import along_edge
 from .silhouette import STEPS, framed_part
 
 
@@ -134,10 +132,6 @@ def on_edge(
             p = jnp.stack([x, y, z])
             p = grid.world_from_grid.point(p if offset is None else p + offset)
             chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
-        elif isinstance(grid, Walls):
-            p = along_edge(grid, point.start, point.end, s)
-            p = grid.world_from_object.point(p if offset is None else p + offset)
-            chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
     assert chosen is not None
     return chosen
 
@@ -201,10 +195,8 @@ def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Float[
             grazing = (slope == 0) | ~point.valid
             step = jnp.where(grazing, 0, quotient(c + a * u + b * v - local.o[2], jnp.where(grazing, 1, slope))) / size
             landed = jnp.where(point.receiver == k, near + step * away, landed)
-        else:
-            ray = Ray(p, away)
-            tube = isinstance(surface, Tube)
-            t, found = tube_distance(surface, ray, None) if tube else wall_distance(surface, ray, None, k)[:2]
+        elif isinstance(surface, Tube):
+            t, found = tube_distance(surface, Ray(p, away), None)
             landed = jnp.where(point.receiver == k, p + jnp.where(found, t, point.t) * away, landed)
     return landed
 

@@ -112,11 +112,6 @@ def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
     (x, y), (along_x, along_y) = _vertices(grid), _steps(z.dtype)
     a = [jnp.stack([row] * 3) for row in materialise(seen(x, y, z))]
     b = materialise(seen(x[None] + along_x, y[None] + along_y, _second_heights(z)))
-    return framed_length(camera, a, b)
-
-
-def framed_length(camera: Camera, a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
-    """The length in the picture, in pixels, of what lies in its frame of the lines between two coordinates of `Projection`."""
     first, last = materialise(framed_part(camera, a, b))
     w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
     ends = [
@@ -165,13 +160,8 @@ def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:
     to: list[Any] = [light.v[k] for k in range(3)]
     if light.at_place:
         to = [light.v[k] - world.offset[k] - p for k, p in enumerate(turned(x[None], y[None], z[None]))]
-    return lit_length(e, to, light.at_place)
-
-
-def lit_length(e: list[Any], to: list[Any], at_place: bool) -> jax.Array:
-    """The length of lines `e` as seen from a light, `at_place` or not, in the direction `to` from where they begin."""
     square = to[0] * to[0] + to[1] * to[1] + to[2] * to[2]
     cross = [e[i] * to[j] - e[j] * to[i] for i, j in ((1, 2), (2, 0), (0, 1))]
     across = jnp.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
     square = jnp.where(square > 0, square, 1)
-    return across / (square if at_place else jnp.sqrt(square))
+    return across / (square if light.at_place else jnp.sqrt(square))
