@@ -1,21 +1,22 @@
 """The two triangles of an edge, as sight or light that passes a point of the edge meets them. Discrete: no derivative."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, unit
+from ..core.vector import dot, select, unit
 from ..scene.camera import Camera
-from ..scene.light import Point, casts_sharp_shadows
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit
 from ..trace.intersect import intersect
 from ..trace.status import Status
 from ..trace.world import World, nearest_hit, no_hit
 from ..xla.materialise import materialise
-from .sample import BoundarySample, between_ends, on_edge
+from .sample import BoundarySample, between_ends, end_heights, on_edge, ways_to_lights
 from .silhouette import whole_cells
 
 # Other surfaces are looked for beside the edge and from a little before it, so that those that share a border with the edge's
@@ -29,9 +30,8 @@ class Fold(eqx.Module):
     Attributes:
       past: the ray, from the sample on, away from its source; `d` has length 1.
       distance: of the source; infinite for a directional light.
-      near: on the triangle over which the ray comes; says what a ray needs that leaves it towards the source.
-      ahead: on that over which the ray goes on; says what the ray needs to leave it. At a border both are the only triangle.
-      source_side: of the triangle ahead, 1 where the source stands on its +z side, else -1.
+      near: on the triangle over which the ray comes, from the side of its source.
+      ahead: on that over which the ray goes on, likewise. At a border both are the only triangle.
       bends: whether the source sees only one of the triangles, or there is only one: then the edge bounds what it sees.
       beside: the ray that other surfaces than the edge's are met by, on the side away from `near`; it begins `back` earlier.
       back: in the units of the ray.
@@ -42,7 +42,6 @@ class Fold(eqx.Module):
     distance: Scalar
     near: Hit
     ahead: Hit
-    source_side: Index
     bends: Flag
     beside: Ray
     back: Scalar
@@ -53,28 +52,15 @@ def towards(world: World, camera: Camera, light: Index, p: Vector) -> tuple[Vect
     """Unit direction from p to a light, or to the eye where that is -1, and the distance."""
     eye, at_place = camera.viewpoint()
     sight = eye - p if at_place else eye * camera.film_from_world()(p)[3]
-    chosen = unit(sight)
-    distance = dot(sight, chosen)
-    for number, source in enumerate(world.lights):
-        if not casts_sharp_shadows(source):
-            continue
-        there = source.p - p if isinstance(source, Point) else source.towards
-        to = unit(there)
-        far = dot(there, to) if isinstance(source, Point) else jnp.full_like(distance, jnp.inf)
-        chosen, distance = jnp.where(light == number, to, chosen), jnp.where(light == number, far, distance)
-    return chosen, distance
+    to = unit(sight)
+    return select(light, ways_to_lights(world, p), (to, dot(sight, to)))
 
 
 def fold_at(world: World, camera: Camera, sample: BoundarySample) -> Fold:
     """The fold at a sample."""
     p = on_edge(world, sample, sample.s)
     to, distance = towards(world, camera, sample.light, p)
-    chosen = None
-    for k, grid, _ in world.grids:
-        here = _fold_on(grid, k, sample, Ray(p, -to), distance)
-        chosen = here if chosen is None else jax.tree.map(lambda a, b, k=k: jnp.where(sample.surface == k, a, b), here, chosen)
-    assert chosen is not None
-    return chosen
+    return select(sample.surface, ((k, _fold_on(grid, k, sample, Ray(p, -to), distance)) for k, grid, _ in world.grids))
 
 
 def _fold_on(grid: Grid, number: int, sample: BoundarySample, past: Ray, distance: Scalar) -> Fold:
@@ -91,38 +77,33 @@ def _fold_on(grid: Grid, number: int, sample: BoundarySample, past: Ray, distanc
     near_left = ahead_left ^ (has_left & has_right)
     x, y = between_ends(sample, sample.s)
 
-    def on_triangle(left: Flag) -> tuple[Hit, Index]:
-        """A hit from the side of the source on one of the two, and the side."""
+    def on_triangle(left: Flag) -> Hit:
+        """A hit from the side of the source on one of the two."""
         cell_x = jnp.clip(jnp.where(left, left_x, right_x), 0, grid.cells[0] - 1)
         cell_y = jnp.clip(jnp.where(left, left_y, right_y), 0, grid.cells[1] - 1)
         upper = jnp.where(left, left_upper, right_upper)
         a, b, _ = triangle_plane(grid, cell_x, cell_y, upper)
         side = jnp.where(d[2] - a * d[0] - b * d[1] <= 0, 1, -1).astype(jnp.int32)
-        hit = eqx.tree_at(
-            lambda hit: (hit.cell, hit.triangle, hit.side, hit.uv, hit.object),
+        return dataclasses.replace(
             no_hit(d.dtype),
-            (
-                jnp.stack([cell_x, cell_y]),
-                upper.astype(jnp.int32),
-                side,
-                jnp.stack([x / grid.cells[0], y / grid.cells[1]]),
-                jnp.full((), number, jnp.int32),
-            ),
+            object=jnp.full((), number, jnp.int32),
+            cell=jnp.stack([cell_x, cell_y]),
+            triangle=upper.astype(jnp.int32),
+            side=side,
+            uv=jnp.stack([x / grid.cells[0], y / grid.cells[1]]),
         )
-        return hit, side
 
-    near, near_side = on_triangle(near_left)
-    ahead, source_side = on_triangle(ahead_left)
-    z0, z1 = (grid.rows.at[v[1] * grid.shape[1] + v[0]].get(mode="clip") for v in (sample.start, sample.end))
-    e = jnp.stack([*(sample.end - sample.start).astype(d.dtype), jnp.where(jnp.isfinite(z1 - z0), z1 - z0, 0)])
+    near, ahead = on_triangle(near_left), on_triangle(ahead_left)
+    z0, z1 = end_heights(grid, sample)
+    e = jnp.stack([*(sample.end - sample.start).astype(d.dtype), z1 - z0])
     normal = jnp.stack([e[i] * d[j] - e[j] * d[i] for i, j in ((1, 2), (2, 0), (0, 1))])
     # The triangle on the left lies on the side of e x d if the source sees its +z side.
-    across = unit(normal) * jnp.where(near_left, near_side, -near_side).astype(d.dtype)
-    bends = (near_side != source_side) | ~(has_left & has_right)
+    across = unit(normal) * jnp.where(near_left, near.side, -near.side).astype(d.dtype)
+    bends = (near.side != ahead.side) | ~(has_left & has_right)
     step = _ASIDE * float(jnp.finfo(d.dtype).eps) ** 0.5 * max(grid.cells)
     back = _BACK * step / dot(local, d)
     beside = Ray(past.o - grid.world_from_grid.vector(across * step) - back * past.d, past.d)
-    return Fold(past, distance, near, ahead, source_side, bends, beside, back, across)
+    return Fold(past, distance, near, ahead, bends, beside, back, across)
 
 
 def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
@@ -164,7 +145,7 @@ def probe_source(world: World, fold: Fold, active: Flag) -> Probe:
 
 def probe_beyond(world: World, fold: Fold, active: Flag) -> Probe:
     """Past the edge. Another surface that touches the edge there is met at a t between -`back` and `back`."""
-    leaving = eqx.tree_at(lambda hit: hit.side, fold.ahead, -fold.source_side)
+    leaving = dataclasses.replace(fold.ahead, side=-fold.ahead.side)
     beside = fold.beside if len(world.surfaces) > 1 else None
     return Probe(fold.past, beside, fold.back, leaving, active, jnp.full_like(fold.back, jnp.inf))
 

@@ -13,7 +13,8 @@ from ..core.settings import Shading
 from ..core.types import Index, Scalar
 from ..core.vector import unit
 from ..scene.camera import Camera
-from ..scene.light import Directional, Point, Sun, casts_sharp_shadows
+from ..scene.light import Directional, Point, Sun
+from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube
 from ..trace.grid import Grid
 from ..trace.world import World
@@ -26,10 +27,10 @@ _BLOCK = 8
 
 
 class EdgeSet(NamedTuple):
-    """The edges of one surface, seen where they stand (`light` None) or by their shadow; `first` is the number of its first."""
+    """The edges of one surface, seen where they stand (`light` -1) or by their shadow; `first` is the number of its first."""
 
     surface: int
-    light: int | None
+    light: int
     first: int
     ny: int
     nx: int
@@ -42,11 +43,9 @@ class EdgeSet(NamedTuple):
 def edge_sets(world: World) -> tuple[EdgeSet, ...]:
     """All edges of the scene that may bound something, in one numbering. A cylinder has none."""
     found, first = [], 0
-    casting = (
-        [number for number, light in enumerate(world.lights) if casts_sharp_shadows(light)] if world.settings.shadows else []
-    )
+    casting = [number for number, _ in sharp_lights(world)] if world.settings.shadows else []
     for k, grid, _ in world.grids:
-        for light in (None, *casting):
+        for light in (-1, *casting):
             found.append(EdgeSet(k, light, first, *grid.shape))
             first = found[-1].end
     return tuple(found)
@@ -59,13 +58,13 @@ def has_edges(world: World) -> bool:
 
 def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
     """Weights of the edges by their lengths as seen or lit, without tracing a ray; those of a set sum to one, or are zero."""
-    lights = {number: _viewpoint(light) for number, light in enumerate(world.lights) if casts_sharp_shadows(light)}
+    lights = {number: _viewpoint(light) for number, light in sharp_lights(world)}
     standing = [*lights.values(), *(view for light in world.lights if isinstance(light, Sun) for view in _ends_of(light))]
     weights = []
     for edges in edge_sets(world):
         grid = world.surfaces[edges.surface]
         assert isinstance(grid, Grid)
-        if edges.light is None:
+        if edges.light < 0:
             flags = _standing(grid, camera, standing, world.settings.shading)
             lengths = seen_lengths(grid, camera)
         else:
@@ -94,9 +93,8 @@ def boundary_length(world: World, camera: Camera) -> Scalar:
     for _, grid, _ in world.grids:
         lengths = seen_lengths(grid, camera)
         total = total + jnp.sum(jnp.where(silhouettes(grid, Viewpoint(*camera.viewpoint())), lengths, 0))
-        for light in world.lights if world.settings.shadows else ():
-            if casts_sharp_shadows(light):
-                total = total + jnp.sum(jnp.where(folds(grid, _viewpoint(light)), lengths, 0))
+        for _, light in sharp_lights(world) if world.settings.shadows else ():
+            total = total + jnp.sum(jnp.where(folds(grid, _viewpoint(light)), lengths, 0))
     return total
 
 

@@ -12,7 +12,7 @@ from jax import lax
 
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
-from ..core.vector import dot
+from ..core.vector import dot, select
 from ..scene.camera import Camera
 from ..shade.radiance import radiance_from, shadowed_radiance
 from ..trace.hit import Hit
@@ -148,11 +148,7 @@ def radiance_jump(world: World, sample: BoundarySample, passage: Passage, active
 
 def _side_radiance(world: World, fold: Fold, beyond: Hit, side: Index, active: Flag) -> Vector:
     """What comes to the eye from the triangle that is near, or from what stands beyond: the other triangle, if that is seen."""
-    ahead = eqx.tree_at(lambda hit: hit.side, fold.ahead, fold.source_side)
-    at = lax.cond(side == 0, lambda ends: ends[0], lambda ends: ends[1], (fold.near, ahead))
-    hit = beyond
-    for number, grid, _ in world.grids:
-        own = ((side == 0) | ~fold.bends) & (at.object == number)
-        here = hit_on_triangle(grid, number, fold.past, at)
-        hit = jax.tree.map(lambda new, old, own=own: jnp.where(own, new, old), here, hit)
+    at = lax.cond(side == 0, lambda ends: ends[0], lambda ends: ends[1], (fold.near, fold.ahead))
+    on_triangle = ((number, hit_on_triangle(grid, number, fold.past, at)) for number, grid, _ in world.grids)
+    hit = select(jnp.where((side == 0) | ~fold.bends, at.object, -1), on_triangle, beyond)
     return radiance_from(world, fold.past, hit, active)

@@ -9,15 +9,15 @@ from jax import lax
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import Flag, Index, Vector
-from ..core.vector import dot, unit
-from ..scene.light import Sky, casts_sharp_shadows
+from ..core.vector import dot, select, unit
+from ..scene.light import Sky
 from ..scene.material import Material, Matte, Mirror
 from ..scene.texture import ImageTexture
 from ..trace.hit import Hit
 from ..trace.status import Status
 from ..trace.world import World, first_hit, no_hit
 from ..xla.masked import only_where
-from .lighting import GRAZING, irradiance, unshadowed_irradiance
+from .lighting import GRAZING, irradiance, sharp_lights, unshadowed_irradiance
 
 
 def radiance(world: World, ray: Ray) -> tuple[Vector, Index]:
@@ -38,14 +38,11 @@ def radiance_from(world: World, ray: Ray, hit: Hit, active: Flag) -> Vector:
 
 def shadowed_radiance(world: World, number: Index, hit: Hit) -> Vector:
     """By how much the shadow of the light of this number darkens the hit, if nothing else keeps that light from it."""
-    total = jnp.zeros_like(hit.n)
-    albedo = _albedo(world, hit)
-    if albedo is not None:
-        for k, light in enumerate(world.lights):
-            if casts_sharp_shadows(light):
-                total = jnp.where(number == k, unshadowed_irradiance(world, light, hit), total)
-        total = jnp.where(_has_material(world, hit, Matte), albedo / jnp.pi * total, 0)
-    return total
+    albedo, dark = _albedo(world, hit), jnp.zeros_like(hit.n)
+    if albedo is None:
+        return dark
+    arriving = ((k, unshadowed_irradiance(world, light, hit)) for k, light in sharp_lights(world))
+    return jnp.where(_has_material(world, hit, Matte), albedo / jnp.pi * select(number, arriving, dark), 0)
 
 
 def _path(world: World, ray: Ray, leaving: Hit, active: Flag, length: int) -> tuple[Vector, Index]:
@@ -152,20 +149,10 @@ def _albedo(world: World, hit: Hit) -> Vector | None:
         for number, m in enumerate(world.materials)
         if isinstance(m, Matte)
     ]
-    return _select(values, hit.object)
+    return select(hit.object, values) if values else None
 
 
 def _reflectance(world: World, hit: Hit) -> tuple[Flag, Vector]:
     """Whether the hit lies on a mirror, and that mirror's reflectance."""
     values = [(number, jnp.asarray(m.reflectance)) for number, m in enumerate(world.materials) if isinstance(m, Mirror)]
-    reflectance = _select(values, hit.object)
-    assert reflectance is not None
-    return _has_material(world, hit, Mirror), reflectance
-
-
-def _select(values: list[tuple[int, Vector]], number: Index) -> Vector | None:
-    """The value with this number; any of them where there is none such."""
-    chosen = None
-    for k, value in values:
-        chosen = value if chosen is None else jnp.where(number == k, value, chosen)
-    return chosen
+    return _has_material(world, hit, Mirror), select(hit.object, values)
