@@ -3,7 +3,6 @@
 import dataclasses
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 
 from ..core.ray import Ray
@@ -117,7 +116,8 @@ class Probe(eqx.Module):
 
     Attributes:
       ray: by which the edge's own surface is met.
-      beside: by which others are; it begins `back` earlier. None where there are no others.
+      beside: by which others are; it begins `back` earlier, so that one which touches the edge is met at a t between -`back`
+        and `back`.
       back: in the units of the rays.
       leaving: the hit.
       active: whether it looks at all.
@@ -125,49 +125,22 @@ class Probe(eqx.Module):
     """
 
     ray: Ray
-    beside: Ray | None
+    beside: Ray
     back: Scalar
     leaving: Hit
     active: Flag
     t_max: Scalar
 
 
-def probe(world: World, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar) -> Probe:
-    """One that meets all surfaces by the same ray."""
-    beside = ray if len(world.surfaces) > 1 else None
-    return Probe(ray, beside, jnp.zeros_like(t_max), leaving, active, t_max)
-
-
-def probe_source(world: World, fold: Fold, active: Flag) -> Probe:
-    """From the edge to the source."""
-    return probe(world, Ray(fold.past.o, -fold.past.d), fold.near, active, fold.distance)
-
-
-def probe_beyond(world: World, fold: Fold, active: Flag) -> Probe:
-    """Past the edge. Another surface that touches the edge there is met at a t between -`back` and `back`."""
-    leaving = dataclasses.replace(fold.ahead, side=-fold.ahead.side)
-    beside = fold.beside if len(world.surfaces) > 1 else None
-    return Probe(fold.past, beside, fold.back, leaving, active, jnp.full_like(fold.back, jnp.inf))
-
-
 def meet(world: World, sample: BoundarySample, probe: Probe) -> tuple[Hit, Flag]:
     """What a probe meets, t counted from the start of its `ray`; and whether an active one meets nothing before its `t_max`."""
     hits = []
     for number, surface in enumerate(world.surfaces):
-        ray, back = probe.ray, None
-        if probe.beside is not None:
-            own = sample.surface == number
-            ray = jax.tree.map(lambda a, b, own=own: jnp.where(own, a, b), probe.ray, probe.beside)
-            back = jnp.where(own, 0, probe.back)
-        hit = intersect(
-            surface,
-            number,
-            ray,
-            max_steps=world.settings.max_steps,
-            leaving=probe.leaving,
-            active=probe.active,
-            t_max=probe.t_max if back is None else probe.t_max + back,
-        )
-        hits.append(hit if back is None else eqx.tree_at(lambda hit: hit.t, hit, hit.t - back))
+        ray, back = probe.ray, jnp.zeros_like(probe.back)
+        if len(world.surfaces) > 1:
+            ray, back = select(sample.surface, [(number, (ray, back))], (probe.beside, probe.back))
+        steps, t_max = world.settings.max_steps, probe.t_max + back
+        hit = intersect(surface, number, ray, max_steps=steps, leaving=probe.leaving, active=probe.active, t_max=t_max)
+        hits.append(dataclasses.replace(hit, t=hit.t - back))
     hit = nearest_hit(hits)
     return hit, probe.active & ~((hit.status == int(Status.HIT)) & (hit.t < probe.t_max))

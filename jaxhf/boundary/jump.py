@@ -5,6 +5,8 @@ and could stand on both sides of another boundary. Everything is followed from t
 its edge: a jump belongs to the edge, or there is none.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,7 +23,7 @@ from ..trace.status import Status
 from ..trace.world import World, no_hit
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
-from .fold import Fold, Probe, fold_at, meet, probe, probe_beyond, probe_source, towards
+from .fold import Fold, Probe, fold_at, meet, towards
 from .sample import BoundarySample, picture_point
 
 
@@ -62,23 +64,21 @@ def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[Bou
       source nor, for a shadow, its place from the eye. And the passage.
     """
     fold = fold_at(world, camera, sample)
-    casts, never = sample.light >= 0, jnp.zeros((), bool)
-
-    def to_source(free: Flag, beyond: Hit) -> Probe:
-        return probe_source(world, fold, sample.valid & (fold.bends | ~casts))
-
-    def past_edge(free: Flag, beyond: Hit) -> Probe:
-        return probe_beyond(world, fold, free & fold.bends)
-
-    def to_eye(free: Flag, beyond: Hit) -> Probe:
-        """From the side of the place from which it was met."""
-        to, distance = towards(world, camera, jnp.full((), -1, jnp.int32), beyond.p)
-        faces = dot(to, beyond.n) * beyond.side.astype(to.dtype) > 0
-        return probe(world, Ray(beyond.p, to), beyond, _falls(sample, fold, free, beyond) & faces, distance)
+    casts, never, past, none = sample.light >= 0, jnp.zeros((), bool), fold.past, jnp.zeros_like(fold.back)
+    onwards = dataclasses.replace(fold.ahead, side=-fold.ahead.side)
 
     def look(known: tuple[Flag, Hit, Flag], number: Index) -> tuple[tuple[Flag, Hit, Flag], None]:
+        """From the edge to its source; past the edge; and from a shadow to the eye, on the side from which it was met."""
         free, beyond, _ = known
-        hit, clear = meet(world, sample, lax.switch(number, [to_source, past_edge, to_eye], free, beyond))
+        back, to_eye = Ray(past.o, -past.d), towards(world, camera, jnp.full((), -1, jnp.int32), beyond.p)
+        up = Ray(beyond.p, to_eye[0])
+        faces = dot(up.d, beyond.n) * beyond.side.astype(up.d.dtype) > 0
+        probes = (
+            Probe(back, back, none, fold.near, sample.valid & (fold.bends | ~casts), fold.distance),
+            Probe(past, fold.beside, fold.back, onwards, free & fold.bends, jnp.full_like(fold.back, jnp.inf)),
+            Probe(up, up, none, beyond, _falls(sample, fold, free, beyond) & faces, to_eye[1]),
+        )
+        hit, clear = meet(world, sample, select(number, enumerate(probes)))
         beyond = lax.cond(number == 1, lambda hits: hits[0], lambda hits: hits[1], (hit, beyond))  # no kernel, unlike `where`
         return (jnp.where(number == 0, clear, free), beyond, clear), None
 
@@ -86,16 +86,13 @@ def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[Bou
     known = never, no_hit(sample.s.dtype), never
     (free, beyond, seen), _ = lax.scan(look, known, jnp.arange(3, dtype=jnp.int32))
     falls = _falls(sample, fold, free, beyond)
-    sample = eqx.tree_at(
-        lambda sample: (sample.valid, sample.receiver, sample.cell, sample.upper, sample.t),
+    sample = dataclasses.replace(
         sample,
-        (
-            jnp.where(casts, seen, free),
-            jnp.maximum(beyond.object, 0),
-            beyond.cell,
-            beyond.triangle == 1,
-            jnp.where(falls, beyond.t, 0),
-        ),
+        valid=jnp.where(casts, seen, free),
+        receiver=jnp.maximum(beyond.object, 0),
+        cell=beyond.cell,
+        upper=beyond.triangle == 1,
+        t=jnp.where(falls, beyond.t, 0),
     )
     return sample, Passage(fold, beyond)
 

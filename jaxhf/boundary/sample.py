@@ -13,6 +13,8 @@ dx/ds turned by a right angle, times ds, so the term is the mean over points of 
 docs/concepts/boundary.md has the whole.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -95,11 +97,8 @@ def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u
     first, last = materialise(framed_part(camera, a, b))
     stands = light < 0
     first, last = jnp.where(stands, first, 0), jnp.where(stands, last, 1)
-    return eqx.tree_at(
-        lambda point: (point.valid, point.s, point.measure),
-        point,
-        (valid & (last > first), first + s * (last - first), measure * (last - first)),
-    )
+    share, valid = last - first, valid & (last > first)
+    return dataclasses.replace(point, valid=valid, s=first + s * share, measure=measure * share)
 
 
 def between_ends(point: BoundarySample, s: Scalar) -> tuple[Scalar, Scalar]:
