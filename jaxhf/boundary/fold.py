@@ -9,6 +9,7 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, select, unit
 from ..scene.camera import Camera
+from ..trace.edges import whole_cells
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit
 from ..trace.intersect import intersect
@@ -16,7 +17,6 @@ from ..trace.status import Status
 from ..trace.world import World, nearest_hit, no_hit
 from ..xla.materialise import materialise
 from .sample import BoundarySample, between_ends, end_heights, on_edge, ways_to_lights
-from .silhouette import whole_cells
 
 # Other surfaces are looked for beside the edge and from a little before it, so that those that share a border with the edge's
 # are met: this many times the square root of an ulp of the grid's larger side beside it, and as many times that before it.
@@ -108,7 +108,7 @@ def _fold_on(grid: Grid, number: int, sample: BoundarySample, past: Ray, distanc
 def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
     """Whether there is such a cell, with all its vertices."""
     x, y = jnp.clip(ix, 0, grid.cells[0] - 1), jnp.clip(iy, 0, grid.cells[1] - 1)
-    return materialise((x == ix) & (y == iy) & whole_cells(grid)[y, x])
+    return materialise((x == ix) & (y == iy) & whole_cells(grid.z)[y, x])
 
 
 class Probe(eqx.Module):

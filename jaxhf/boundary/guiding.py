@@ -16,9 +16,10 @@ from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sun
 from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube
+from ..trace.edges import EdgeFlags, present_edges
 from ..trace.grid import Grid
 from ..trace.world import World
-from .silhouette import EdgeFlags, EdgeWeights, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
+from .silhouette import EdgeWeights, Viewpoint, folds, lit_lengths, seen_lengths, silhouettes
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
 _TOTAL_WEIGHT = 2**30
@@ -101,7 +102,7 @@ def boundary_length(world: World, camera: Camera) -> Scalar:
 def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], shading: Shading) -> EdgeFlags:
     """Edges across which what is seen jumps at the edge itself; one that is a silhouette for several counts once."""
     if shading == "flat":
-        return all_edges(grid)
+        return present_edges(grid.z)
     flags = silhouettes(grid, Viewpoint(*camera.viewpoint()))
     for light in lights:
         flags = flags | silhouettes(grid, light)

@@ -30,12 +30,13 @@ from ..scene.camera import Camera
 from ..scene.light import Point
 from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube, tube_distance
+from ..trace.edges import STEPS
 from ..trace.grid import Grid
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
 from ..trace.world import World
 from ..xla.materialise import materialise
 from .guiding import GuidingDistribution, edge_sets
-from .silhouette import STEPS, framed_part
+from .silhouette import framed_part
 
 
 class BoundarySample(eqx.Module):

@@ -1,7 +1,6 @@
 """Which edges of a heightfield bound what is seen or lit: dense arithmetic over the grid, without a derivative.
 
-Edges have a kind, 0 along x, 1 along y, 2 along the diagonal, and begin at a vertex: arrays over them have shape
-(3, ny, nx). Those that would leave the grid are there too, and bound nothing.
+Arrays over edges are those of `trace.edges`; an edge that would leave the grid bounds nothing.
 """
 
 from typing import Any
@@ -9,17 +8,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..core.types import Vector
 from ..scene.camera import Camera
+from ..trace.edges import STEPS, EdgeFlags, compare_sides, whole_cells
 from ..trace.grid import Grid
 from ..xla.materialise import materialise
 
-# From an edge's first vertex to its second.
-STEPS = ((1, 0), (0, 1), (1, 1))
-
-EdgeFlags = Bool[jax.Array, "3 ny nx"]
 EdgeWeights = Float[jax.Array, "3 ny nx"]
 
 
@@ -37,32 +33,13 @@ def silhouettes(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     at holes have one triangle.
     """
     lower, upper = _facing(grid, viewpoint)
-    return _between(lower, upper, lambda a, b: a != b)
+    return compare_sides(lower, upper, lambda a, b: a != b)
 
 
 def folds(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     """The edges with one triangle that faces the viewpoint and one that faces away."""
     lower, upper = _facing(grid, viewpoint)
-    return _between(lower, upper, lambda a, b: a * b < 0)
-
-
-def all_edges(grid: Grid) -> EdgeFlags:
-    """The edges with at least one triangle."""
-    present = whole_cells(grid)
-    return _between(present, present, lambda a, b: a | b)
-
-
-def _between(lower: jax.Array, upper: jax.Array, compare: Any) -> EdgeFlags:
-    """Compares the two triangles of every edge, given values per cell of its two triangles; beyond the border stands zero."""
-    above, right = jnp.pad(lower, ((0, 1), (0, 1))), jnp.pad(upper, ((0, 1), (0, 1)))
-    below, left = jnp.pad(upper, ((1, 0), (0, 1))), jnp.pad(lower, ((0, 1), (1, 0)))
-    return jnp.stack([compare(above, below), compare(right, left), compare(above, right)])
-
-
-def whole_cells(grid: Grid) -> Bool[jax.Array, "cells_y cells_x"]:
-    """Which cells have all their vertices."""
-    z = grid.z
-    return jnp.isfinite(z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:])
+    return compare_sides(lower, upper, lambda a, b: a * b < 0)
 
 
 def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
@@ -74,7 +51,7 @@ def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
     if viewpoint.at_place:
         x, y = _vertices(grid)
         to_x, to_y, to_z = v[0] - x[:-1, :-1], v[1] - y[:-1, :-1], v[2] - z00
-    present = whole_cells(grid)
+    present = whole_cells(grid.z)
 
     def facing(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(present, jnp.where(to_z - a * to_x - b * to_y >= 0, 1, -1), 0).astype(jnp.int8)

@@ -20,9 +20,9 @@ import jaxhf
 from jaxhf.boundary.guiding import initial_weights, make_distribution
 from jaxhf.boundary.jump import boundary_segment, pass_edge, radiance_jump
 from jaxhf.boundary.sample import BoundarySample
-from jaxhf.boundary.silhouette import STEPS
 from jaxhf.fitting.defaults import choose_edge_samples
 from jaxhf.scene.localise import localise
+from jaxhf.trace.edges import STEPS
 from jaxhf.trace.world import make_world, resolve_settings
 
 EDGES = jaxhf.Settings(samples=16, edge_samples=4000)
