@@ -84,10 +84,9 @@ def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:
     met = hit.object >= 0
     flags = []
     for number, light in enumerate(world.lights):
-        if not isinstance(light, Sky):
-            if isinstance(light, Sun):
-                flags.append(met & ~(_disc(world, light, hit, met)[0].share > 0))
-                continue
+        if isinstance(light, Sun):
+            flags.append(met & ~(_disc(world, light, hit, met)[0].share > 0))
+        elif not isinstance(light, Sky):
             wi, _, distance = _towards(light, hit.p)
             flags.append(met & ~_visible(number, world, wi, distance, hit, met)[0])
     return jnp.stack(flags) if flags else jnp.zeros(0, bool)

@@ -67,11 +67,12 @@ def has_mirrors(materials: Iterable[Material], settings: Settings) -> bool:
     return settings.max_depth > 0 and any(isinstance(material, Mirror) for material in materials)
 
 
-def direct(world: World, ray: Ray) -> tuple[Vector, Index, Hit]:
-    """`radiance` of a scene without mirrors, and the hit that it comes from."""
-    hit = first_hit(world, ray)
-    light, exhausted = _outgoing(world, ray, hit, hit.status != int(Status.EXHAUSTED))
-    return light, exhausted + _count(hit.status == int(Status.EXHAUSTED)), hit
+def direct(world: World, ray: Ray, leaving: Hit | None = None, active: Flag | None = None) -> tuple[Vector, Index, Hit]:
+    """`radiance` of a scene without mirrors, and the hit that it comes from; `leaving` and `active` as for `first_hit`."""
+    hit = first_hit(world, ray, leaving, active)
+    ran_out = hit.status == int(Status.EXHAUSTED)
+    light, exhausted = _outgoing(world, ray, hit, ~ran_out if active is None else active & ~ran_out)
+    return light, exhausted + ran_out.astype(jnp.int32), hit
 
 
 def _bounce(world: World, ray: Ray, leaving: Hit, active: Flag) -> tuple[Ray, Hit, Vector, Vector, Flag, Index]:
@@ -81,21 +82,15 @@ def _bounce(world: World, ray: Ray, leaving: Hit, active: Flag) -> tuple[Ray, Hi
       The mirrored ray, the hit that it leaves, and that mirror's reflectance; the light from the hit; whether the path goes
       on; how many walks ran out of steps.
     """
-    hit = first_hit(world, ray, leaving, active)
-    out_of_steps = active & (hit.status == int(Status.EXHAUSTED))
-    light, exhausted = _outgoing(world, ray, hit, active & ~out_of_steps)
+    light, exhausted, hit = direct(world, ray, leaving, active)
     onwards, reflectance, mirrored = _mirrored(world, ray, hit)
-    return onwards, hit, reflectance, light, active & mirrored, exhausted + _count(out_of_steps)
+    return onwards, hit, reflectance, light, active & mirrored, exhausted
 
 
 def _mirrored(world: World, ray: Ray, hit: Hit) -> tuple[Ray, Vector, Flag]:
     """The mirrored ray from a hit, the mirror's reflectance, and whether there is a mirror."""
-    mirrored, reflectance = _reflectance(world, hit)
-    return Ray(hit.p, _reflect(ray.d, hit)), reflectance, mirrored
-
-
-def _count(flag: Flag) -> Index:
-    return flag.astype(jnp.int32)
+    values = [(number, jnp.asarray(m.reflectance)) for number, m in enumerate(world.materials) if isinstance(m, Mirror)]
+    return Ray(hit.p, _reflect(ray.d, hit)), select(hit.object, values), _has_material(world, hit, Mirror)
 
 
 def _outgoing(world: World, ray: Ray, hit: Hit, active: Flag) -> tuple[Vector, Index]:
@@ -150,9 +145,3 @@ def _albedo(world: World, hit: Hit) -> Vector | None:
         if isinstance(m, Matte)
     ]
     return select(hit.object, values) if values else None
-
-
-def _reflectance(world: World, hit: Hit) -> tuple[Flag, Vector]:
-    """Whether the hit lies on a mirror, and that mirror's reflectance."""
-    values = [(number, jnp.asarray(m.reflectance)) for number, m in enumerate(world.materials) if isinstance(m, Mirror)]
-    return _has_material(world, hit, Mirror), select(hit.object, values)

@@ -138,7 +138,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
         case(material=jaxhf.Matte(jaxhf.ImageTexture(TEXELS, wrap="clamp"))),
         [within(texture, "within")],
     ),
-    "mirror": ("plain", case(MIRROR), [*map(everywhere, (radiance._reflect, radiance._reflectance, trace_world.no_hit))]),
+    "mirror": ("plain", case(MIRROR), [*map(everywhere, (radiance._reflect, radiance._mirrored, trace_world.no_hit))]),
     "cylinder": (
         "plain",
         case(jaxhf.Object(jaxhf.Cylinder())),
