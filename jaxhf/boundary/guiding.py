@@ -66,11 +66,9 @@ def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
         grid = world.surfaces[edges.surface]
         assert isinstance(grid, Grid)
         if edges.light < 0:
-            flags = _standing(grid, camera, standing, world.settings.shading)
-            lengths = seen_lengths(grid, camera)
+            flags, lengths = _standing(grid, camera, standing, world.settings.shading), seen_lengths(grid, camera)
         else:
-            flags = silhouettes(grid, lights[edges.light])
-            lengths = lit_lengths(grid, lights[edges.light])
+            flags, lengths = silhouettes(grid, lights[edges.light]), lit_lengths(grid, lights[edges.light])
         weights.append(_shares(jnp.where(flags, lengths, 0)))
     return jnp.concatenate(weights)
 

@@ -6,6 +6,7 @@ its edge: a jump belongs to the edge, or there is none.
 """
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
@@ -105,20 +106,13 @@ def _falls(sample: BoundarySample, fold: Fold, free: Flag, beyond: Hit) -> Flag:
 
 def boundary_segment(world: World, camera: Camera, sample: BoundarySample, fold: Fold) -> BoundarySegment:
     """The boundary round a sample: its position in the picture, its normal and its speed, by forward differentiation."""
-
-    def position(s: Scalar) -> tuple[Point2, Flag]:
-        return picture_point(world, camera, sample, s)
-
-    x, along, valid = materialise(jax.jvp(position, (sample.s,), (jnp.ones_like(sample.s),), has_aux=True))
+    at = functools.partial(picture_point, world, camera, sample)
+    x, along, valid = materialise(jax.jvp(at, (sample.s,), (jnp.ones_like(sample.s),), has_aux=True))
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
     # Of what would cross the whole picture within less than the rounding of s, no position is known.
     valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)
     across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
-
-    def moved(offset: Vector) -> Point2:
-        return picture_point(world, camera, sample, sample.s, offset)[0]
-
-    _, motion = jax.jvp(moved, (jnp.zeros_like(fold.across),), (fold.across,))
+    _, motion, _ = jax.jvp(functools.partial(at, sample.s), (jnp.zeros_like(fold.across),), (fold.across,), has_aux=True)
     rate = (across[0] * motion[0] + across[1] * motion[1]) / jnp.where(valid, length, 1)
     speed = jnp.abs(rate * fold.across[2])  # along the edge and along the ray the boundary stands still
     speed = jnp.where(valid & jnp.isfinite(speed), speed, 0)

@@ -38,6 +38,9 @@ from ..xla.materialise import materialise
 from .guiding import GuidingDistribution, edge_sets
 from .silhouette import framed_part
 
+# What is added to the heights at the `deciding_vertices` of a sample.
+HeightChanges = Float[jax.Array, "5"]
+
 
 class BoundarySample(eqx.Module):
     """A point sampled on an edge, and where its shadow falls. All of it is discrete but `s`, the position along the edge.
@@ -108,11 +111,7 @@ def between_ends(point: BoundarySample, s: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def on_edge(
-    world: World,
-    point: BoundarySample,
-    s: Scalar,
-    offset: Vector | None = None,
-    perturbation: Float[jax.Array, "5"] | None = None,
+    world: World, point: BoundarySample, s: Scalar, offset: Vector | None = None, perturbation: HeightChanges | None = None
 ) -> Vector:
     """World frame, moved by `offset` (in the surface's own frame); differentiable in the heights and in the transform."""
 
@@ -169,7 +168,7 @@ def ways_to_lights(world: World, p: Vector) -> list[tuple[int, tuple[Vector, Sca
     return ways
 
 
-def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Float[jax.Array, "5"] | None = None) -> Vector:
+def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: HeightChanges | None = None) -> Vector:
     """Where the light past p meets the triangle that was found; differentiable."""
     to, _ = select(point.light, ways_to_lights(world, p))
     away = -to
@@ -208,12 +207,11 @@ def picture_point(
     point: BoundarySample,
     s: Scalar,
     offset: Vector | None = None,
-    perturbation: Float[jax.Array, "5"] | None = None,
+    perturbation: HeightChanges | None = None,
 ) -> tuple[Point2, Flag]:
     """The position of the sample, or of its shadow, in the picture (pixels), and whether it is in the frame; differentiable.
 
-    In every leaf of the scene, and in s while the shadow stays in its triangle; in `perturbation`, which is added to the
-    heights at its `deciding_vertices`.
+    In every leaf of the scene, in s while the shadow stays in its triangle, and in `perturbation`.
     """
     p = materialise(on_edge(world, point, s, offset, perturbation))
     if any(edges.light >= 0 for edges in edge_sets(world)):

@@ -32,14 +32,12 @@ def silhouettes(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     (Hertzmann and Zorin, Illustrating smooth surfaces, SIGGRAPH 2000, section 4.1, on polygons.) Edges at the border and
     at holes have one triangle.
     """
-    lower, upper = _facing(grid, viewpoint)
-    return compare_sides(lower, upper, lambda a, b: a != b)
+    return compare_sides(*_facing(grid, viewpoint), lambda a, b: a != b)
 
 
 def folds(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     """The edges with one triangle that faces the viewpoint and one that faces away."""
-    lower, upper = _facing(grid, viewpoint)
-    return compare_sides(lower, upper, lambda a, b: a * b < 0)
+    return compare_sides(*_facing(grid, viewpoint), lambda a, b: a * b < 0)
 
 
 def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
@@ -71,24 +69,23 @@ def _steps(dtype: Any) -> tuple[jax.Array, jax.Array]:
     return along_x, along_y
 
 
-def _second_heights(z: Float[jax.Array, "ny nx"]) -> EdgeWeights:
-    """The heights at the second vertex of every edge; of one that would leave the grid, zero."""
-    ny, nx = z.shape
+def _heights(grid: Grid) -> tuple[Float[jax.Array, "ny nx"], EdgeWeights]:
+    """At the first vertices of edges, and at the second ones; zero in holes and beyond the grid."""
+    z, (ny, nx) = jnp.where(jnp.isfinite(grid.z), grid.z, 0), grid.shape
     padded = jnp.pad(z, ((0, 1), (0, 1)))
-    return materialise(jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS]))
+    return z, materialise(jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS]))
 
 
 def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
     """The length in the picture, in pixels, of the part of every edge that lies in its frame; hidden or not."""
-    film = camera.film_from_world().of(grid.world_from_grid)
-    z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
+    film, (z, second) = camera.film_from_world().of(grid.world_from_grid), _heights(grid)
 
     def seen(x: jax.Array, y: jax.Array, z: jax.Array) -> list[jax.Array]:
         return [film.linear[k, 0] * x + film.linear[k, 1] * y + film.linear[k, 2] * z + film.offset[k] for k in range(4)]
 
     (x, y), (along_x, along_y) = _vertices(grid), _steps(z.dtype)
     a = [jnp.stack([row] * 3) for row in materialise(seen(x, y, z))]
-    b = materialise(seen(x[None] + along_x, y[None] + along_y, _second_heights(z)))
+    b = materialise(seen(x[None] + along_x, y[None] + along_y, second))
     first, last = materialise(framed_part(camera, a, b))
     w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
     ends = [
@@ -126,14 +123,12 @@ def _inside(camera: Camera, at: Any) -> tuple[jax.Array, ...]:
 
 def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:
     """The length of every edge as seen from a light: projected across its direction; for a point light, as an angle."""
-    z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
-    x, y = _vertices(grid)
-    world = grid.world_from_grid
+    world, (x, y), (z, second) = grid.world_from_grid, _vertices(grid), _heights(grid)
 
     def turned(vx: jax.Array, vy: jax.Array, vz: jax.Array) -> list[jax.Array]:
         return [world.linear[k, 0] * vx + world.linear[k, 1] * vy + world.linear[k, 2] * vz for k in range(3)]
 
-    e = turned(*_steps(z.dtype), _second_heights(z) - z[None])
+    e = turned(*_steps(z.dtype), second - z[None])
     to: list[Any] = [light.v[k] for k in range(3)]
     if light.at_place:
         to = [light.v[k] - world.offset[k] - p for k, p in enumerate(turned(x[None], y[None], z[None]))]
