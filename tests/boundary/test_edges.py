@@ -7,6 +7,7 @@ differences are noisy, as few of a pixel's samples change sides.
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -109,11 +110,6 @@ def shadow_scene(light: Any = (-1.0, 0.0, TAN), at: float = SHADOW) -> jaxhf.Sce
     return small_scene(HEIGHT * PLATEAU, from_above(at + 0.01), light)
 
 
-def sheet_scene() -> jaxhf.Scene:
-    """The border of a flat sheet, x = 1, seen from above."""
-    return small_scene(np.zeros((9, 9)), from_above(1.01), (0.0, 0.0, 1.0))
-
-
 def seen_aslant(heights: np.ndarray, target: Any, towards: tuple[float, float], tilt: float) -> jaxhf.Scene:
     """Looked at along a horizontal direction and downwards by an angle; lit from above."""
     x, y = towards
@@ -122,31 +118,18 @@ def seen_aslant(heights: np.ndarray, target: Any, towards: tuple[float, float], 
     return small_scene(heights, camera, (0.0, 0.0, 1.0))
 
 
-def far_border_scene() -> jaxhf.Scene:
-    return seen_aslant(np.zeros((9, 9)), (0.5, 1.0, 0.01), (0, 1), np.pi / 6)
-
-
-def crest_scene() -> jaxhf.Scene:
-    """A ridge before the black background, lit on both sides: a silhouette for the eye only."""
-    return seen_aslant(RIDGE, (0.5, 0.5, 0.51), (1, 0), TILTED)
-
-
-def terminator_scene() -> jaxhf.Scene:
-    """A ridge, seen from above with one side dark: its crest is nobody's silhouette but the light's."""
-    return small_scene(RIDGE, from_above(0.49), (-1.0, 0.0, 0.2))
+# The border of a flat sheet, x = 1, seen from above; and its far border, y = 1.
+sheet_scene = functools.partial(small_scene, np.zeros((9, 9)), from_above(1.01), (0.0, 0.0, 1.0))
+far_border_scene = functools.partial(seen_aslant, np.zeros((9, 9)), (0.5, 1.0, 0.01), (0, 1), np.pi / 6)
+# A ridge before the black background, lit on both sides: a silhouette for the eye only. And one that is seen from above with
+# one side dark: its crest is nobody's silhouette but the light's.
+crest_scene = functools.partial(seen_aslant, RIDGE, (0.5, 0.5, 0.51), (1, 0), TILTED)
+terminator_scene = functools.partial(small_scene, RIDGE, from_above(0.49), (-1.0, 0.0, 0.2))
+camera_of, extent_of = operator.attrgetter("camera.world_from_camera"), operator.attrgetter("camera.extent")
 
 
 def world_of(scene: jaxhf.Scene) -> Any:
     return scene.objects[0].world_from_object
-
-
-def camera_of(scene: jaxhf.Scene) -> Any:
-    return scene.camera.world_from_camera
-
-
-def extent_of(scene: jaxhf.Scene) -> Any:
-    assert isinstance(scene.camera, jaxhf.Orthographic)
-    return scene.camera.extent
 
 
 def stretch(x: float, y: float, z: float) -> np.ndarray:
