@@ -13,12 +13,13 @@ from ..core.settings import Shading
 from ..core.types import Index, Scalar
 from ..core.vector import unit
 from ..scene.camera import Camera
-from ..scene.light import Directional, Point, Sun, casts_sharp_shadows
+from ..scene.light import Directional, Point, Sun
+from ..shade.lighting import sharp_lights
+from ..trace.cylinder import Tube
+from ..trace.edges import EdgeFlags, present_edges
 from ..trace.grid import Grid
-from ..trace.skirt import Walls
 from ..trace.world import World
-from . import outline
-from .silhouette import EdgeFlags, EdgeWeights, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
+from .silhouette import EdgeWeights, Viewpoint, folds, lit_lengths, seen_lengths, silhouettes
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
 _TOTAL_WEIGHT = 2**30
@@ -27,10 +28,10 @@ _BLOCK = 8
 
 
 class EdgeSet(NamedTuple):
-    """The edges of one surface, seen where they stand (`light` None) or by their shadow; `first` is the number of its first."""
+    """The edges of one surface, seen where they stand (`light` -1) or by their shadow; `first` is the number of its first."""
 
     surface: int
-    light: int | None
+    light: int
     first: int
     ny: int
     nx: int
@@ -41,39 +42,33 @@ class EdgeSet(NamedTuple):
 
 
 def edge_sets(world: World) -> tuple[EdgeSet, ...]:
-    """All edges of the scene that may bound something, in one numbering; for skirts see `outline`. A cylinder has none."""
+    """All edges of the scene that may bound something, in one numbering. A cylinder has none."""
     found, first = [], 0
-    casting = (
-        [number for number, light in enumerate(world.lights) if casts_sharp_shadows(light)] if world.settings.shadows else []
-    )
-    for k, surface in enumerate(world.surfaces):
-        if not isinstance(surface, Grid | Walls):
-            continue
-        for light in (None, *casting):
-            ny, nx = surface.shape if isinstance(surface, Grid) else (2, outline.columns(surface))
-            found.append(EdgeSet(k, light, first, ny, nx))
+    casting = [number for number, _ in sharp_lights(world)] if world.settings.shadows else []
+    for k, grid, _ in world.grids:
+        for light in (-1, *casting):
+            found.append(EdgeSet(k, light, first, *grid.shape))
             first = found[-1].end
     return tuple(found)
 
 
+def has_edges(world: World) -> bool:
+    """Whether a derivative draws points on edges: a cylinder has none, and to draw those of a skirt is refused."""
+    return bool(world.settings.edge_samples) and any(not isinstance(surface, Tube) for surface in world.surfaces)
+
+
 def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
     """Weights of the edges by their lengths as seen or lit, without tracing a ray; those of a set sum to one, or are zero."""
-    lights = {number: _viewpoint(light) for number, light in enumerate(world.lights) if casts_sharp_shadows(light)}
+    lights = {number: _viewpoint(light) for number, light in sharp_lights(world)}
     standing = [*lights.values(), *(view for light in world.lights if isinstance(light, Sun) for view in _ends_of(light))]
     weights = []
     for edges in edge_sets(world):
-        surface = world.surfaces[edges.surface]
-        if isinstance(surface, Walls):
-            lengths = _outline_lengths(world, surface, camera, None if edges.light is None else lights[edges.light])
-            weights.append(_shares(lengths))
-            continue
-        assert isinstance(surface, Grid)
-        if edges.light is None:
-            flags = _standing(surface, camera, standing, world.settings.shading)
-            lengths = seen_lengths(surface, camera)
+        grid = world.surfaces[edges.surface]
+        assert isinstance(grid, Grid)
+        if edges.light < 0:
+            flags, lengths = _standing(grid, camera, standing, world.settings.shading), seen_lengths(grid, camera)
         else:
-            flags = silhouettes(surface, lights[edges.light])
-            lengths = lit_lengths(surface, lights[edges.light])
+            flags, lengths = silhouettes(grid, lights[edges.light]), lit_lengths(grid, lights[edges.light])
         weights.append(_shares(jnp.where(flags, lengths, 0)))
     return jnp.concatenate(weights)
 
@@ -87,13 +82,6 @@ def _shares(lengths: EdgeWeights) -> Float[jax.Array, " edges"]:
     return lengths / jnp.where(total > 0, total, 1)
 
 
-def _outline_lengths(world: World, walls: Walls, camera: Camera, light: Viewpoint | None) -> EdgeWeights:
-    """Of the edges of a skirt that may bound what is seen, as seen; or those that throw a shadow, as lit."""
-    if light is None:
-        return jnp.where(outline.outline(world, walls), outline.seen_lengths(walls, camera), 0)
-    return jnp.where(outline.shading_edges(world, walls, light), outline.lit_lengths(walls, light), 0)
-
-
 def boundary_length(world: World, camera: Camera) -> Scalar:
     """How long boundaries may be in the picture, pixels: silhouettes, the terrain's border and edges of shadows.
 
@@ -101,21 +89,18 @@ def boundary_length(world: World, camera: Camera) -> Scalar:
     edge that throws it. Zero where nothing in the picture has a boundary.
     """
     total = jnp.zeros((), camera.world_from_camera.dtype)
-    for surface in world.surfaces:
-        if not isinstance(surface, Grid):
-            continue
-        lengths = seen_lengths(surface, camera)
-        total = total + jnp.sum(jnp.where(silhouettes(surface, Viewpoint(*camera.viewpoint())), lengths, 0))
-        for light in world.lights if world.settings.shadows else ():
-            if casts_sharp_shadows(light):
-                total = total + jnp.sum(jnp.where(folds(surface, _viewpoint(light)), lengths, 0))
+    for _, grid, _ in world.grids:
+        lengths = seen_lengths(grid, camera)
+        total = total + jnp.sum(jnp.where(silhouettes(grid, Viewpoint(*camera.viewpoint())), lengths, 0))
+        for _, light in sharp_lights(world) if world.settings.shadows else ():
+            total = total + jnp.sum(jnp.where(folds(grid, _viewpoint(light)), lengths, 0))
     return total
 
 
 def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], shading: Shading) -> EdgeFlags:
     """Edges across which what is seen jumps at the edge itself; one that is a silhouette for several counts once."""
     if shading == "flat":
-        return all_edges(grid)
+        return present_edges(grid.z)
     flags = silhouettes(grid, Viewpoint(*camera.viewpoint()))
     for light in lights:
         flags = flags | silhouettes(grid, light)

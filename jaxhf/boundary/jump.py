@@ -5,6 +5,9 @@ and could stand on both sides of another boundary. Everything is followed from t
 its edge: a jump belongs to the edge, or there is none.
 """
 
+import dataclasses
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,17 +15,16 @@ from jax import lax
 
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
-from ..core.vector import dot
+from ..core.vector import dot, select
 from ..scene.camera import Camera
 from ..shade.radiance import radiance_from, shadowed_radiance
 from ..trace.hit import Hit
 from ..trace.intersect import hit_on_triangle
-from ..trace.skirt import hit_on_side
 from ..trace.status import Status
 from ..trace.world import World, no_hit
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
-from .fold import Fold, Probe, fold_at, meet, probe, probe_beyond, probe_source, skirts, towards
+from .fold import Fold, Probe, fold_at, meet, towards
 from .sample import BoundarySample, picture_point
 
 
@@ -63,23 +65,21 @@ def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[Bou
       source nor, for a shadow, its place from the eye. And the passage.
     """
     fold = fold_at(world, camera, sample)
-    casts, never = sample.light >= 0, jnp.zeros((), bool)
-
-    def to_source(free: Flag, beyond: Hit) -> Probe:
-        return probe_source(world, fold, sample.valid & (fold.bends | ~casts))
-
-    def past_edge(free: Flag, beyond: Hit) -> Probe:
-        return probe_beyond(world, fold, free & fold.bends)
-
-    def to_eye(free: Flag, beyond: Hit) -> Probe:
-        """From the side of the place from which it was met."""
-        to, distance = towards(world, camera, jnp.full((), -1, jnp.int32), beyond.p)
-        faces = dot(to, beyond.n) * beyond.side.astype(to.dtype) > 0
-        return probe(world, Ray(beyond.p, to), beyond, _falls(sample, fold, free, beyond) & faces, distance)
+    casts, never, past, none = sample.light >= 0, jnp.zeros((), bool), fold.past, jnp.zeros_like(fold.back)
+    onwards = dataclasses.replace(fold.ahead, side=-fold.ahead.side)
 
     def look(known: tuple[Flag, Hit, Flag], number: Index) -> tuple[tuple[Flag, Hit, Flag], None]:
+        """From the edge to its source; past the edge; and from a shadow to the eye, on the side from which it was met."""
         free, beyond, _ = known
-        hit, clear = meet(world, sample, lax.switch(number, [to_source, past_edge, to_eye], free, beyond))
+        back, to_eye = Ray(past.o, -past.d), towards(world, camera, jnp.full((), -1, jnp.int32), beyond.p)
+        up = Ray(beyond.p, to_eye[0])
+        faces = dot(up.d, beyond.n) * beyond.side.astype(up.d.dtype) > 0
+        probes = (
+            Probe(back, back, none, fold.near, sample.valid & (fold.bends | ~casts), fold.distance),
+            Probe(past, fold.beside, fold.back, onwards, free & fold.bends, jnp.full_like(fold.back, jnp.inf)),
+            Probe(up, up, none, beyond, _falls(sample, fold, free, beyond) & faces, to_eye[1]),
+        )
+        hit, clear = meet(world, sample, select(number, enumerate(probes)))
         beyond = lax.cond(number == 1, lambda hits: hits[0], lambda hits: hits[1], (hit, beyond))  # no kernel, unlike `where`
         return (jnp.where(number == 0, clear, free), beyond, clear), None
 
@@ -87,16 +87,13 @@ def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[Bou
     known = never, no_hit(sample.s.dtype), never
     (free, beyond, seen), _ = lax.scan(look, known, jnp.arange(3, dtype=jnp.int32))
     falls = _falls(sample, fold, free, beyond)
-    sample = eqx.tree_at(
-        lambda sample: (sample.valid, sample.receiver, sample.cell, sample.upper, sample.t),
+    sample = dataclasses.replace(
         sample,
-        (
-            jnp.where(casts, seen, free),
-            jnp.maximum(beyond.object, 0),
-            beyond.cell,
-            beyond.triangle == 1,
-            jnp.where(falls, beyond.t, 0),
-        ),
+        valid=jnp.where(casts, seen, free),
+        receiver=jnp.maximum(beyond.object, 0),
+        cell=beyond.cell,
+        upper=beyond.triangle == 1,
+        t=jnp.where(falls, beyond.t, 0),
     )
     return sample, Passage(fold, beyond)
 
@@ -109,20 +106,13 @@ def _falls(sample: BoundarySample, fold: Fold, free: Flag, beyond: Hit) -> Flag:
 
 def boundary_segment(world: World, camera: Camera, sample: BoundarySample, fold: Fold) -> BoundarySegment:
     """The boundary round a sample: its position in the picture, its normal and its speed, by forward differentiation."""
-
-    def position(s: Scalar) -> tuple[Point2, Flag]:
-        return picture_point(world, camera, sample, s)
-
-    x, along, valid = materialise(jax.jvp(position, (sample.s,), (jnp.ones_like(sample.s),), has_aux=True))
+    at = functools.partial(picture_point, world, camera, sample)
+    x, along, valid = materialise(jax.jvp(at, (sample.s,), (jnp.ones_like(sample.s),), has_aux=True))
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
     # Of what would cross the whole picture within less than the rounding of s, no position is known.
     valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)
     across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
-
-    def moved(offset: Vector) -> Point2:
-        return picture_point(world, camera, sample, sample.s, offset)[0]
-
-    _, motion = jax.jvp(moved, (jnp.zeros_like(fold.across),), (fold.across,))
+    _, motion, _ = jax.jvp(functools.partial(at, sample.s), (jnp.zeros_like(fold.across),), (fold.across,), has_aux=True)
     rate = (across[0] * motion[0] + across[1] * motion[1]) / jnp.where(valid, length, 1)
     speed = jnp.abs(rate * fold.across[2])  # along the edge and along the ray the boundary stands still
     speed = jnp.where(valid & jnp.isfinite(speed), speed, 0)
@@ -149,20 +139,7 @@ def radiance_jump(world: World, sample: BoundarySample, passage: Passage, active
 
 def _side_radiance(world: World, fold: Fold, beyond: Hit, side: Index, active: Flag) -> Vector:
     """What comes to the eye from the triangle that is near, or from what stands beyond: the other triangle, if that is seen."""
-    ahead = eqx.tree_at(lambda hit: hit.side, fold.ahead, fold.source_side)
-    at = lax.cond(side == 0, lambda ends: ends[0], lambda ends: ends[1], (fold.near, ahead))
-    hit, past, faces = beyond, fold.past, fold.faces
-    if faces is not None:
-        past = Ray(past.o + faces.inwards, past.d)
-    for number, grid, _ in world.grids:
-        own = ((side == 0) | ~fold.bends) & (at.object == number)
-        here = hit_on_triangle(grid, number, past, at)
-        hit = jax.tree.map(lambda new, old, own=own: jnp.where(own, new, old), here, hit)
-    if faces is not None:
-        face = jax.tree.map(lambda near, ahead: jnp.where(side == 0, near, ahead), faces.near, faces.ahead)
-        is_face = jnp.where(side == 0, faces.is_near, faces.is_ahead)
-        for number, walls in skirts(world):
-            here = hit_on_side(walls, number, face.cell[0], face.p, past.d)
-            own = is_face & (face.object == number)
-            hit = jax.tree.map(lambda new, old, own=own: jnp.where(own, new, old), here, hit)
+    at = lax.cond(side == 0, lambda ends: ends[0], lambda ends: ends[1], (fold.near, fold.ahead))
+    on_triangle = ((number, hit_on_triangle(grid, number, fold.past, at)) for number, grid, _ in world.grids)
+    hit = select(jnp.where((side == 0) | ~fold.bends, at.object, -1), on_triangle, beyond)
     return radiance_from(world, fold.past, hit, active)

@@ -13,6 +13,8 @@ dx/ds turned by a right angle, times ds, so the term is the mean over points of 
 docs/concepts/boundary.md has the whole.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,18 +25,21 @@ from ..core.affine import affine
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
-from ..core.vector import largest_component, quotient, unit
+from ..core.vector import dot, largest_component, quotient, select, unit
 from ..scene.camera import Camera
-from ..scene.light import Point, casts_sharp_shadows
+from ..scene.light import Point
+from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube, tube_distance
+from ..trace.edges import STEPS
 from ..trace.grid import Grid
-from ..trace.skirt import Walls, wall_distance
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
 from ..trace.world import World
 from ..xla.materialise import materialise
 from .guiding import GuidingDistribution, edge_sets
-from .outline import along_edge
-from .silhouette import STEPS, framed_part
+from .silhouette import framed_part
+
+# What is added to the heights at the `deciding_vertices` of a sample.
+HeightChanges = Float[jax.Array, "5"]
 
 
 class BoundarySample(eqx.Module):
@@ -81,20 +86,14 @@ def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u
     s = ((chosen - before).astype(dtype) + u[1]) / weight.astype(dtype)
     measure = guiding.stratum.astype(dtype) / weight.astype(dtype)
 
-    none = jnp.zeros((), jnp.int32)
-    surface, light, kind, ix, iy = none, none - 1, none, none, none
-    for edges in edge_sets(world):
-        here = (edge >= edges.first) & (edge < edges.end)
-        local, area = edge - edges.first, edges.ny * edges.nx
-        surface = jnp.where(here, edges.surface, surface)
-        light = jnp.where(here, -1 if edges.light is None else edges.light, light)
-        kind = jnp.where(here, local // area, kind)
-        ix, iy = jnp.where(here, local % edges.nx, ix), jnp.where(here, local % area // edges.nx, iy)
-    steps = jnp.array(STEPS, jnp.int32)
-    start = jnp.stack([ix, iy])
+    sets = edge_sets(world)
+    number = sum((edge >= later.first).astype(jnp.int32) for later in sets[1:])
+    surface, light, first, ny, nx = jnp.array(sets, jnp.int32)[number]
+    kind, vertex = (edge - first) // (ny * nx), (edge - first) % (ny * nx)
+    start, none = jnp.stack([vertex % nx, vertex // nx]), jnp.zeros((), jnp.int32)
     point = BoundarySample(
-        valid=valid, edge=edge, surface=surface, light=light, start=start, end=start + steps[kind], s=s, measure=measure,
-        receiver=none, cell=jnp.zeros(2, jnp.int32), upper=jnp.zeros((), bool), t=jnp.zeros((), dtype),
+        valid=valid, edge=edge, surface=surface, light=light, start=start, end=start + jnp.array(STEPS, jnp.int32)[kind], s=s,
+        measure=measure, receiver=none, cell=jnp.zeros(2, jnp.int32), upper=jnp.zeros((), bool), t=jnp.zeros((), dtype),
     )  # fmt: skip
     # Of an edge that is seen where it stands, only the part in the frame is drawn from.
     film = camera.film_from_world()
@@ -102,11 +101,8 @@ def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u
     first, last = materialise(framed_part(camera, a, b))
     stands = light < 0
     first, last = jnp.where(stands, first, 0), jnp.where(stands, last, 1)
-    return eqx.tree_at(
-        lambda point: (point.valid, point.s, point.measure),
-        point,
-        (valid & (last > first), first + s * (last - first), measure * (last - first)),
-    )
+    share, valid = last - first, valid & (last > first)
+    return dataclasses.replace(point, valid=valid, s=first + s * share, measure=measure * share)
 
 
 def between_ends(point: BoundarySample, s: Scalar) -> tuple[Scalar, Scalar]:
@@ -115,31 +111,25 @@ def between_ends(point: BoundarySample, s: Scalar) -> tuple[Scalar, Scalar]:
 
 
 def on_edge(
-    world: World,
-    point: BoundarySample,
-    s: Scalar,
-    offset: Vector | None = None,
-    perturbation: Float[jax.Array, "5"] | None = None,
+    world: World, point: BoundarySample, s: Scalar, offset: Vector | None = None, perturbation: HeightChanges | None = None
 ) -> Vector:
     """World frame, moved by `offset` (in the surface's own frame); differentiable in the heights and in the transform."""
-    chosen = None
-    for k, grid in enumerate(world.surfaces):
-        if isinstance(grid, Grid):
-            x, y = between_ends(point, s)
-            z0, z1 = (grid.rows.at[end].get(mode="clip") for end in _ends(grid, point))
-            if perturbation is not None:
-                z0, z1 = z0 + perturbation[0], z1 + perturbation[1]
-            z0, z1 = (jnp.where(jnp.isfinite(z), z, 0) for z in (z0, z1))
-            z = z0 + s * (z1 - z0)
-            p = jnp.stack([x, y, z])
-            p = grid.world_from_grid.point(p if offset is None else p + offset)
-            chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
-        elif isinstance(grid, Walls):
-            p = along_edge(grid, point.start, point.end, s)
-            p = grid.world_from_object.point(p if offset is None else p + offset)
-            chosen = p if chosen is None else jnp.where(point.surface == k, p, chosen)
-    assert chosen is not None
-    return chosen
+
+    def on(grid: Grid) -> Vector:
+        x, y = between_ends(point, s)
+        z0, z1 = end_heights(grid, point, None if perturbation is None else perturbation[:2])
+        p = jnp.stack([x, y, z0 + s * (z1 - z0)])
+        return grid.world_from_grid.point(p if offset is None else p + offset)
+
+    return select(point.surface, ((k, on(grid)) for k, grid, _ in world.grids))
+
+
+def end_heights(grid: Grid, point: BoundarySample, more: Point2 | None = None) -> tuple[Scalar, Scalar]:
+    """At the edge's two vertices, grid frame, with `more` added; zero for holes, which bound no edge that counts."""
+    z0, z1 = (grid.rows.at[end].get(mode="clip") for end in _ends(grid, point))
+    if more is not None:
+        z0, z1 = z0 + more[0], z1 + more[1]
+    return jnp.where(jnp.isfinite(z0), z0, 0), jnp.where(jnp.isfinite(z1), z1, 0)
 
 
 def _ends(grid: Grid, point: BoundarySample) -> tuple[Index, Index]:
@@ -158,55 +148,57 @@ def deciding_vertices(world: World, point: BoundarySample) -> Int[jax.Array, "5"
 
     The edge's two; and the three of the triangle on which its shadow falls.
     """
-    vertices = jnp.zeros(5, jnp.int32)
+    ends, triangles = [], []
     for k, grid, before in world.grids:
         cell = _receiving_cell(grid, point)
-        ends = jnp.clip(jnp.stack(_ends(grid, point)), 0, grid.rows.shape[0] - 1)
-        triangle = jnp.stack(triangle_vertices(grid.shape[1], cell[0], cell[1], point.upper))
-        here = jnp.stack([point.surface == k] * 2 + [point.receiver == k] * 3)
-        vertices = jnp.where(here, before + jnp.concatenate([ends, triangle]), vertices)
-    return vertices
+        ends.append((k, before + jnp.clip(jnp.stack(_ends(grid, point)), 0, grid.rows.shape[0] - 1)))
+        triangles.append((k, before + jnp.stack(triangle_vertices(grid.shape[1], cell[0], cell[1], point.upper))))
+    none = jnp.zeros(3, jnp.int32)
+    return jnp.concatenate([select(point.surface, ends), select(point.receiver, triangles, none)])
 
 
-def _away_from_light(world: World, point: BoundarySample, p: Vector) -> Vector:
-    """The unit direction in which light goes on past p."""
-    chosen = jnp.zeros_like(p)
-    for number, light in enumerate(world.lights):
-        if casts_sharp_shadows(light):
-            away = unit(p - light.p) if isinstance(light, Point) else -unit(light.towards)
-            chosen = jnp.where(point.light == number, away, chosen)
-    return chosen
+def ways_to_lights(world: World, p: Vector) -> list[tuple[int, tuple[Vector, Scalar]]]:
+    """The unit direction from p to each light whose shadows are sharp, and its distance, with the light's number."""
+    ways = []
+    for number, light in sharp_lights(world):
+        at_place = isinstance(light, Point)
+        there = light.p - p if at_place else light.towards
+        to = unit(there)
+        ways.append((number, (to, dot(there, to) if at_place else jnp.full((), jnp.inf, p.dtype))))
+    return ways
 
 
-def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Float[jax.Array, "5"] | None = None) -> Vector:
+def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: HeightChanges | None = None) -> Vector:
     """Where the light past p meets the triangle that was found; differentiable."""
-    away = _away_from_light(world, point, p)
+    to, _ = select(point.light, ways_to_lights(world, p))
+    away = -to
     near = p + jnp.where(point.valid, point.t, 0) * away
-    landed = near
-    for k, surface in enumerate(world.surfaces):
-        if isinstance(surface, Grid):
-            # From `near` on, which lies there but for its derivative: far distances would cancel.
-            local = surface.grid_from_world.ray(Ray(near, away))
-            cell = _receiving_cell(surface, point)
-            heights = triangle_corners(surface.rows, surface.shape[1], cell[0], cell[1], point.upper)
-            if perturbation is not None:
-                heights = tuple(z + more for z, more in zip(heights, perturbation[2:], strict=True))
-            a, b, c = plane_through(heights, point.upper)
-            u, v = local.o[0] - cell[0].astype(p.dtype), local.o[1] - cell[1].astype(p.dtype)
-            # At a length around one, as the derivative has the slope's square in it; a power of two changes no bit.
-            size = largest_component(local.d)
-            size = floor_to_power_of_two(jnp.where(size > 0, size, 1))
-            d = local.d / size
-            slope = d[2] - a * d[0] - b * d[1]
-            grazing = (slope == 0) | ~point.valid
-            step = jnp.where(grazing, 0, quotient(c + a * u + b * v - local.o[2], jnp.where(grazing, 1, slope))) / size
-            landed = jnp.where(point.receiver == k, near + step * away, landed)
-        else:
-            ray = Ray(p, away)
-            tube = isinstance(surface, Tube)
-            t, found = tube_distance(surface, ray, None) if tube else wall_distance(surface, ray, None, k)[:2]
-            landed = jnp.where(point.receiver == k, p + jnp.where(found, t, point.t) * away, landed)
-    return landed
+
+    def on_triangle(grid: Grid) -> Vector:
+        # From `near` on, which lies there but for its derivative: far distances would cancel.
+        local = grid.grid_from_world.ray(Ray(near, away))
+        cell = _receiving_cell(grid, point)
+        heights = triangle_corners(grid.rows, grid.shape[1], cell[0], cell[1], point.upper)
+        if perturbation is not None:
+            heights = tuple(z + more for z, more in zip(heights, perturbation[2:], strict=True))
+        a, b, c = plane_through(heights, point.upper)
+        u, v = local.o[0] - cell[0].astype(p.dtype), local.o[1] - cell[1].astype(p.dtype)
+        # At a length around one, as the derivative has the slope's square in it; a power of two changes no bit.
+        size = largest_component(local.d)
+        size = floor_to_power_of_two(jnp.where(size > 0, size, 1))
+        d = local.d / size
+        slope = d[2] - a * d[0] - b * d[1]
+        grazing = (slope == 0) | ~point.valid
+        step = jnp.where(grazing, 0, quotient(c + a * u + b * v - local.o[2], jnp.where(grazing, 1, slope))) / size
+        return near + step * away
+
+    def on_tube(tube: Tube) -> Vector:
+        t, found = tube_distance(tube, Ray(p, away), None)
+        return p + jnp.where(found, t, point.t) * away
+
+    grids = [(k, on_triangle(grid)) for k, grid, _ in world.grids]
+    tubes = [(k, on_tube(tube)) for k, tube in enumerate(world.surfaces) if isinstance(tube, Tube)]
+    return select(point.receiver, [*grids, *tubes], near)
 
 
 def picture_point(
@@ -215,15 +207,14 @@ def picture_point(
     point: BoundarySample,
     s: Scalar,
     offset: Vector | None = None,
-    perturbation: Float[jax.Array, "5"] | None = None,
+    perturbation: HeightChanges | None = None,
 ) -> tuple[Point2, Flag]:
     """The position of the sample, or of its shadow, in the picture (pixels), and whether it is in the frame; differentiable.
 
-    In every leaf of the scene, and in s while the shadow stays in its triangle; in `perturbation`, which is added to the
-    heights at its `deciding_vertices`.
+    In every leaf of the scene, in s while the shadow stays in its triangle, and in `perturbation`.
     """
     p = materialise(on_edge(world, point, s, offset, perturbation))
-    if any(edges.light is not None for edges in edge_sets(world)):
+    if any(edges.light >= 0 for edges in edge_sets(world)):
         p = jnp.where(point.light >= 0, _fallen(world, point, p, perturbation), p)
     # Of a point that does not count, the position may be larger than any number, and its derivative, times zero, none.
     ahead = affine(jnp.asarray(camera.world_from_camera)).point(jnp.array([0, 0, 1], p.dtype))

@@ -1,7 +1,6 @@
 """Which edges of a heightfield bound what is seen or lit: dense arithmetic over the grid, without a derivative.
 
-Edges have a kind, 0 along x, 1 along y, 2 along the diagonal, and begin at a vertex: arrays over them have shape
-(3, ny, nx). Those that would leave the grid are there too, and bound nothing.
+Arrays over edges are those of `trace.edges`; an edge that would leave the grid bounds nothing.
 """
 
 from typing import Any
@@ -9,17 +8,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ..core.types import Vector
 from ..scene.camera import Camera
+from ..trace.edges import STEPS, EdgeFlags, compare_sides, whole_cells
 from ..trace.grid import Grid
 from ..xla.materialise import materialise
 
-# From an edge's first vertex to its second.
-STEPS = ((1, 0), (0, 1), (1, 1))
-
-EdgeFlags = Bool[jax.Array, "3 ny nx"]
 EdgeWeights = Float[jax.Array, "3 ny nx"]
 
 
@@ -36,33 +32,12 @@ def silhouettes(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     (Hertzmann and Zorin, Illustrating smooth surfaces, SIGGRAPH 2000, section 4.1, on polygons.) Edges at the border and
     at holes have one triangle.
     """
-    lower, upper = _facing(grid, viewpoint)
-    return _between(lower, upper, lambda a, b: a != b)
+    return compare_sides(*_facing(grid, viewpoint), lambda a, b: a != b)
 
 
 def folds(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     """The edges with one triangle that faces the viewpoint and one that faces away."""
-    lower, upper = _facing(grid, viewpoint)
-    return _between(lower, upper, lambda a, b: a * b < 0)
-
-
-def all_edges(grid: Grid) -> EdgeFlags:
-    """The edges with at least one triangle."""
-    present = whole_cells(grid)
-    return _between(present, present, lambda a, b: a | b)
-
-
-def _between(lower: jax.Array, upper: jax.Array, compare: Any) -> EdgeFlags:
-    """Compares the two triangles of every edge, given values per cell of its two triangles; beyond the border stands zero."""
-    above, right = jnp.pad(lower, ((0, 1), (0, 1))), jnp.pad(upper, ((0, 1), (0, 1)))
-    below, left = jnp.pad(upper, ((1, 0), (0, 1))), jnp.pad(lower, ((0, 1), (1, 0)))
-    return jnp.stack([compare(above, below), compare(right, left), compare(above, right)])
-
-
-def whole_cells(grid: Grid) -> Bool[jax.Array, "cells_y cells_x"]:
-    """Which cells have all their vertices."""
-    z = grid.z
-    return jnp.isfinite(z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:])
+    return compare_sides(*_facing(grid, viewpoint), lambda a, b: a * b < 0)
 
 
 def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
@@ -74,7 +49,7 @@ def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
     if viewpoint.at_place:
         x, y = _vertices(grid)
         to_x, to_y, to_z = v[0] - x[:-1, :-1], v[1] - y[:-1, :-1], v[2] - z00
-    present = whole_cells(grid)
+    present = whole_cells(grid.z)
 
     def facing(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(present, jnp.where(to_z - a * to_x - b * to_y >= 0, 1, -1), 0).astype(jnp.int8)
@@ -94,29 +69,23 @@ def _steps(dtype: Any) -> tuple[jax.Array, jax.Array]:
     return along_x, along_y
 
 
-def _second_heights(z: Float[jax.Array, "ny nx"]) -> EdgeWeights:
-    """The heights at the second vertex of every edge; of one that would leave the grid, zero."""
-    ny, nx = z.shape
+def _heights(grid: Grid) -> tuple[Float[jax.Array, "ny nx"], EdgeWeights]:
+    """At the first vertices of edges, and at the second ones; zero in holes and beyond the grid."""
+    z, (ny, nx) = jnp.where(jnp.isfinite(grid.z), grid.z, 0), grid.shape
     padded = jnp.pad(z, ((0, 1), (0, 1)))
-    return materialise(jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS]))
+    return z, materialise(jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS]))
 
 
 def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
     """The length in the picture, in pixels, of the part of every edge that lies in its frame; hidden or not."""
-    film = camera.film_from_world().of(grid.world_from_grid)
-    z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
+    film, (z, second) = camera.film_from_world().of(grid.world_from_grid), _heights(grid)
 
     def seen(x: jax.Array, y: jax.Array, z: jax.Array) -> list[jax.Array]:
         return [film.linear[k, 0] * x + film.linear[k, 1] * y + film.linear[k, 2] * z + film.offset[k] for k in range(4)]
 
     (x, y), (along_x, along_y) = _vertices(grid), _steps(z.dtype)
     a = [jnp.stack([row] * 3) for row in materialise(seen(x, y, z))]
-    b = materialise(seen(x[None] + along_x, y[None] + along_y, _second_heights(z)))
-    return framed_length(camera, a, b)
-
-
-def framed_length(camera: Camera, a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
-    """The length in the picture, in pixels, of what lies in its frame of the lines between two coordinates of `Projection`."""
+    b = materialise(seen(x[None] + along_x, y[None] + along_y, second))
     first, last = materialise(framed_part(camera, a, b))
     w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
     ends = [
@@ -154,24 +123,17 @@ def _inside(camera: Camera, at: Any) -> tuple[jax.Array, ...]:
 
 def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:
     """The length of every edge as seen from a light: projected across its direction; for a point light, as an angle."""
-    z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
-    x, y = _vertices(grid)
-    world = grid.world_from_grid
+    world, (x, y), (z, second) = grid.world_from_grid, _vertices(grid), _heights(grid)
 
     def turned(vx: jax.Array, vy: jax.Array, vz: jax.Array) -> list[jax.Array]:
         return [world.linear[k, 0] * vx + world.linear[k, 1] * vy + world.linear[k, 2] * vz for k in range(3)]
 
-    e = turned(*_steps(z.dtype), _second_heights(z) - z[None])
+    e = turned(*_steps(z.dtype), second - z[None])
     to: list[Any] = [light.v[k] for k in range(3)]
     if light.at_place:
         to = [light.v[k] - world.offset[k] - p for k, p in enumerate(turned(x[None], y[None], z[None]))]
-    return lit_length(e, to, light.at_place)
-
-
-def lit_length(e: list[Any], to: list[Any], at_place: bool) -> jax.Array:
-    """The length of lines `e` as seen from a light, `at_place` or not, in the direction `to` from where they begin."""
     square = to[0] * to[0] + to[1] * to[1] + to[2] * to[2]
     cross = [e[i] * to[j] - e[j] * to[i] for i, j in ((1, 2), (2, 0), (0, 1))]
     across = jnp.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
     square = jnp.where(square > 0, square, 1)
-    return across / (square if at_place else jnp.sqrt(square))
+    return across / (square if light.at_place else jnp.sqrt(square))

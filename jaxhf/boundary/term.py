@@ -16,8 +16,10 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
+from ..core.errors import ArgumentError
 from ..core.settings import Settings
 from ..scene.camera import Camera
+from ..trace.skirt import Walls
 from ..trace.world import World
 from ..xla.devices import map_over
 from ..xla.kernel import PART, one_kernel, traced_once
@@ -93,8 +95,14 @@ def draw_boundaries(
       key: of the random numbers; None: a fixed one.
       mesh: the devices that share the work.
       resampled: how many pixels are resampled; None: as many as take `edge_samples` samples.
+
+    Raises:
+      ArgumentError: the scene has a skirt.
     """
     settings, edge_samples = world.settings, world.settings.edge_samples or 0
+    if any(isinstance(surface, Walls) for surface in world.surfaces):
+        rule = f"must be 0 where a scene with a Skirt is differentiated, as its edges are not followed; it is {edge_samples}"
+        raise ArgumentError("Settings", "edge_samples", rule)
     key = jax.random.key(0) if key is None else key
     chunks = math.ceil(edge_samples / (_ROUNDS * settings.chunk))
     draws = math.ceil(edge_samples / (_ROUNDS * chunks))

@@ -6,6 +6,8 @@ over the quotient, that infinity times zero is nan. So whatever may be tiny divi
 
 import functools
 import operator
+from collections.abc import Iterable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,9 @@ from jax import lax
 from jaxtyping import Float
 
 from .powers import floor_to_power_of_two
-from .types import Flag, Scalar, Vector
+from .types import Flag, Index, Scalar, Vector
+
+Tree = TypeVar("Tree")
 
 # Along an axis in which it moves less than 1 / FAR, a ray counts as standing still; its distance to the next plane there is
 # then large, but finite in single precision whatever it is multiplied with later.
@@ -68,6 +72,18 @@ def within(x: Scalar, least: Scalar | float, most: Scalar | float) -> Scalar:
     and rounds it otherwise none does, and the derivative is zero.
     """
     return lesser(greater(x, jnp.asarray(least, x.dtype)), jnp.asarray(most, x.dtype))
+
+
+def select(number: Index, values: Iterable[tuple[int, Tree]], otherwise: Tree | None = None) -> Tree:
+    """The pytree that stands beside this number among `values`, and `otherwise` beside none; if that is None, any of them."""
+    chosen = otherwise
+    for k, value in values:
+        if chosen is None:
+            chosen = value
+        else:
+            chosen = jax.tree.map(lambda new, old, k=k: jnp.where(number == k, new, old), value, chosen)
+    assert chosen is not None, "nothing to select from"
+    return chosen
 
 
 def largest_component(v: Float[jax.Array, " n"]) -> Scalar:

@@ -11,6 +11,7 @@ from ..boundary.guiding import boundary_length
 from ..core.settings import Settings
 from ..core.types import Scalar
 from ..scene.scene import Scene
+from ..scene.skirt import Skirt
 from ..trace.world import make_world, resolve_settings
 from ..xla.compilation import compiled
 from .linearise import can_be_linearised
@@ -29,7 +30,8 @@ def choose_samples(scenes: Sequence[Scene], settings: Settings) -> Settings:
 
 
 def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: bool = False) -> int:
-    """As many points on edges as the boundaries in the longest of these pictures are long; 0 where there are none.
+    """As many points on edges as the boundaries in the longest of these pictures are long; 0 where there are none, and beside
+    a skirt.
 
     A power of two, so that pictures that differ little share a program.
 
@@ -38,7 +40,8 @@ def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: boo
       settings: the knobs.
       shadows: whether the measured pictures show shadows, whatever these scenes do.
     """
-    if not all(can_be_linearised(view, settings) for view in views):
+    has_skirt = any(isinstance(obj.shape, Skirt) for view in views for obj in view.objects)  # with points it is refused
+    if has_skirt or not all(can_be_linearised(view, settings) for view in views):
         return 0
     settings = dataclasses.replace(settings, edge_samples=None)  # so that a second call, when some are chosen, compiles nothing
     length = max(float(_boundary_length(view, settings)) for view in views)

@@ -162,7 +162,7 @@ def what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"], pictures:
         return "loss='geman' lets pixels go that the scene cannot explain"
     if not problem.settings.shadows:
         return "Settings(shadows=True), the default, renders shadows, too"
-    if not problem.settings.edge_samples:
+    if options.settings.edge_samples == 0:
         return "Settings(edge_samples=None), the default, lets the fit move silhouettes, shadows and the terrain's border"
     share = share_of_normals(problem, heights) if problem.by_angle is None else 0.0  # else the fit has tried them
     if share > 1:

@@ -18,7 +18,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
-from ..boundary.guiding import edge_sets
+from ..boundary.guiding import has_edges
 from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
 from ..boundary.term import Packed, draw_boundaries
 from ..core.autodiff import with_tangent
@@ -155,7 +155,7 @@ def picture_each(
 
 def _linearise(world: World, camera: Camera, mesh: Mesh, channels: int, still: View) -> Linearised:
     drawn, edge_samples = None, world.settings.edge_samples or 0
-    if edge_samples and edge_sets(world):
+    if has_edges(world):
         drawn = draw_boundaries(world, camera, None, mesh, math.ceil(edge_samples / _POINTS_PER_PIXEL))
     samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
     sampled = functools.partial(_samples, channels)

@@ -15,7 +15,7 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..boundary.guiding import edge_sets
+from ..boundary.guiding import has_edges
 from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
@@ -266,8 +266,7 @@ def _trace(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key:
         drawn = draw_boundaries(world, camera, key, mesh)
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
 
-    has_points = world.settings.edge_samples and edge_sets(world)
-    return in_turn(picture, world, camera, key, derivative_of=across_boundaries if has_points else None)
+    return in_turn(picture, world, camera, key, derivative_of=across_boundaries if has_edges(world) else None)
 
 
 def _trace_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh) -> dict[str, jax.Array]:

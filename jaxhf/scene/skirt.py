@@ -22,7 +22,8 @@ class Skirt(eqx.Module):
     """The four vertical walls under a heightfield's border, down to a level, and the floor there; seen from both sides.
 
     (u, v) on a wall: u along it, 0 to 1, v from 0 on the floor to 1 on the highest point of the border; on the floor as on the
-    heightfield. Where the border has a hole there is no wall.
+    heightfield. Where the border has a hole there is no wall. A derivative of a scene that has one is refused with
+    `Settings.edge_samples` above 0.
 
     Attributes:
       south, north: heights of the border's first and last row.

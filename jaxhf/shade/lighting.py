@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, greater, largest_component, quotient, unit, within
-from ..scene.light import Directional, Point, Sky, Sun
+from ..core.vector import dot, greater, largest_component, quotient, select, unit, within
+from ..scene.light import Directional, Point, Sky, Sun, casts_sharp_shadows
 from ..trace.cylinder import Tube
 from ..trace.grid import Grid
 from ..trace.hit import Hit
@@ -38,10 +38,9 @@ def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vecto
     if isinstance(light, Sky):
         cosine = hit.ns[2] * hit.side.astype(hit.ns.dtype)
         share = (1 + cosine) / 2
-        for k, grid, _ in world.grids:
-            seen = world.sky[k]
-            if seen is not None:
-                share = jnp.where((hit.object == k) & (hit.side > 0), _seen_share(grid, seen, hit), share)
+        visible = ((k, grid, world.sky[k]) for k, grid, _ in world.grids)
+        seen = [(k, _seen_share(grid, sky, hit)) for k, grid, sky in visible if sky is not None]
+        share = select(jnp.where(hit.side > 0, hit.object, -1), seen, share)
         return light.radiance * (jnp.pi * share), jnp.zeros((), jnp.int32)
     if isinstance(light, Sun):
         seen, exhausted = _disc(world, light, hit, active)
@@ -62,6 +61,11 @@ def _seen_share(grid: Grid, sky: Float[jax.Array, "_ 3"], hit: Hit) -> Scalar:
     return greater(dot(first + on_first * (between - first) + on_last * (last - between), hit.ns), jnp.zeros((), hit.t.dtype))
 
 
+def sharp_lights(world: World) -> list[tuple[int, Directional | Point]]:
+    """The lights whose shadows have sharp edges, with their numbers."""
+    return [(number, light) for number, light in enumerate(world.lights) if casts_sharp_shadows(light)]
+
+
 def unshadowed_irradiance(world: World, light: Directional | Point, hit: Hit) -> Vector:
     """What would arrive if nothing stood between the light and the hit, and the light on that side of it."""
     wi, arriving, _ = _towards(light, hit.p)
@@ -80,10 +84,9 @@ def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:
     met = hit.object >= 0
     flags = []
     for number, light in enumerate(world.lights):
-        if not isinstance(light, Sky):
-            if isinstance(light, Sun):
-                flags.append(met & ~(_disc(world, light, hit, met)[0].share > 0))
-                continue
+        if isinstance(light, Sun):
+            flags.append(met & ~(_disc(world, light, hit, met)[0].share > 0))
+        elif not isinstance(light, Sky):
             wi, _, distance = _towards(light, hit.p)
             flags.append(met & ~_visible(number, world, wi, distance, hit, met)[0])
     return jnp.stack(flags) if flags else jnp.zeros(0, bool)

@@ -9,15 +9,15 @@ from jax import lax
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import Flag, Index, Vector
-from ..core.vector import dot, unit
-from ..scene.light import Sky, casts_sharp_shadows
+from ..core.vector import dot, select, unit
+from ..scene.light import Sky
 from ..scene.material import Material, Matte, Mirror
 from ..scene.texture import ImageTexture
 from ..trace.hit import Hit
 from ..trace.status import Status
 from ..trace.world import World, first_hit, no_hit
 from ..xla.masked import only_where
-from .lighting import GRAZING, irradiance, unshadowed_irradiance
+from .lighting import GRAZING, irradiance, sharp_lights, unshadowed_irradiance
 
 
 def radiance(world: World, ray: Ray) -> tuple[Vector, Index]:
@@ -38,14 +38,11 @@ def radiance_from(world: World, ray: Ray, hit: Hit, active: Flag) -> Vector:
 
 def shadowed_radiance(world: World, number: Index, hit: Hit) -> Vector:
     """By how much the shadow of the light of this number darkens the hit, if nothing else keeps that light from it."""
-    total = jnp.zeros_like(hit.n)
-    albedo = _albedo(world, hit)
-    if albedo is not None:
-        for k, light in enumerate(world.lights):
-            if casts_sharp_shadows(light):
-                total = jnp.where(number == k, unshadowed_irradiance(world, light, hit), total)
-        total = jnp.where(_has_material(world, hit, Matte), albedo / jnp.pi * total, 0)
-    return total
+    albedo, dark = _albedo(world, hit), jnp.zeros_like(hit.n)
+    if albedo is None:
+        return dark
+    arriving = ((k, unshadowed_irradiance(world, light, hit)) for k, light in sharp_lights(world))
+    return jnp.where(_has_material(world, hit, Matte), albedo / jnp.pi * select(number, arriving, dark), 0)
 
 
 def _path(world: World, ray: Ray, leaving: Hit, active: Flag, length: int) -> tuple[Vector, Index]:
@@ -70,11 +67,12 @@ def has_mirrors(materials: Iterable[Material], settings: Settings) -> bool:
     return settings.max_depth > 0 and any(isinstance(material, Mirror) for material in materials)
 
 
-def direct(world: World, ray: Ray) -> tuple[Vector, Index, Hit]:
-    """`radiance` of a scene without mirrors, and the hit that it comes from."""
-    hit = first_hit(world, ray)
-    light, exhausted = _outgoing(world, ray, hit, hit.status != int(Status.EXHAUSTED))
-    return light, exhausted + _count(hit.status == int(Status.EXHAUSTED)), hit
+def direct(world: World, ray: Ray, leaving: Hit | None = None, active: Flag | None = None) -> tuple[Vector, Index, Hit]:
+    """`radiance` of a scene without mirrors, and the hit that it comes from; `leaving` and `active` as for `first_hit`."""
+    hit = first_hit(world, ray, leaving, active)
+    ran_out = hit.status == int(Status.EXHAUSTED)
+    light, exhausted = _outgoing(world, ray, hit, ~ran_out if active is None else active & ~ran_out)
+    return light, exhausted + ran_out.astype(jnp.int32), hit
 
 
 def _bounce(world: World, ray: Ray, leaving: Hit, active: Flag) -> tuple[Ray, Hit, Vector, Vector, Flag, Index]:
@@ -84,21 +82,15 @@ def _bounce(world: World, ray: Ray, leaving: Hit, active: Flag) -> tuple[Ray, Hi
       The mirrored ray, the hit that it leaves, and that mirror's reflectance; the light from the hit; whether the path goes
       on; how many walks ran out of steps.
     """
-    hit = first_hit(world, ray, leaving, active)
-    out_of_steps = active & (hit.status == int(Status.EXHAUSTED))
-    light, exhausted = _outgoing(world, ray, hit, active & ~out_of_steps)
+    light, exhausted, hit = direct(world, ray, leaving, active)
     onwards, reflectance, mirrored = _mirrored(world, ray, hit)
-    return onwards, hit, reflectance, light, active & mirrored, exhausted + _count(out_of_steps)
+    return onwards, hit, reflectance, light, active & mirrored, exhausted
 
 
 def _mirrored(world: World, ray: Ray, hit: Hit) -> tuple[Ray, Vector, Flag]:
     """The mirrored ray from a hit, the mirror's reflectance, and whether there is a mirror."""
-    mirrored, reflectance = _reflectance(world, hit)
-    return Ray(hit.p, _reflect(ray.d, hit)), reflectance, mirrored
-
-
-def _count(flag: Flag) -> Index:
-    return flag.astype(jnp.int32)
+    values = [(number, jnp.asarray(m.reflectance)) for number, m in enumerate(world.materials) if isinstance(m, Mirror)]
+    return Ray(hit.p, _reflect(ray.d, hit)), select(hit.object, values), _has_material(world, hit, Mirror)
 
 
 def _outgoing(world: World, ray: Ray, hit: Hit, active: Flag) -> tuple[Vector, Index]:
@@ -152,20 +144,4 @@ def _albedo(world: World, hit: Hit) -> Vector | None:
         for number, m in enumerate(world.materials)
         if isinstance(m, Matte)
     ]
-    return _select(values, hit.object)
-
-
-def _reflectance(world: World, hit: Hit) -> tuple[Flag, Vector]:
-    """Whether the hit lies on a mirror, and that mirror's reflectance."""
-    values = [(number, jnp.asarray(m.reflectance)) for number, m in enumerate(world.materials) if isinstance(m, Mirror)]
-    reflectance = _select(values, hit.object)
-    assert reflectance is not None
-    return _has_material(world, hit, Mirror), reflectance
-
-
-def _select(values: list[tuple[int, Vector]], number: Index) -> Vector | None:
-    """The value with this number; any of them where there is none such."""
-    chosen = None
-    for k, value in values:
-        chosen = value if chosen is None else jnp.where(number == k, value, chosen)
-    return chosen
+    return select(hit.object, values) if values else None

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..core.types import Index, Scalar
 from ..xla.devices import local_mesh, map_over
+from .edges import STEPS, present_edges, whole_cells
 from .grid import Grid
 
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
@@ -31,9 +32,9 @@ _GRAIN = 8  # cells from one of the windows whose highest points are kept to the
 _MARGIN = _TILE + 1
 _STEEPEST = 1e18  # of slopes: a right angle, whose square is a number in single precision
 
-# The kinds of edges, by where they lead from their first vertex, in x and y; the last is that of crossings at a vertex.
+# The kinds of edges, see `edges`; and a last one, for crossings at a vertex, which leads nowhere.
 _ALONG_X, _ALONG_Y, _DIAGONAL, _VERTEX = range(4)
-_TO_SECOND = np.array([[1, 0], [0, 1], [1, 1], [0, 0]], np.int32)
+_TO_SECOND = np.array([*STEPS, (0, 0)], np.int32)
 
 # Slopes in all directions to what is wanted of them: arrays without an axis for the direction, or with one in front.
 Summary = Callable[[Float[jax.Array, "k *at"]], jax.Array]
@@ -333,10 +334,9 @@ def _from_tile(
 
 def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
     """For each kind, heights at the first vertices of edges; nan where no cell of the surface has the edge."""
-    whole = jnp.pad(jnp.isfinite(z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:]), 1)
-    north_east, north_west, south_east, south_west = whole[1:, 1:], whole[1:, :-1], whole[:-1, 1:], whole[:-1, :-1]
-    east, north = north_east | south_east, north_east | north_west
-    return jnp.where(jnp.stack([east, north, north_east, east | north_west | south_west]), z[None], jnp.nan)
+    whole = jnp.pad(whole_cells(z), 1)
+    at_vertex = whole[1:, 1:] | whole[1:, :-1] | whole[:-1, 1:] | whole[:-1, :-1]
+    return jnp.where(jnp.concatenate([present_edges(z), at_vertex[None]]), z[None], jnp.nan)
 
 
 def _reach() -> int:

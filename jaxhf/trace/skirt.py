@@ -60,8 +60,8 @@ def wall_distance(walls: Walls, ray: Ray, leaving: Hit | None, number: int) -> t
     Args:
       walls: the surface.
       ray: world frame.
-      leaving: the hit from which it starts; if that lies on these walls, its side cannot be met again, nor, where it lies on an
-        edge (`triangle` is 1), that of `cell[1]`. None for rays that start in free space.
+      leaving: the hit from which it starts; if that lies on these walls, its side cannot be met again. None for
+        rays that start in free space.
       number: of the object.
     """
     local = walls.object_from_world.ray(ray)
@@ -84,8 +84,7 @@ def wall_distance(walls: Walls, ray: Ray, leaving: Hit | None, number: int) -> t
             inside = inside & (at[2] >= walls.base - wider[2]) & (at[2] <= low + share * (high - low) + more)
         met = ever & (t > 0) & (t < best) & inside
         if leaving is not None:
-            left = (leaving.cell[0] == side) | ((leaving.triangle == 1) & (leaving.cell[1] == side))
-            met = met & ~((leaving.object == number) & left)
+            met = met & ~((leaving.object == number) & (leaving.cell[0] == side))
         best, found, nearest = jnp.where(met, t, best), found | met, jnp.where(met, side, nearest)
     return jnp.where(found, best, 0), found, nearest
 

@@ -17,15 +17,13 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import greater, lesser, quotient
 from ..xla.materialise import materialise
+from .edges import STEPS
 from .grid import Grid, triangle_plane
 from .hit import Hit
 from .search import SKIPS, enough_steps
 from .triangle import plane_through, triangle_corners
 from .walk import MISS, Walk, walking
 from .walk_start import place_on_grid, walk_start
-
-# From an edge's first vertex to its second, by its kind.
-_STEPS = ((1, 0), (0, 1), (1, 1))
 
 
 def hidden_slopes(
@@ -128,7 +126,7 @@ def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index, above: bool) ->
     """
     known, edge = edge >= 0, jnp.maximum(edge, 0)
     first, kind, nx = edge // 3, edge % 3, grid.shape[1]
-    step = jnp.asarray(_STEPS, jnp.int32)[kind]
+    step = jnp.asarray(STEPS, jnp.int32)[kind]
     z0, z1 = (grid.rows.at[at].get(mode="clip") for at in (first, first + step[1] * nx + step[0]))
     known = known & jnp.isfinite(z0 + z1)
     z0, z1 = jnp.where(known, z0, 0), jnp.where(known, z1, 0)

@@ -7,6 +7,7 @@ differences are noisy, as few of a pixel's samples change sides.
 
 import dataclasses
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -20,8 +21,9 @@ import jaxhf
 from jaxhf.boundary.guiding import initial_weights, make_distribution
 from jaxhf.boundary.jump import boundary_segment, pass_edge, radiance_jump
 from jaxhf.boundary.sample import BoundarySample
-from jaxhf.boundary.silhouette import STEPS
+from jaxhf.fitting.defaults import choose_edge_samples
 from jaxhf.scene.localise import localise
+from jaxhf.trace.edges import STEPS
 from jaxhf.trace.world import make_world, resolve_settings
 
 EDGES = jaxhf.Settings(samples=16, edge_samples=4000)
@@ -108,11 +110,6 @@ def shadow_scene(light: Any = (-1.0, 0.0, TAN), at: float = SHADOW) -> jaxhf.Sce
     return small_scene(HEIGHT * PLATEAU, from_above(at + 0.01), light)
 
 
-def sheet_scene() -> jaxhf.Scene:
-    """The border of a flat sheet, x = 1, seen from above."""
-    return small_scene(np.zeros((9, 9)), from_above(1.01), (0.0, 0.0, 1.0))
-
-
 def seen_aslant(heights: np.ndarray, target: Any, towards: tuple[float, float], tilt: float) -> jaxhf.Scene:
     """Looked at along a horizontal direction and downwards by an angle; lit from above."""
     x, y = towards
@@ -121,31 +118,18 @@ def seen_aslant(heights: np.ndarray, target: Any, towards: tuple[float, float], 
     return small_scene(heights, camera, (0.0, 0.0, 1.0))
 
 
-def far_border_scene() -> jaxhf.Scene:
-    return seen_aslant(np.zeros((9, 9)), (0.5, 1.0, 0.01), (0, 1), np.pi / 6)
-
-
-def crest_scene() -> jaxhf.Scene:
-    """A ridge before the black background, lit on both sides: a silhouette for the eye only."""
-    return seen_aslant(RIDGE, (0.5, 0.5, 0.51), (1, 0), TILTED)
-
-
-def terminator_scene() -> jaxhf.Scene:
-    """A ridge, seen from above with one side dark: its crest is nobody's silhouette but the light's."""
-    return small_scene(RIDGE, from_above(0.49), (-1.0, 0.0, 0.2))
+# The border of a flat sheet, x = 1, seen from above; and its far border, y = 1.
+sheet_scene = functools.partial(small_scene, np.zeros((9, 9)), from_above(1.01), (0.0, 0.0, 1.0))
+far_border_scene = functools.partial(seen_aslant, np.zeros((9, 9)), (0.5, 1.0, 0.01), (0, 1), np.pi / 6)
+# A ridge before the black background, lit on both sides: a silhouette for the eye only. And one that is seen from above with
+# one side dark: its crest is nobody's silhouette but the light's.
+crest_scene = functools.partial(seen_aslant, RIDGE, (0.5, 0.5, 0.51), (1, 0), TILTED)
+terminator_scene = functools.partial(small_scene, RIDGE, from_above(0.49), (-1.0, 0.0, 0.2))
+camera_of, extent_of = operator.attrgetter("camera.world_from_camera"), operator.attrgetter("camera.extent")
 
 
 def world_of(scene: jaxhf.Scene) -> Any:
     return scene.objects[0].world_from_object
-
-
-def camera_of(scene: jaxhf.Scene) -> Any:
-    return scene.camera.world_from_camera
-
-
-def extent_of(scene: jaxhf.Scene) -> Any:
-    assert isinstance(scene.camera, jaxhf.Orthographic)
-    return scene.camera.extent
 
 
 def stretch(x: float, y: float, z: float) -> np.ndarray:
@@ -203,77 +187,28 @@ def test_edges_of_facets_move():
     assert_line(change, -0.7 * (1.1 - 0.9) / np.hypot(1, 0.1) / np.sqrt(2) / PIXEL)
 
 
-# A flat block over the ground: terrain at 0.1, walls of a skirt down to -0.1, floor. Light comes from the south-west; what each
-# of them sends out follows, background and floor are black.
-SOUTHWEST = np.array([-0.48, -0.64, 0.6])
-SOUTH_WALL, WEST_WALL, TOP, GROUND = 0.7 * 0.64, 0.7 * 0.48, 0.4 * 0.6, 0.2 * 0.6
-GROUND_LEVEL = -0.15
+def test_points_are_refused_beside_a_skirt():
+    """In both modes, and in a fit; a picture by itself, and a derivative without points, stay what they were."""
+    field = jaxhf.Heightfield(jnp.asarray(HEIGHT * PLATEAU, jnp.float32))
+    objects = [jaxhf.Object(field), jaxhf.Object(jaxhf.Skirt.of(field, -0.1))]
+    scene = jaxhf.Scene(objects, from_above(SHADOW), [jaxhf.Directional((-1.0, 0.0, TAN))])
 
+    def picture(heights: jax.Array, points: int) -> jax.Array:
+        return jaxhf.render(scene.with_heights(heights), jaxhf.Settings(edge_samples=points))
 
-def block_scene(heights: Any, target: Any, view: Any, up: Any = (0, 0, 1)) -> jaxhf.Scene:
-    field, target = jaxhf.Heightfield(heights), np.array(target, float)
-    ground = np.diag([20.0, 20.0, 1, 1])
-    ground[:3, 3] = -10, -10, GROUND_LEVEL
-    objects = [
-        jaxhf.Object(field, jaxhf.Matte(0.4), np.eye(4)),
-        jaxhf.Object(jaxhf.Skirt.of(field, -0.1), jaxhf.Matte(0.7), np.eye(4)),
-        jaxhf.Object(jaxhf.Heightfield(np.zeros((2, 2))), jaxhf.Matte(0.2), ground),
-    ]
-    eye = target - (0.2 if view[2] > 0 else 2) * np.array(view)  # above the ground
-    camera = jaxhf.Orthographic.look_at(eye, target, up, WIDE, width=SIZE, height=SIZE)
-    return jax.tree.map(jnp.asarray, jaxhf.Scene(objects, camera, [jaxhf.Directional(SOUTHWEST)]))
+    def refused(points: int) -> Any:
+        said = rf"Settings: edge_samples must be 0 where a scene with a Skirt is differentiated.*; it is {points}\b"
+        return pytest.raises(jaxhf.ArgumentError, match=said)
 
-
-def tilted(angle: float) -> tuple[float, float, float]:
-    """A view to the north, upwards by an angle."""
-    return 0, np.cos(angle), np.sin(angle)
-
-
-def camera_to_the_right(scene: jaxhf.Scene) -> jaxhf.Scene:
-    return moved(camera_of, shift(*np.asarray(camera_of(scene))[:3, 0]))(scene)
-
-
-def floor_rises(scene: jaxhf.Scene) -> jaxhf.Scene:
-    return moved(lambda scene: scene.objects[1].shape.base, 1)(scene)
-
-
-def border_rises(scene: jaxhf.Scene) -> jaxhf.Scene:
-    """The terrain, and with it the walls."""
-
-    def sides(scene: Any) -> list[Any]:
-        return [getattr(scene.objects[1].shape, side) for side in ("south", "north", "west", "east")]
-
-    return eqx.tree_at(sides, moved(heights_of, 1)(scene), [jnp.ones_like(side) for side in sides(scene)])
-
-
-def skirt_to_the_right(scene: jaxhf.Scene) -> jaxhf.Scene:
-    return moved(lambda scene: scene.objects[1].world_from_object, shift(*np.asarray(camera_of(scene))[:3, 0]))(scene)
-
-
-LEVEL, SHADOW_OF_CORNER = (0.5, np.sqrt(0.75), 0.0), (1.1224, 0.1582, GROUND_LEVEL)
-OUTLINES = {
-    "between two walls": ((0, 0, 0), LEVEL, camera_to_the_right, SOUTH_WALL - WEST_WALL),
-    "end of a wall": ((1, 0, 0), LEVEL, camera_to_the_right, -SOUTH_WALL),
-    "hidden corner": ((1, 1, 0), (0.6, 0.8, 0.0), camera_to_the_right, 0),
-    "foot": ((0.4, 0, -0.1), tilted(TILTED), floor_rises, -SOUTH_WALL * np.cos(TILTED)),
-    "rim from below": ((0.4, 0, 0.1), tilted(TILTED), border_rises, SOUTH_WALL * np.cos(TILTED)),
-    "rim from above": ((0.4, 0, 0.1), tilted(-TILTED), border_rises, (SOUTH_WALL - TOP) * np.cos(TILTED)),
-    "shadow of a corner": (SHADOW_OF_CORNER, (0, 0, -1), camera_to_the_right, GROUND),
-    "shadow of a corner, skirt": (SHADOW_OF_CORNER, (0, 0, -1), skirt_to_the_right, -GROUND),
-}
-
-
-@pytest.mark.deep
-@pytest.mark.parametrize("name", OUTLINES)
-def test_outline_of_a_skirt(name):
-    """Each surface is of one radiance, so nothing but the outline changes the picture."""
-    target, view, direction, flow = OUTLINES[name]
-    scene = block_scene(np.full((9, 9), 0.1), target, view, (0.6, 0.8, 0) if view[2] == -1 else (0, 0, 1))
-    change = whole_change(scene, direction(scene))
-    if flow == 0:
-        assert np.abs(change).max() < 1e-5
-    else:
-        assert_line(change, flow / PIXEL, elsewhere=1e-3)
+    with refused(400):
+        jax.grad(lambda heights: picture(heights, 400).sum())(scene.heights)
+    with refused(9):
+        jax.jvp(lambda heights: picture(heights, 9), (scene.heights,), (scene.heights,))
+    target = np.asarray(picture(scene.heights, 400))
+    with refused(300):
+        jaxhf.fit([scene], [target], settings=jaxhf.Settings(edge_samples=300))
+    assert choose_edge_samples([localise(scene)], jaxhf.Settings(), shadows=True) == 0
+    assert np.isfinite(jax.grad(lambda heights: picture(heights, 0).sum())(scene.heights)).all()
 
 
 def test_boundary_pixels_are_looked_at_again():

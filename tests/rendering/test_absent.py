@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.boundary import fold, guiding, outline, sample
+from jaxhf.boundary import guiding, sample
 from jaxhf.core import affine, autodiff
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import localise, texture
@@ -138,16 +138,16 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
         case(material=jaxhf.Matte(jaxhf.ImageTexture(TEXELS, wrap="clamp"))),
         [within(texture, "within")],
     ),
-    "mirror": ("plain", case(MIRROR), [*map(everywhere, (radiance._reflect, radiance._reflectance, trace_world.no_hit))]),
+    "mirror": ("plain", case(MIRROR), [*map(everywhere, (radiance._reflect, radiance._mirrored, trace_world.no_hit))]),
     "cylinder": (
         "plain",
         case(jaxhf.Object(jaxhf.Cylinder())),
         [everywhere(cylinder.make_tube), everywhere(cylinder.tube_distance), recognised(intersect, "Tube")],
     ),
     "skirt": (
-        "edge samples",
-        case(jaxhf.Object(jaxhf.Skirt.of(FIELD, -1)), edge_samples=64, differentiated=True),
-        [*map(everywhere, (skirt.make_walls, skirt.hit_on_side, outline.faces_of, fold._with_walls))],
+        "plain",
+        case(jaxhf.Object(jaxhf.Skirt.of(FIELD, -1))),
+        [*map(everywhere, (skirt.make_walls, skirt.hit_on_side))],
     ),
     "second heightfield": (
         "smooth normals",
@@ -219,10 +219,7 @@ def traced(name: str) -> tuple[str, set[tuple[str, int]]]:
         return CASES[name].program(), said
 
 
-LARGE = {"skirt": [pytest.mark.deep]}
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=LARGE.get(name, [])) for name in FEATURES])
+@pytest.mark.parametrize("name", FEATURES)
 def test_a_feature_is_in_the_program_only_where_it_is_used(name):
     without_it, _, watches = FEATURES[name]
     (program, said), (longer, said_with_it) = traced(without_it), traced(name)

@@ -139,6 +139,9 @@ def weights() -> np.ndarray:
 
 
 def brightness(scene: jaxhf.Scene, edge_samples: int = 0) -> jax.Array:
+    if edge_samples:  # refused beside a skirt
+        objects = [obj for obj in scene.objects if not isinstance(obj.shape, jaxhf.Skirt)]
+        scene = jaxhf.Scene(objects, scene.camera, scene.lights)
     image = jaxhf.render(scene, jaxhf.Settings(chunk=PIXELS * PIXELS, edge_samples=edge_samples))
     return jnp.sum(image * jnp.asarray(weights(), image.dtype)) / 100
 

@@ -1,0 +1,33 @@
+"""The edges of a heightfield's triangles, by their kinds: 0 along x, 1 along y, 2 along the diagonal.
+
+An edge begins at a vertex, so arrays over edges have shape (3, ny, nx). Those that would leave the grid are there too.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Bool, Float
+
+# From an edge's first vertex to its second, in x and in y.
+STEPS = ((1, 0), (0, 1), (1, 1))
+
+EdgeFlags = Bool[jax.Array, "3 ny nx"]
+
+
+def whole_cells(z: Float[jax.Array, "ny nx"]) -> Bool[jax.Array, "cells_y cells_x"]:
+    """Which cells have all their vertices; a hole is nan."""
+    return jnp.isfinite(z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:])
+
+
+def present_edges(z: Float[jax.Array, "ny nx"]) -> EdgeFlags:
+    """The edges with at least one triangle."""
+    present = whole_cells(z)
+    return compare_sides(present, present, lambda a, b: a | b)
+
+
+def compare_sides(lower: jax.Array, upper: jax.Array, compare: Callable[[jax.Array, jax.Array], jax.Array]) -> jax.Array:
+    """Compares the two triangles of every edge, given values per cell of its two triangles; beyond the border stands zero."""
+    above, right = jnp.pad(lower, ((0, 1), (0, 1))), jnp.pad(upper, ((0, 1), (0, 1)))
+    below, left = jnp.pad(upper, ((1, 0), (0, 1))), jnp.pad(lower, ((0, 1), (1, 0)))
+    return jnp.stack([compare(above, below), compare(right, left), compare(above, right)])
