@@ -87,9 +87,9 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
         state = solvers.init_state(solver, unknowns, known)
         return arrays_only(solvers._advance, solver, unknowns, state, known)
     if name == "frame":
+        from jaxhf.preparation.localise import localise
+        from jaxhf.preparation.world import make_world, resolve_settings
         from jaxhf.rendering import render
-        from jaxhf.scene.localise import localise
-        from jaxhf.trace.world import make_world, resolve_settings
         from jaxhf.xla.devices import local_mesh, on_every_device
 
         scene, mesh = make_scene(heights, 512), local_mesh(1)

@@ -23,11 +23,11 @@ from peers import embree_frame, mitsuba_scene, need_fast_mitsuba, povray_seconds
 
 import jaxhf
 from jaxhf.core.vector import dot, unit
+from jaxhf.preparation.ceiling import clears
+from jaxhf.preparation.localise import localise
+from jaxhf.preparation.world import first_hit, make_world, resolve_settings
 from jaxhf.rendering.tiles import Tiling
-from jaxhf.scene.localise import localise
 from jaxhf.scene.procedural import fractal
-from jaxhf.trace.ceiling import clears
-from jaxhf.trace.world import first_hit, make_world, resolve_settings
 
 CAMERAS = {  # eye, target, field of view: a fifth of the picture covered, all of it covered
     "A": ((1.2, -0.9, 0.7), (0.5, 0.5, 0.05), 45.0),

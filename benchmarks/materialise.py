@@ -10,9 +10,9 @@ import jax
 from forward import report, scene, terrain
 
 import jaxhf
+from jaxhf.preparation.localise import localise
+from jaxhf.preparation.world import make_world, resolve_settings
 from jaxhf.rendering import render as rendering
-from jaxhf.scene.localise import localise
-from jaxhf.trace.world import make_world, resolve_settings
 from jaxhf.xla.devices import local_mesh
 from jaxhf.xla.materialise import materialise
 

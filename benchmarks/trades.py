@@ -37,7 +37,8 @@ def without_bounds() -> None:
     import equinox as eqx
     import jax.numpy as jnp
 
-    from jaxhf.trace import search as _search, walk as _walk, world as _world
+    from jaxhf.preparation import world as _world
+    from jaxhf.trace import search as _search, walk as _walk
 
     make_grid = _world.make_grid
 
@@ -55,7 +56,8 @@ def with_stored_triangles() -> None:
     import equinox as eqx
     import jax
 
-    from jaxhf.trace import grid as _grid, intersect as _hit, triangle as _triangle, walk as _walk, world as _world
+    from jaxhf.preparation import world as _world
+    from jaxhf.trace import grid as _grid, intersect as _hit, triangle as _triangle, walk as _walk
 
     class Triangles(eqx.Module):
         heights: jax.Array

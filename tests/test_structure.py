@@ -7,7 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "jaxhf"
 # Along the flow: a package imports only from those before it. Two that stand together know nothing of each other.
-ORDER = "core < xla < scene < trace io < maps < shade < boundary < rendering < fitting mujoco < study < cli"
+ORDER = "core < xla < scene < trace io < preparation < maps shade < boundary < rendering < fitting mujoco < study < cli"
 READ_FILES = {"maps", "fitting", "study", "cli"}  # the only ones that import from io
 
 FLOORS = [floor.split() for floor in ORDER.split(" < ")]
@@ -62,7 +62,7 @@ RULES = {"xla/masked", "trace/search"}  # of what `vmap` makes of a call
 PLACES = {  # what stands in these modules alone
     "custom_vmap": RULES,
     "jax.vmap": MAPS_OVER_RAYS | RULES,
-    "lax.map(": MAPS_OVER_RAYS | {"xla/devices", "trace/horizon", "fitting/jacobian", "mujoco/hfield"},
+    "lax.map(": MAPS_OVER_RAYS | {"xla/devices", "preparation/horizon", "fitting/jacobian", "mujoco/hfield"},
     "jax.jit": {"xla/compilation", "xla/insides", "xla/kernel", "xla/masked"},
     "shard_map(": {"xla/devices"},
 }

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, select, unit
+from ..preparation.world import World, nearest_hit, no_hit
 from ..scene.camera import Camera
 from ..trace.edges import whole_cells
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit
 from ..trace.intersect import intersect
 from ..trace.status import Status
-from ..trace.world import World, nearest_hit, no_hit
 from ..xla.materialise import materialise
 from .sample import BoundarySample, between_ends, end_heights, on_edge, ways_to_lights
 

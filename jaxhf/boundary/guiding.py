@@ -12,13 +12,13 @@ from ..core.powers import floor_to_power_of_two
 from ..core.settings import Shading
 from ..core.types import Index, Scalar
 from ..core.vector import unit
+from ..preparation.world import World
 from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sun
 from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube
 from ..trace.edges import EdgeFlags, present_edges
 from ..trace.grid import Grid
-from ..trace.world import World
 from .silhouette import EdgeWeights, Viewpoint, folds, lit_lengths, seen_lengths, silhouettes
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.

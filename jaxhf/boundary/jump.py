@@ -16,12 +16,12 @@ from jax import lax
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
 from ..core.vector import dot, select
+from ..preparation.world import World, no_hit
 from ..scene.camera import Camera
 from ..shade.radiance import radiance_from, shadowed_radiance
 from ..trace.hit import Hit
 from ..trace.intersect import hit_on_triangle
 from ..trace.status import Status
-from ..trace.world import World, no_hit
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
 from .fold import Fold, Probe, fold_at, meet, towards

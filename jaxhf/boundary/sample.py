@@ -26,6 +26,7 @@ from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
 from ..core.vector import dot, largest_component, quotient, select, unit
+from ..preparation.world import World
 from ..scene.camera import Camera
 from ..scene.light import Point
 from ..shade.lighting import sharp_lights
@@ -33,7 +34,6 @@ from ..trace.cylinder import Tube, tube_distance
 from ..trace.edges import STEPS
 from ..trace.grid import Grid
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
-from ..trace.world import World
 from ..xla.materialise import materialise
 from .guiding import GuidingDistribution, edge_sets
 from .silhouette import framed_part

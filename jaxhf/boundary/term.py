@@ -18,9 +18,9 @@ from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
+from ..preparation.world import World
 from ..scene.camera import Camera
 from ..trace.skirt import Walls
-from ..trace.world import World
 from ..xla.devices import map_over
 from ..xla.kernel import PART, one_kernel, traced_once
 from ..xla.materialise import materialise

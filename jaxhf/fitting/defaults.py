@@ -10,9 +10,9 @@ import equinox as eqx
 from ..boundary.guiding import boundary_length
 from ..core.settings import Settings
 from ..core.types import Scalar
+from ..preparation.world import make_world, resolve_settings
 from ..scene.scene import Scene
 from ..scene.skirt import Skirt
-from ..trace.world import make_world, resolve_settings
 from ..xla.compilation import compiled
 from .linearise import can_be_linearised
 

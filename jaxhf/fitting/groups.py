@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from ..core.errors import ArgumentError
 from ..core.precision import numbers
 from ..core.settings import Settings
-from ..scene.localise import localise
+from ..preparation.localise import localise
+from ..preparation.world import resolve_settings
 from ..scene.scene import Scene
-from ..trace.world import resolve_settings
 from .options import FitOptions
 
 

@@ -22,11 +22,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..boundary.term import resampled_side
+from ..preparation.world import make_world
 from ..rendering.samples import PictureSamples
 from ..rendering.tiles import Tiling
 from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
-from ..trace.world import make_world
 from ..xla.compilation import compiled
 from ..xla.devices import on_every_device
 from .basis import Unknowns

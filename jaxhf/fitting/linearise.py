@@ -24,6 +24,7 @@ from ..boundary.term import Packed, draw_boundaries
 from ..core.autodiff import with_tangent
 from ..core.settings import Settings
 from ..core.types import Flag
+from ..preparation.world import World, make_world
 from ..rendering.samples import PictureSamples
 from ..scene.camera import Camera
 from ..scene.light import Sun
@@ -32,7 +33,6 @@ from ..shade.radiance import direct, has_mirrors
 from ..trace.grid import Grid
 from ..trace.hit import Hit
 from ..trace.triangle import Corners, triangle_vertices
-from ..trace.world import World, make_world
 from ..xla.devices import map_over, on_every_device
 from ..xla.kernel import one_kernel
 from ..xla.materialise import materialise

@@ -13,8 +13,7 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_progress
-from ..scene.heightfield import Heightfield
-from ..trace.horizon import (
+from ..preparation.horizon import (
     HorizonView,
     Summary,
     assemble,
@@ -25,6 +24,7 @@ from ..trace.horizon import (
     sky_vector,
     tile_count,
 )
+from ..scene.heightfield import Heightfield
 from ..trace.normals import vertex_normals
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, on_every_device

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from ..core.errors import ArgumentError
 from ..core.ray import Ray
+from ..preparation.world import World, first_hit
 from ..shade.lighting import in_shadow
-from ..trace.world import World, first_hit
 
 AOVS = ("depth", "normal", "uv", "status", "object", "cell", "shadow", "steps", "exhausted")
 """Arbitrary output variables, each (h, w) or (h, w, c), of the ray through the pixel's centre:

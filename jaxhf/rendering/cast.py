@@ -15,13 +15,13 @@ from ..core.precision import numbers
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import array_leaf, float_leaf
+from ..preparation.localise import anchor, localise, precision
+from ..preparation.world import World, first_hit, make_world, resolve_settings
 from ..scene.heightfield import Heightfield
-from ..scene.localise import anchor, localise, precision
 from ..scene.scene import Scene
 from ..trace.grid import Grid, joined
 from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
-from ..trace.world import World, first_hit, make_world, resolve_settings
 from ..xla.compilation import compiled
 from ..xla.devices import prepared_mesh, where_called
 from ..xla.transfers import takes_numbers

@@ -20,13 +20,13 @@ from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
+from ..preparation.localise import anchor, localise, localise_camera, localise_lights, precision
+from ..preparation.world import World, make_ceilings, make_surface, make_world, resolve_settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light
-from ..scene.localise import anchor, localise, localise_camera, localise_lights, precision
 from ..scene.scene import Scene
 from ..trace.grid import Grid
-from ..trace.world import World, make_ceilings, make_surface, make_world, resolve_settings
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, map_over, on_every_device, prepared_mesh, where_called
 from ..xla.kernel import in_turn, one_kernel

@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from ..core.autodiff import recomputed
 from ..core.sampling import sample_offset
 from ..core.settings import Settings
+from ..preparation.world import World
 from ..scene.camera import Camera
 from ..shade.radiance import radiance
-from ..trace.world import World
 from ..xla.devices import map_over
 from ..xla.kernel import one_kernel
 from ..xla.materialise import materialise

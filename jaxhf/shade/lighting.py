@@ -12,6 +12,7 @@ from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, greater, largest_component, quotient, select, unit, within
+from ..preparation.world import World, unblocked
 from ..scene.light import Directional, Point, Sky, Sun, casts_sharp_shadows
 from ..trace.cylinder import Tube
 from ..trace.grid import Grid
@@ -21,7 +22,6 @@ from ..trace.skirt import Walls, wall_slopes
 from ..trace.skyline import hidden_slopes, skyline_slope
 from ..trace.triangle import triangle_corners
 from ..trace.walk_start import place_on_grid
-from ..trace.world import World, unblocked
 from ..xla.materialise import materialise
 
 # So near to zero a cosine is rounded off: 0.6 degrees round the horizon of the shading normal.

@@ -10,12 +10,12 @@ from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import Flag, Index, Vector
 from ..core.vector import dot, select, unit
+from ..preparation.world import World, first_hit, no_hit
 from ..scene.light import Sky
 from ..scene.material import Material, Matte, Mirror
 from ..scene.texture import ImageTexture
 from ..trace.hit import Hit
 from ..trace.status import Status
-from ..trace.world import World, first_hit, no_hit
 from ..xla.masked import only_where
 from .lighting import GRAZING, irradiance, sharp_lights, unshadowed_irradiance
 

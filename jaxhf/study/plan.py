@@ -16,11 +16,11 @@ from ..core.version import __version__
 from ..io.errors import FileError
 from ..io.files import PathLike
 from ..io.scenes import load_scene
+from ..preparation.world import resolve_settings
 from ..scene.light import Sky
 from ..scene.material import Mirror
 from ..scene.scene import Scene
 from ..scene.views import resized, shrunk
-from ..trace.world import resolve_settings
 from ..xla.machine import default_devices
 from .table import KNOBS, Row, Sweep
 

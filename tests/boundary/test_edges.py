@@ -22,9 +22,9 @@ from jaxhf.boundary.guiding import initial_weights, make_distribution
 from jaxhf.boundary.jump import boundary_segment, pass_edge, radiance_jump
 from jaxhf.boundary.sample import BoundarySample
 from jaxhf.fitting.defaults import choose_edge_samples
-from jaxhf.scene.localise import localise
+from jaxhf.preparation.localise import localise
+from jaxhf.preparation.world import make_world, resolve_settings
 from jaxhf.trace.edges import STEPS
-from jaxhf.trace.world import make_world, resolve_settings
 
 EDGES = jaxhf.Settings(samples=16, edge_samples=4000)
 INTERIOR = jaxhf.Settings(samples=16)

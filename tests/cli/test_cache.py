@@ -31,7 +31,7 @@ def test_a_second_run_does_not_trace(tmp_path):
         pictures.append(np.load(tmp_path / name))
         paths = list((tmp_path / "kept").glob("jaxhf-*/*"))
         kept = {path.name.split("-")[0] for path in paths}
-        assert {"jaxhf.rendering.tiles.trace_tiles", "jaxhf.trace.world.make_world"} <= kept
+        assert {"jaxhf.rendering.tiles.trace_tiles", "jaxhf.preparation.world.make_world"} <= kept
         for path in paths:
             if path.name.startswith("jit_"):
                 path.unlink()

@@ -24,7 +24,7 @@ from jaxhf.fitting.normals import deviations_above_zero, evidence_for_angles, sh
 from jaxhf.fitting.problem import make_problem
 from jaxhf.fitting.residuals import linearised, picture_residuals
 from jaxhf.fitting.uncertainty import with_unexplained
-from jaxhf.scene.localise import localise
+from jaxhf.preparation.localise import localise
 
 
 def test_noise_that_is_not_given_is_estimated():

@@ -22,7 +22,7 @@ from jaxhf.fitting.prior import Prior, make_prior
 from jaxhf.fitting.problem import Problem, make_problem
 from jaxhf.fitting.residuals import _with_albedo, prior_residuals
 from jaxhf.fitting.robust import influence_function, soften
-from jaxhf.scene.localise import localise
+from jaxhf.preparation.localise import localise
 from jaxhf.xla.devices import local_mesh
 
 

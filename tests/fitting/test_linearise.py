@@ -16,10 +16,10 @@ from jaxhf.fitting import linearise as _linearise
 from jaxhf.fitting.jacobian import picture_by_vertices, vertex_slopes, vertices_by_heights
 from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each, vertex_values
 from jaxhf.fitting.view import View, moved
+from jaxhf.preparation.localise import localise
+from jaxhf.preparation.world import make_world
 from jaxhf.rendering.samples import PictureSamples
-from jaxhf.scene.localise import localise
 from jaxhf.trace.grid import Grid
-from jaxhf.trace.world import make_world
 from jaxhf.xla.devices import local_mesh
 
 PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])

@@ -17,10 +17,11 @@ import pytest
 import jaxhf
 from jaxhf.boundary import guiding, sample
 from jaxhf.core import affine, autodiff
+from jaxhf.preparation import ceiling, horizon, localise, world as worlds
 from jaxhf.rendering import aovs as rendering_aovs, tiles
-from jaxhf.scene import localise, texture
+from jaxhf.scene import texture
 from jaxhf.shade import lighting, radiance
-from jaxhf.trace import ceiling, cylinder, horizon, intersect, normals, search, skirt, skyline, world as trace_world
+from jaxhf.trace import cylinder, intersect, normals, search, skirt, skyline
 from jaxhf.xla import masked
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
@@ -138,7 +139,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
         case(material=jaxhf.Matte(jaxhf.ImageTexture(TEXELS, wrap="clamp"))),
         [within(texture, "within")],
     ),
-    "mirror": ("plain", case(MIRROR), [*map(everywhere, (radiance._reflect, radiance._mirrored, trace_world.no_hit))]),
+    "mirror": ("plain", case(MIRROR), [*map(everywhere, (radiance._reflect, radiance._mirrored, worlds.no_hit))]),
     "cylinder": (
         "plain",
         case(jaxhf.Object(jaxhf.Cylinder())),
@@ -152,7 +153,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
     "second heightfield": (
         "smooth normals",
         case(jaxhf.Object(FIELD), shading="smooth"),
-        [second_call(trace_world.make_surface), second_call(normals.vertex_normals)],
+        [second_call(worlds.make_surface), second_call(normals.vertex_normals)],
     ),
     "several samples": ("plain", case(samples=4), [reached(tiles, "lax", "fori_loop")]),
     "sky": ("plain", case(lights=(SUN, SKY)), [recognised(lighting, "Sky")]),
@@ -177,7 +178,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
         [everywhere(normals.vertex_normals), everywhere(lighting.rounded_clamp)],
     ),
     # None is the identity, and nothing is inverted for it.
-    "transform": ("plain", case(world=TILTED), [within(trace_world, "affine"), within(affine.Affine, "inverse")]),
+    "transform": ("plain", case(world=TILTED), [within(worlds, "affine"), within(affine.Affine, "inverse")]),
     "edge samples": (
         "differentiated",
         case(edge_samples=64, differentiated=True),

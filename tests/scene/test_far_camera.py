@@ -10,8 +10,8 @@ import pytest
 
 import jaxhf
 from jaxhf.fitting.view import View, motion, moved
+from jaxhf.preparation.localise import localise
 from jaxhf.rendering.cast import cast_camera
-from jaxhf.scene.localise import localise
 
 CELL, CELLS, AWAY = 0.5, 64, 7e5
 HEIGHTS = np.random.default_rng(0).standard_normal((CELLS + 1, CELLS + 1)).cumsum(0).cumsum(1).astype(np.float32) / 40

@@ -15,7 +15,7 @@ import pytest
 from compare import heightfield
 
 import jaxhf
-from jaxhf.scene.localise import localise
+from jaxhf.preparation.localise import localise
 
 NAN, INF = np.nan, np.inf
 GRID = np.zeros((2, 3))

@@ -7,8 +7,8 @@ import pytest
 
 import jaxhf
 from jaxhf.core.ray import Ray
-from jaxhf.scene.localise import localise
-from jaxhf.trace.world import first_hit, make_world
+from jaxhf.preparation.localise import localise
+from jaxhf.preparation.world import first_hit, make_world
 
 RNG = np.random.default_rng(7)
 HEIGHTS = RNG.uniform(0, 2, (6, 9)).astype(np.float32)

@@ -29,9 +29,9 @@ def run(options: argparse.Namespace) -> None:
     import jax
     import numpy as np
 
+    from ...preparation.world import resolve_settings
     from ...rendering.aovs import known_aovs
     from ...rendering.render import render
-    from ...trace.world import resolve_settings
     from ...xla.devices import local_mesh
     from ..limits import require_memory, worthwhile_devices
     from ..progress import CompileTime, compiled_bar

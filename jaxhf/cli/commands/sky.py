@@ -73,7 +73,7 @@ def _horizon(options: argparse.Namespace) -> None:
     stored, terrain = _read(options)
     arguments.set_up_jax(options)
     from ...maps.skyview import horizon
-    from ...trace.horizon import even_azimuths
+    from ...preparation.horizon import even_azimuths
     from ..progress import compiled_bar
 
     begin = time.perf_counter()

@@ -13,12 +13,12 @@ import numpy as np
 from jax import lax
 
 from ..core.affine import affine, translate
+from ..scene.camera import Camera
+from ..scene.heightfield import Heightfield
+from ..scene.light import Light, Point
+from ..scene.scene import Object, Scene, Shape
+from ..scene.skirt import Skirt
 from ..xla.compilation import compiled
-from .camera import Camera
-from .heightfield import Heightfield
-from .light import Light, Point
-from .scene import Object, Scene, Shape
-from .skirt import Skirt
 
 
 def localise(scene: Scene) -> Scene:

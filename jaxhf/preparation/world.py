@@ -21,16 +21,16 @@ from ..scene.light import Directional, Light, Sun
 from ..scene.material import Material
 from ..scene.scene import Scene, Shape
 from ..scene.skirt import Skirt
+from ..trace.cylinder import make_tube
+from ..trace.grid import Grid, make_grid
+from ..trace.hit import Hit
+from ..trace.intersect import Surface, blocked, intersect
+from ..trace.skirt import make_walls
+from ..trace.status import Status
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
 from .ceiling import Ceiling, clears, make_ceiling
-from .cylinder import make_tube
-from .grid import Grid, make_grid
-from .hit import Hit
 from .horizon import visible_sky
-from .intersect import Surface, blocked, intersect
-from .skirt import make_walls
-from .status import Status
 
 
 class World(eqx.Module):

@@ -12,9 +12,9 @@ import jaxhf
 from jaxhf.core.affine import affine
 from jaxhf.core.ray import Ray
 from jaxhf.core.vector import dot, unit
+from jaxhf.preparation import world as worlds
+from jaxhf.preparation.ceiling import clears, make_ceiling
 from jaxhf.scene.procedural import fractal
-from jaxhf.trace import world as trace_world
-from jaxhf.trace.ceiling import clears, make_ceiling
 from jaxhf.trace.grid import make_grid
 from jaxhf.trace.intersect import blocked, intersect
 
@@ -115,7 +115,7 @@ def test_the_picture_keeps_its_bits(monkeypatch):
     settings = jaxhf.Settings(chunk=256)
     image, aovs = jaxhf.render(scene, settings, aovs=("shadow",))
     prepared = jaxhf.render(jaxhf.prepare(scene, settings))
-    monkeypatch.setattr(trace_world, "_make_ceiling", lambda *_: None)
+    monkeypatch.setattr(worlds, "_make_ceiling", lambda *_: None)
     jax.clear_caches()
     plain, plain_aovs = jaxhf.render(scene, settings, aovs=("shadow",))
     np.testing.assert_array_equal(image, plain)

@@ -8,10 +8,10 @@ from jaxtyping import Float, Int
 
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import largest_component
-from .grid import Grid, triangle_plane
-from .hit import Hit
-from .walk import reciprocal
-from .walk_start import place_on_grid
+from ..trace.grid import Grid, triangle_plane
+from ..trace.hit import Hit
+from ..trace.walk import reciprocal
+from ..trace.walk_start import place_on_grid
 
 
 class Ceiling(eqx.Module):

@@ -20,9 +20,9 @@ from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
 from ..core.types import Index, Scalar
+from ..trace.edges import STEPS, present_edges, whole_cells
+from ..trace.grid import Grid
 from ..xla.devices import local_mesh, map_over
-from .edges import STEPS, present_edges, whole_cells
-from .grid import Grid
 
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
 _TILE = 32  # vertices along its side
