@@ -44,7 +44,8 @@ cameras: scene/framing.py -> scene/test_framing.py scene/test_projections.py sce
 lights: scene/sun.py -> scene/test_sun.py
 lights: scene/light.py -> scene/test_scene.py scene/test_sun.py shade/test_shade.py
 lights: shade/lighting.py -> shade/test_shade.py shade/test_hidden_sky.py shade/test_penumbra.py rendering/test_gradient.py
-tiles: rendering/tiles.py rendering/samples.py -> rendering/test_render.py rendering/test_bits.py
+tiles: rendering/tiles.py -> rendering/test_render.py rendering/test_bits.py
+tiles: rendering/samples.py -> rendering/test_render.py boundary/test_edges.py
 tiles: rendering/chunks.py -> rendering/test_cast.py rendering/test_bits.py
 maps: maps/hillshade.py maps/slope.py maps/surface.py maps/choices.py -> maps/test_maps.py
 maps: maps/ramp.py maps/relief.py -> maps/test_maps.py cli/test_hillshade.py '-k=tint or colour or pales or adds'

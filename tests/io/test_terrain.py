@@ -243,6 +243,14 @@ def tiff(values: np.ndarray = NORTH_FIRST, **tags):
 
 SQUARE = np.zeros((2, 2))
 GLOBE = {"elevation": SQUARE, "dx": 30.0, "dy": 30.0, "xmin": 0.0, "ymin": 5e6, "ymax": 5e6}
+
+
+def test_matplotlibs_arrays_lie_where_their_bounds_say(tmp_path):
+    """Bounds are those of cells; its own file has ymin and ymax swapped."""
+    np.savez(tmp_path / "hills.npz", **GLOBE | {"dx": 0.5, "dy": 0.25, "xmin": -84.0, "ymin": 36.5, "ymax": 36.0})
+    assert load_heights(tmp_path / "hills.npz").georeference.offset == (-83.75, 36.125)
+
+
 BAD_FILES = [
     ("line.npy", save(a=np.zeros(4)), {}, "shape (ny, nx), theirs is (4,)"),
     ("empty.npy", save(a=np.zeros((0, 5))), {}, "its size must be positive"),
