@@ -47,6 +47,17 @@ def test_equals_mujoco(dtype, tolerance):
     assert 0.05 < (t < 0).mean() < 0.5
 
 
+def test_rays_along_an_axis_meet_what_mujocos_do():
+    """From above, from below the surface, from within the base, and from beside the field."""
+    reference = Reference(GROUND, SIZE)
+    places = np.random.default_rng(4).uniform(-1.2, 1.2, (40, 3)) * [*SIZE[:2], SIZE[2:].max()]
+    o, d = np.repeat(places.astype(np.float32).astype(float), 6, axis=0), np.tile(np.vstack([np.eye(3), -np.eye(3)]), (40, 1))
+    (ours, normals), (t, n) = ray(HField(GROUND, SIZE), o, d), reference(o, d)
+    np.testing.assert_allclose(ours, t, atol=1e-5)
+    np.testing.assert_allclose(normals, n, atol=1e-4)
+    assert 0.2 < np.mean(t < 0) < 0.8
+
+
 def test_no_ray_slips_through_where_mujoco_loses_some():
     """A steep ray from above at a vertex or an edge inside of the border has nothing before it, so that its t is 1."""
     data = heights(*GROUND.shape, seed=3) * 0.02
