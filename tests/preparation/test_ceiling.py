@@ -101,6 +101,7 @@ def test_a_square_terrain_of_many_cells():
     assert np.all(share[3:6].mean(1) > (0.3, 0.8, 0.95))
 
 
+@pytest.mark.optimised  # to the bit
 @pytest.mark.deep  # no spared walk meets anything, by the test above
 def test_the_picture_keeps_its_bits(monkeypatch):
     """Of two terrains, one of which shadows the other."""
