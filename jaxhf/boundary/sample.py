@@ -170,8 +170,8 @@ def ways_to_lights(world: World, p: Vector) -> list[tuple[int, tuple[Vector, Sca
 
 def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: HeightChanges | None = None) -> Vector:
     """Where the light past p meets the triangle that was found; differentiable."""
-    to, _ = select(point.light, ways_to_lights(world, p))
-    away = -to
+    still = jnp.zeros_like(p), jnp.zeros((), p.dtype)  # for what is seen where it stands, whose result is not used
+    away = -select(point.light, ways_to_lights(world, p), still)[0]
     near = p + jnp.where(point.valid, point.t, 0) * away
 
     def on_triangle(grid: Grid) -> Vector:

@@ -112,7 +112,7 @@ def test_every_part_of_a_scene(tmp_path):
         matrix = [[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
         """,
     )
-    field = Heightfield(0.5 * bumps([6, 5], range=(0, 2)).astype(np.float32), 30.0, 20.0, 500000.0, 5e6)
+    field = Heightfield(0.5 * bumps([6, 5], range=(0.0, 2.0)).astype(np.float32), 30.0, 20.0, 500000.0, 5e6)
     assert field.heights.max() == 1
     land = jaxhf.Object(field, Matte(ImageTexture(grid([8, 16], lines=2))))
     pose = np.array([[2, 0, 0, 1], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]])
