@@ -38,7 +38,7 @@ DERIVED = re.compile("trace/(normals|intersect)|scene/camera|shade|boundary/(ter
 AIMS = """
 walk: trace/walk*.py trace/[ps][ye]*.py -> rendering/test_cast.py shade/test_penumbra.py '-k=oracle or sun or vmap'
 normals: trace/normals.py -> scene/test_scene.py rendering/test_cast.py -k=normal
-normals: trace/intersect.py -> rendering/test_cast.py shade/test_shade.py
+normals: trace/intersect.py -> trace/test_leaving.py trace/test_extremes.py rendering/test_cast.py shade/test_shade.py
 cameras: scene/camera.py -> scene/test_scene.py scene/test_framing.py scene/test_projections.py scene/test_far_camera.py
 cameras: scene/framing.py -> scene/test_framing.py scene/test_projections.py scene/test_scene.py
 lights: scene/sun.py -> scene/test_sun.py

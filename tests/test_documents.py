@@ -37,7 +37,7 @@ DEEP = {  # over four seconds of a processor
     "docs/coming-from/gdal.md",
     "docs/index.md",
     *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/sun-and-sky", "guides/view")),
-    *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "robots")),
+    *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "picture", "robots")),
 }
 FOREIGN = {"gdaldem", "gdalinfo", "gdal_translate"}  # programs that may not be here
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -202,6 +202,7 @@ def test_tables_have_their_rows():
         assert f'measured("{path.stem}")' in pages, path
 
 
+@pytest.mark.deep
 @pytest.mark.skipif(find_spec("zensical") is None, reason="the site's builder, the extra docs, is not installed")
 def test_site_builds_strictly_and_needs_no_other(tmp_path):
     shutil.copytree(DOCS, tmp_path / "docs")

@@ -55,6 +55,7 @@ print(jax.jit(one)(1.0), jax.jit(two)(1.0), events.count("/jax/compilation_cache
 """
 
 
+@pytest.mark.deep
 def test_damaged_programs_are_compiled_again(tmp_path):
     """By JAX, which only warns, each time anew."""
 

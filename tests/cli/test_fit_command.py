@@ -232,6 +232,7 @@ def test_a_terminal_is_told_what_is_to_come(folder):
     assert any(re.search(r"sample 1 of 3, \d s so far, about 2 s to come \(Ctrl-C: enough\)", line) for line in lines)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("quiet", [False, pytest.param(True, marks=pytest.mark.deep)])
 def test_elsewhere_a_line_a_minute_tells_it(folder, quiet):
     """Here of 0.7 s; a minute without one is silent, and so is --quiet."""

@@ -54,7 +54,8 @@ def test_heights_come_back_to_double_precision():
     assert rms(np.asarray(found.heights) - TRUTH) < 1e-6 * np.ptp(TRUTH)
 
 
-def test_robust_losses_let_wild_pixels_go(targets):
+@pytest.mark.parametrize("losses", [("geman",), pytest.param(("huber", "cauchy"), marks=pytest.mark.deep)])
+def test_robust_losses_let_wild_pixels_go(targets, losses):
     """A twentieth of them, brighter than all others, and 0.2 % noise: heights off by at most 0.9 %, by least squares 28 %."""
     rng, wild = np.random.default_rng(1), []
     for target in targets:
@@ -62,9 +63,9 @@ def test_robust_losses_let_wild_pixels_go(targets):
         wild.append(np.where(rng.uniform(size=target.shape) < 0.05, 1.0, noisy))
     off = {
         loss: off_in_shape(jaxhf.fit(scenes(), wild, settings=SETTINGS, noise=0.002, loss=loss).heights)
-        for loss in ("squares", "huber", "cauchy", "geman")
+        for loss in ("squares", *losses)
     }
-    assert 10 * max(off["huber"], off["cauchy"], off["geman"]) < off["squares"], off
+    assert 10 * max(off[loss] for loss in losses) < off["squares"], off
 
 
 @pytest.mark.deep  # each alone, and wild pixels, are in other tests

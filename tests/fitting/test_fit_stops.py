@@ -52,6 +52,7 @@ def test_lines_tell_what_is_to_come(capsys):
     assert second == "step 2: 9 modes a side, loss 0.5, λ 0.1, change 0.2, 22.0 s, about 16 s to come, not accepted"
 
 
+@pytest.mark.deep
 def test_rejected_steps_are_damped_until_one_is_short_enough():
     """Where the loss is 1e5 standard deviations squared, a damping of 160 still lets steps through that are too long."""
     found = fitted(prior_std=0.2, levels=[1.0])

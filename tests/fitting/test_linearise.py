@@ -221,7 +221,7 @@ def samples_of(picture, side: int, pixels: int = 24) -> np.ndarray:
     return picture(x, y)[..., None].astype(np.float32)
 
 
-@pytest.mark.parametrize("side", [2, 4, 8])
+@pytest.mark.parametrize("side", [4, *(pytest.param(side, marks=pytest.mark.deep) for side in (2, 8))])
 @pytest.mark.parametrize(
     ("picture", "least", "most"),
     [

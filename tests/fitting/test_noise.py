@@ -77,7 +77,7 @@ def test_noise_is_found_in_spite_of_shadows_that_stand_elsewhere(count):
     assert found.stats["chi2"] > 1.2
 
 
-@pytest.mark.parametrize("loss", ["geman", "squares"])
+@pytest.mark.parametrize("loss", [pytest.param("geman", marks=pytest.mark.deep), "squares"])
 def test_chi2_is_by_degree_of_freedom_where_the_noise_is_given(loss):
     found = fitted(1, 0.6, 1, noise=NOISE, loss=loss)
     assert 0.8 < found.stats["chi2"] < 1.2  # of some 340 degrees of freedom: to 8 %
@@ -94,6 +94,7 @@ def test_a_prior_length_that_does_not_fit_is_named(length, fits):
     assert said is None if fits else "prior_length, 1 or 1 cells, may be too short" in str(said)
 
 
+@pytest.mark.deep
 def test_a_noise_that_pictures_cannot_tell_is_asked_for():
     """One sun and no prior: the heights explain nearly all of the picture, noise included."""
     found = fitted(1, 0.6, 1, prior=None, prior_std=None, prior_length=None, max_steps=30)

@@ -53,6 +53,7 @@ def test_it_is_the_square_of_the_residuals_derivative(rounding):
     np.testing.assert_allclose(np.concatenate([np.ravel(modes), product[n:]]), expected, rtol=0, atol=rounding * rms(expected))
 
 
+@pytest.mark.deep
 @PRECISIONS
 def test_a_step_solves_the_damped_equations_of_the_loss_itself(rounding):
     """Its gradient is JAX's own of the robust loss with all priors; so is the loss."""

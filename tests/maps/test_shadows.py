@@ -13,8 +13,8 @@ from jaxhf.maps.shadows import lit
 DIRECTIONS = [(0, 20), (45, 5), (60, 35), (90, 20), (135, 45), (200, 10), (225, 20), (270, 70), (301.7, 3), (315, 45)]
 
 
-@pytest.mark.parametrize("kind", ["hills", "noise", "holes"])
-@pytest.mark.parametrize("shape", [(13, 31), (31, 13)])
+@pytest.mark.parametrize("kind", ["hills", "holes", pytest.param("noise", marks=pytest.mark.deep)])
+@pytest.mark.parametrize("shape", [(13, 31), pytest.param((31, 13), marks=pytest.mark.deep)])
 def test_shadows_are_those_of_every_crossing(kind, shape):
     """Lit is what has its horizon below the light. With abysses for holes horizons are at least what they are."""
     random = np.random.default_rng(5)

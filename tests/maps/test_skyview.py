@@ -38,6 +38,8 @@ def every_crossing(z, azimuth, dx, dy, lowest):
     for rate in (gx, gy, gx - gy):
         for line in range(1, sum(z.shape)) if abs(rate) > 1e-12 * np.hypot(gx, gy) else ():
             s = line / abs(rate)
+            if abs(gx * s) > z.shape[1] or abs(gy * s) > z.shape[0]:
+                break  # beyond the surface, from wherever
             for off_x, off_y in ((tiny, 2 * tiny), (2 * tiny, tiny), (-tiny, tiny), (tiny, -tiny), (-tiny, -2 * tiny)):
                 height = surface(z, ix + gx * s + off_x, iy + gy * s + off_y)
                 slopes = np.fmax(slopes, (height - z) / s)

@@ -220,7 +220,13 @@ def traced(name: str) -> tuple[str, set[tuple[str, int]]]:
         return CASES[name].program(), said
 
 
-@pytest.mark.parametrize("name", FEATURES)
+FURTHER = {
+    "clamped texture", "skirt", "several samples", "sky", "point light", "transform",
+    "AOVs", "step counting", "shadow AOV", "step budget", "fixed number of steps",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.deep] * (name in FURTHER)) for name in FEATURES])
 def test_a_feature_is_in_the_program_only_where_it_is_used(name):
     without_it, _, watches = FEATURES[name]
     (program, said), (longer, said_with_it) = traced(without_it), traced(name)
@@ -231,6 +237,7 @@ def test_a_feature_is_in_the_program_only_where_it_is_used(name):
     assert [(name, k) in said for k in numbers] == [False for _ in numbers]
 
 
+@pytest.mark.deep
 def test_settings_that_a_scene_gives_no_meaning():
     """Points on edges where no derivative is taken, and bounces where there are no mirrors."""
     knobs: dict[str, Any]

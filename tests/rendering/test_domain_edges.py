@@ -249,6 +249,7 @@ def skies(heights: jax.Array, cell: float, weighting: Any) -> jax.Array:
     return jnp.sum(jaxhf.sky_view(heights, 8, weighting=weighting, dx=cell))
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(
     ("fun", "kinds"),
     [

@@ -27,6 +27,7 @@ def mirrors(heights) -> jaxhf.Scene:
     return jaxhf.Scene(objects, CAMERA, [jaxhf.Point((0.8, -0.3, 1.4))])
 
 
+@pytest.mark.deep
 @pytest.mark.optimised  # to the bit
 @pytest.mark.parametrize(
     ("scene", "aovs", "knobs"),

@@ -48,11 +48,12 @@ def traced(settings: jaxhf.Settings, transform: Callable[..., Any]) -> list[Any]
 @pytest.mark.parametrize(
     ("settings", "transform", "bound"),
     [
-        (jaxhf.Settings(), lambda loss: loss, 3950),
-        (jaxhf.Settings(samples=4), jax.value_and_grad, 5250),
-        (jaxhf.Settings(samples=4, edge_samples=1000), jax.value_and_grad, 15800),
+        pytest.param(jaxhf.Settings(), lambda loss: loss, 3950, id="frame"),
+        pytest.param(jaxhf.Settings(samples=4), jax.value_and_grad, 5250, id="gradient"),
+        pytest.param(
+            jaxhf.Settings(samples=4, edge_samples=1000), jax.value_and_grad, 15800, id="edges", marks=pytest.mark.deep
+        ),
     ],
-    ids=["frame", "gradient", "edges"],
 )
 def test_programs_stay_small(settings, transform, bound):
     count = len(traced(settings, transform))

@@ -297,6 +297,7 @@ def test_textured_radiance_agrees_with_pbrt_on_average(pbrt, shading):
     assert np.abs(image - ref).mean() < 0.02 * ref.mean()
 
 
+@pytest.mark.deep
 @pytest.mark.optimised
 @pytest.mark.parametrize("shading", ["smooth", pytest.param("flat", marks=pytest.mark.deep)])
 def test_a_converged_picture_agrees_with_pbrt(shading):

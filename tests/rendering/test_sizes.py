@@ -55,6 +55,7 @@ def test_pictures_and_gradients(shape):
     assert np.abs(gradient[known]).max() > 0
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("shape", SIZES)
 def test_rays_and_maps(shape):
     z = heights(*shape)

@@ -56,6 +56,7 @@ def test_an_object_may_be_turned_and_scaled_but_not_tilted():
         jaxhf.Sky(1.0, occlusion=0)
 
 
+@pytest.mark.deep
 @pytest.mark.x64  # for differences of 1e-6
 def test_its_derivative_is_that_of_differences():
     base = scene(jnp.asarray(RIDGES), [jaxhf.Sky(1.0, occlusion=4)])

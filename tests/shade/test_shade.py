@@ -16,7 +16,7 @@ import jaxhf
 from jaxhf.shade.lighting import rounded_clamp
 from jaxhf.shade.radiance import _reflect
 
-OPTIMISED, DEEP = pytest.mark.optimised, pytest.mark.deep
+DEEP = pytest.mark.deep
 ROUNDING = 4e-6
 ALBEDO = np.array([0.2, 0.5, 0.8])
 RADIANCE = np.array([1.0, 2.0, 3.0])
@@ -124,7 +124,6 @@ def shadows(heights, camera, light):
 BEHIND_WALL = {"directional": jaxhf.Directional((1, 0, 0.5)), "point": jaxhf.Point((6, 2.5, 2), 10.0)}
 
 
-@OPTIMISED
 @pytest.mark.parametrize("extent", [3.97, 1e-2, pytest.param(1e-9, marks=(pytest.mark.x64, DEEP))])
 @pytest.mark.parametrize("kind", BEHIND_WALL)
 def test_wall_casts_a_shadow(kind, extent):
@@ -141,7 +140,6 @@ def test_wall_casts_a_shadow(kind, extent):
     np.testing.assert_allclose(image, np.where(lit[..., None], expected, 0), rtol=ROUNDING)
 
 
-@OPTIMISED
 def test_light_before_the_wall_is_not_blocked():
     """Where most rays to it would go on into the wall; just before the wall's foot; above the plain."""
     x, y = places(1, 1.7, 1.9)
@@ -158,7 +156,6 @@ def hidden(p, d, before):
     return crossings.has_changed_sides(course, np.ones(len(p), int), np.zeros(len(p)), np.full(len(p), before))
 
 
-@OPTIMISED
 @pytest.mark.parametrize("kind", [jaxhf.Directional, jaxhf.Point])
 def test_shadows_of_rough_terrain(kind):
     """At each pixel by hand: the triangle below it, the light's cosine, and all that may stand in the light's way."""
@@ -187,7 +184,6 @@ def test_shadows_of_rough_terrain(kind):
 @pytest.mark.parametrize(
     "place", [(16, 16), (14.5, 18.25), *(pytest.param(place, marks=DEEP) for place in ((12, 20), (14.5, 18), (7.25, 21.5)))]
 )
-@OPTIMISED
 @aimed.PRECISIONS
 def test_a_light_on_the_ground_is_not_behind_it(place, dtype):
     """In a bowl it lights all but the triangles that it stands on, whose planes it is in; just below the ground, nothing."""

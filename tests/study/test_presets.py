@@ -49,9 +49,8 @@ def reference(scene: Any) -> dict[str, np.ndarray]:
         return reference
 
 
-@pytest.mark.parametrize(
-    "preset", [pytest.param(name, marks=pytest.mark.deep) if name == "exact" else name for name in PROMISES]
-)
+@pytest.mark.deep
+@pytest.mark.parametrize("preset", PROMISES)
 @pytest.mark.parametrize(
     "scene", [pytest.param(mountains, marks=pytest.mark.slow), pytest.param(hills, marks=pytest.mark.slow), dunes]
 )

@@ -148,7 +148,7 @@ def test_a_terrain_too_large_for_derivatives_has_pictures_measured(tmp_path, swe
     assert len(told) == 1
 
 
-@pytest.mark.parametrize("question", ["ready", "frame", "errors"])
+@pytest.mark.parametrize("question", ["frame", *(pytest.param(name, marks=pytest.mark.deep) for name in ("ready", "errors"))])
 def test_a_process_that_dies_is_listed(sweep, started, monkeypatch, capsys, question):
     monkeypatch.setattr(Pretended, "fatal", ("picture", "dda", question))
     assert main(command(sweep, "precision", "traversal")) == 2

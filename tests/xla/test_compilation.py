@@ -47,6 +47,7 @@ def test_an_option_that_xla_does_not_know_is_left_out(others, monkeypatch):
         compiler_options.cache_clear()
 
 
+@pytest.mark.deep
 def test_the_first_use_may_be_within_a_trace():
     """All is imported late: here while the user's function is being traced."""
     script = """
