@@ -7,11 +7,10 @@ import jax.numpy as jnp
 
 from ..core.affine import Affine
 from ..core.ray import Ray
-from ..core.types import Flag, Scalar
-from ..core.vector import angle, dot, largest_component, lesser, quotient, unit
+from ..core.types import Flag, Scalar, Vector
+from ..core.vector import angle, dot, lesser, quotient, unit
 from ..scene.cylinder import Cylinder
-from .hit import Hit, orthogonal_tangents
-from .status import Status
+from .hit import Hit, hit_of_closed_form, orthogonal_tangents
 
 
 class Tube(eqx.Module):
@@ -64,15 +63,8 @@ def tube_distance(tube: Tube, ray: Ray, left: Flag | None) -> tuple[Scalar, Flag
     return jnp.where(found, t, 0), found
 
 
-def cylinder_hit(
-    tube: Tube, ray: Ray, left: Flag | None, number: int, active: Flag | None, count_steps: bool, tangents: bool = False
-) -> Hit:
-    """The first hit of a world-frame ray on a cylinder; `left` as in `tube_distance`, `number` that of its object."""
-    t, found = tube_distance(tube, ray, left)
-    found = found if active is None else found & active
-    valid = largest_component(ray.d) > 0
-    t = jnp.where(found, t, 0)
-    p = ray(t)
+def hit_on_tube(tube: Tube, number: int, p: Vector, d: Vector, found: Flag, tangents: bool) -> Hit:
+    """The hit at a point of the cylinder of a ray that comes along `d`; with t = 0. Unless `found` it is any other's."""
     local = tube.object_from_world.point(p)
     x, y = jnp.where(found, local[0], 1), jnp.where(found, local[1], 0)
     turn = 2 * jnp.pi
@@ -80,21 +72,8 @@ def cylinder_hit(
     phi = jnp.where(phi < 0, phi + turn, phi)
     zero, height = jnp.zeros_like(x), tube.z_max - tube.z_min
     n = unit(tube.object_from_world.covector(jnp.stack([x, y, zero])))
-    none = jnp.zeros((), jnp.int32)
-    met = found & valid
-    hit = Hit(
-        status=jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID)).astype(jnp.int32),
-        object=jnp.where(met, number, -1).astype(jnp.int32),
-        t=jnp.where(met, t, jnp.inf),
-        p=p,
-        n=n,
-        ns=n,
-        uv=jnp.stack([phi / turn, quotient(local[2] - tube.z_min, height)]),
-        cell=jnp.zeros(2, jnp.int32),
-        triangle=none,
-        side=jnp.where(dot(n, ray.d) < 0, 1, -1).astype(jnp.int32),
-        steps=none if count_steps else None,
-    )
+    uv = jnp.stack([phi / turn, quotient(local[2] - tube.z_min, height)])
+    hit = hit_of_closed_form(number, p, n, uv, d)
     if not tangents:
         return hit
     dp_du = tube.world_from_object.vector(jnp.stack([-y, x, zero])) * turn

@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 
 from ..core.affine import Affine
+from ..core.errors import UserError
 from ..core.powers import floor_to_power_of_two
 from ..core.settings import NormalScheme
 from ..core.types import MOST_PLACES, Flag, Index, Scalar
@@ -117,9 +118,6 @@ def joined(grids: Grid) -> tuple[Grid, Grid]:
       The heights, bounds and normals of all, one after the other; and the rest of each, with the leading axis. The first with
       one of the second makes a grid, see `equinox.combine`.
     """
-    count, vertices = grids.rows.shape
-    assert max(grids.rows.size, grids.pyramid.bounds.size) <= MOST_PLACES, "trace_batch takes few large grids together"
-    number = jnp.arange(count, dtype=jnp.int32)
 
     def arrays(grid: Grid) -> tuple[Any, ...]:
         return grid.rows, grid.pyramid.bounds, grid.normals
@@ -130,12 +128,26 @@ def joined(grids: Grid) -> tuple[Grid, Grid]:
     def at(parts: Callable[[Grid], Any], grids: Grid, values: Any) -> Grid:
         return eqx.tree_at(parts, grids, values, is_leaf=lambda leaf: leaf is None)
 
-    grids = at(places, grids, (number * vertices, number * grids.pyramid.bounds.shape[1]))
+    grids = at(places, grids, (first_places(grids.rows), first_places(grids.pyramid.bounds)))
     common = at(arrays, jax.tree.map(lambda _: False, grids), (True, True, None if grids.normals is None else True))
     shared, own = eqx.partition(grids, common)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), shared), own
 
 
+def first_places(values: Shaped[jax.Array, "count n"]) -> Int[jax.Array, " count"]:
+    """Where each row begins, when all stand in one array, one after the other; UserError where that has too many numbers."""
+    if values.size > MOST_PLACES:
+        share = f"{len(values)} heightfields under a vmap share an array of {values.size} numbers"
+        raise UserError(f"{share}, at most {MOST_PLACES} can be addressed; jax.lax.map with a batch_size takes fewer")
+    return jnp.arange(len(values), dtype=jnp.int32) * values.shape[1]
+
+
 def triangle_plane(grid: Grid, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """(a, b, c) of the triangle's plane c + a u + b v, with u and v from the cell's vertex 00; finite in a hole too."""
     return plane_through(triangle_corners(grid.rows, grid.shape[1], ix, iy, upper, grid.first), upper)
+
+
+def height_over(grid: Grid, ix: Index, iy: Index, upper: Flag, x: Scalar, y: Scalar) -> Scalar:
+    """The height of that plane over the point (x, y); all in the grid's frame."""
+    a, b, c = triangle_plane(grid, ix, iy, upper)
+    return c + a * (x - ix.astype(x.dtype)) + b * (y - iy.astype(y.dtype))

@@ -4,10 +4,12 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Int
 
 from ..core.types import Index, Point2, Scalar, Vector
 from ..core.vector import dot, unit
+from .status import Status
 
 if TYPE_CHECKING:  # who has a hit of `cast` has its tangents
     _Tangent = Vector
@@ -51,6 +53,16 @@ class Hit(eqx.Module):
     dn_du: _Tangent = eqx.field(default=None)
     dn_dv: _Tangent = eqx.field(default=None)
     steps: Index | None = None
+
+
+def hit_of_closed_form(number: int, p: Vector, n: Vector, uv: Point2, d: Vector, part: Index | int = 0) -> Hit:
+    """The hit at a point of a shape without cells, of a ray that comes along `d`; with t = 0. `part` stands for its cell."""
+    none = jnp.zeros((), jnp.int32)
+    return Hit(
+        status=jnp.full((), int(Status.HIT), jnp.int32), object=jnp.full((), number, jnp.int32), t=jnp.zeros((), p.dtype),
+        p=p, n=n, ns=n, uv=uv, cell=jnp.stack([none + part, none]), triangle=none,
+        side=jnp.where(dot(n, d) < 0, 1, -1).astype(jnp.int32),
+    )  # fmt: skip
 
 
 def orthogonal_tangents(per_u: Vector, per_v: Vector, ns: Vector) -> tuple[Vector, Vector]:

@@ -15,19 +15,19 @@ from jax import lax
 from ..core.autodiff import stored
 from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
-from ..core.types import Flag, Scalar, Vector
+from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, finite, largest_component, quotient, unit
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
-from .cylinder import Tube, cylinder_hit, tube_distance
+from .cylinder import Tube, hit_on_tube, tube_distance
 from .grid import Grid, triangle_plane
 from .hit import Hit, orthogonal_tangents
 from .search import first_triangle
-from .skirt import Walls, wall_distance, wall_hit
+from .skirt import Walls, before_terrain, hit_on_side, wall_distance
 from .status import Status
 from .triangle import plane_through, triangle_corners
 from .walk import WalkResult
-from .walk_start import place_on_grid
+from .walk_start import place_on_grid, point_on_grid
 
 Surface = Grid | Tube | Walls
 
@@ -60,11 +60,8 @@ def intersect(
     """
     valid = finite(ray.o) & finite(ray.d)
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
-    if isinstance(surface, Tube):
-        left = None if leaving is None else leaving.object == number
-        return materialise(cylinder_hit(surface, ray, left, number, active, count_steps, tangents))
-    if isinstance(surface, Walls):
-        return materialise(wall_hit(surface, ray, leaving, number, active, count_steps, tangents))
+    if not isinstance(surface, Grid):
+        return materialise(_hit_of_closed_form(surface, number, ray, leaving, active, count_steps, tangents))
     local, scale = ray_in_grid(surface, ray)
     found = first_triangle(
         surface,
@@ -94,11 +91,8 @@ def blocked(
 
     Neither has a derivative: the arguments come under `stop_gradient`, see `unblocked`.
     """
-    if isinstance(surface, Tube):
-        t, found = tube_distance(surface, ray, leaving.object == number)
-        return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
-    if isinstance(surface, Walls):
-        t, found, _ = wall_distance(surface, ray, leaving, number)
+    if not isinstance(surface, Grid):
+        t, found, _ = _distance(surface, number, ray, leaving)
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
     local, scale = ray_in_grid(surface, ray)
     t_max = None if t_max is None else t_max * scale
@@ -107,6 +101,43 @@ def blocked(
     if t_max is not None:
         met = met & _is_through(triangle_plane(surface, found.ix, found.iy, found.upper), local, found, t_max)
     return stored((met, found.status == int(Status.EXHAUSTED)))
+
+
+def _distance(surface: Tube | Walls, number: int, ray: Ray, leaving: Hit | None) -> tuple[Scalar, Flag, Index]:
+    """The smallest t > 0 at which a ray meets a shape without cells, whether it does, and on which of its sides."""
+    if isinstance(surface, Walls):
+        return wall_distance(surface, ray, leaving, number)
+    t, found = tube_distance(surface, ray, None if leaving is None else leaving.object == number)
+    return t, found, jnp.zeros((), jnp.int32)
+
+
+def _hit_of_closed_form(
+    surface: Tube | Walls,
+    number: int,
+    ray: Ray,
+    leaving: Hit | None,
+    active: Flag | None,
+    count_steps: bool,
+    tangents: bool,
+) -> Hit:
+    """`intersect` for a shape without cells, and for a ray that is finite."""
+    t, found, side = _distance(surface, number, ray, leaving)
+    found = found if active is None else found & active
+    valid = largest_component(ray.d) > 0
+    met, t = found & valid, jnp.where(found, t, 0)
+    if isinstance(surface, Walls):
+        hit = hit_on_side(surface, number, ray(t), ray.d, side, tangents)
+        t = jnp.where(hit.side > 0, before_terrain(t), t)
+    else:
+        hit = hit_on_tube(surface, number, ray(t), ray.d, found, tangents)
+    status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID))
+    return dataclasses.replace(
+        hit,
+        status=status.astype(jnp.int32),
+        object=jnp.where(met, hit.object, -1),
+        t=jnp.where(met, t, jnp.inf),
+        steps=jnp.zeros((), jnp.int32) if count_steps else None,
+    )
 
 
 def leave(grid: Grid, number: int, hit: Hit, d: Vector) -> tuple[Ray, Hit]:
@@ -118,10 +149,7 @@ def leave(grid: Grid, number: int, hit: Hit, d: Vector) -> tuple[Ray, Hit]:
     """
     ahead = dot(unit(d), hit.n)
     side = jnp.where(ahead == 0, hit.side, jnp.where(ahead > 0, 1, -1).astype(hit.side.dtype))
-    ix, iy, x, y = place_on_grid(grid, hit)
-    a, b, c = triangle_plane(grid, ix, iy, hit.triangle == 1)
-    u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
-    p = grid.world_from_grid.point(jnp.stack([x, y, c + a * u + b * v]))
+    p = grid.world_from_grid.point(point_on_grid(grid, hit))
     leaving = dataclasses.replace(hit, side=side, object=jnp.full_like(hit.object, number))
     return Ray(p, jnp.where(hit.status == int(Status.HIT), d, 0)), leaving
 

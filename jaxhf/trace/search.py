@@ -1,6 +1,5 @@
 """Which triangle does a ray meet? A discrete search: integers come out, which carry no derivative."""
 
-import functools
 import math
 import operator
 from collections.abc import Callable
@@ -10,13 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Int, UInt32
 
-from ..core.errors import UserError
 from ..core.ray import Ray
-from ..core.types import MOST_PLACES, Flag, Index, Scalar
+from ..core.types import Flag, Index, Scalar
 from ..xla.kernel import in_parts
-from .grid import Grid
+from .grid import Grid, first_places
 from .hit import Hit
 from .walk import Walk, WalkResult, walking
 from .walk_start import walk_start
@@ -54,14 +51,12 @@ def first_triangle(
     """
     grid, ray, leaving, t_max = lax.stop_gradient((grid, ray, leaving, t_max))
     walk, state, valid = walk_start(grid, ray, leaving, number, t_max, active)
-    bound = enough_steps(grid)
-    budget = bound if max_steps is None else min(max_steps, bound)
-    state, steps = _search(walk, state, budget, count_steps, grid.early_exit)
+    state, steps = _search(walk, state, enough_steps(grid, max_steps), count_steps, grid.early_exit)
     return walk.finish(state, valid, steps)
 
 
-def enough_steps(grid: Grid) -> int:
-    """A number of steps that suffices for any ray.
+def enough_steps(grid: Grid, most: int | None = None) -> int:
+    """A number of steps that suffices for any ray, or `most` if that is less.
 
     A ray moves one way along each axis, so on each level it passes through at most (blocks along x) + (blocks along y) - 1
     blocks. It comes to each of them at most once: it grows to a block only on entering it, and goes down into one
@@ -69,10 +64,9 @@ def enough_steps(grid: Grid) -> int:
     """
     cells_x, cells_y = grid.cells
     levels = range(grid.pyramid.levels + 1)
-    return sum(math.ceil(cells_x / 2**level) + math.ceil(cells_y / 2**level) - 1 for level in levels)
+    enough = sum(math.ceil(cells_x / 2**level) + math.ceil(cells_y / 2**level) - 1 for level in levels)
+    return enough if most is None else min(most, enough)
 
-
-Step = Callable[[jax.Array], jax.Array]
 
 # Blocks of cells that are looked at between two visits to cells.
 SKIPS = 2
@@ -100,8 +94,16 @@ def _search_many(of_ray: Walk, budget: int, count: bool, early_exit: bool) -> Ca
         batched, state = own
         skip = jax.vmap(lambda batched, state: eqx.combine(batched, shared).skip(state))
         visit = jax.vmap(lambda batched, state: eqx.combine(batched, shared).visit(state))
-        skip_all, visit_all = (functools.partial(step, batched) for step in (skip, visit))
-        return _steps(skip_all, visit_all, state, budget, count, early_exit)
+
+        def advance(carry):
+            state, steps = carry
+            if steps is not None:
+                steps = steps + walking(state).astype(jnp.int32)
+            state = lax.fori_loop(0, SKIPS, lambda _, state: skip(batched, state), state)
+            return visit(batched, state), steps
+
+        steps = jnp.zeros(state.shape, jnp.int32) if count else None
+        return until_ended(advance, (state, steps), budget, early_exit)
 
     @jax.custom_batching.custom_vmap
     def run(walk: Walk, state: jax.Array):
@@ -140,10 +142,7 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
         """The values of all batches, whether they differ from walk to walk, and where those of a walk begin."""
         if per_ray or not per_batch:
             return flattened(values, per_ray, per_batch), per_ray, first
-        if values.size > MOST_PLACES:
-            share = f"{axis_size} heightfields under a vmap share an array of {values.size} numbers"
-            raise UserError(f"{share}, at most {MOST_PLACES} can be addressed; jax.lax.map with a batch_size takes fewer")
-        begin = jnp.repeat(jnp.arange(axis_size, dtype=jnp.int32), rays) * values.shape[1]
+        begin = jnp.repeat(first_places(values), rays)
         return values.reshape(-1), False, begin if first is None else begin + first
 
     flat, differs = jax.tree.map(flattened, walk, of_ray, of_batch), jax.tree.map(operator.or_, of_ray, of_batch)
@@ -162,23 +161,16 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
     return flat, with_places(differs, differ, next(given), bounds_differ, next(given))
 
 
-def _steps(
-    skip: Step, visit: Step, state: UInt32[jax.Array, "*batch"], budget: int, count: bool, early_exit: bool
-) -> tuple[UInt32[jax.Array, "*batch"], Int[jax.Array, "*batch"] | None]:
-    """Repeats steps, each of which skips a few blocks and visits one cell, for one ray or a batch of them."""
+def until_ended(advance: Callable[[Any], Any], carry: Any, budget: int, early_exit: bool) -> Any:
+    """What a walk carries, `advance`d until it has ended, or `budget` times; without `early_exit` always so many times.
 
-    def advance(state, steps):
-        if steps is not None:
-            steps = steps + walking(state).astype(jnp.int32)
-        state = lax.fori_loop(0, SKIPS, lambda _, state: skip(state), state)
-        return visit(state), steps
-
-    init = state, jnp.zeros(state.shape, jnp.int32) if count else None
+    The first part of `carry` is the state of a walk, or of a batch, where the last one counts.
+    """
     if not early_exit:
-        return lax.fori_loop(0, budget, lambda _, carry: advance(*carry), init)
+        return lax.fori_loop(0, budget, lambda _, carry: advance(carry), carry)
 
-    def going(carry):
-        step, (state, _) = carry
+    def going(counted):
+        step, (state, *_) = counted
         return (step < budget) & walking(state).any()
 
-    return lax.while_loop(going, lambda carry: (carry[0] + 1, advance(*carry[1])), (jnp.zeros((), jnp.int32), init))[1]
+    return lax.while_loop(going, lambda counted: (counted[0] + 1, advance(counted[1])), (jnp.zeros((), jnp.int32), carry))[1]

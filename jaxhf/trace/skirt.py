@@ -10,10 +10,9 @@ from jaxtyping import Float
 from ..core.affine import Affine
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, greater, largest_component, lesser, quotient, time_to, unit, within
+from ..core.vector import greater, largest_component, lesser, quotient, time_to, unit, within
 from ..scene.skirt import Skirt
-from .hit import Hit, orthogonal_tangents
-from .status import Status
+from .hit import Hit, hit_of_closed_form, orthogonal_tangents
 
 # The directions out of the solid through the four walls and the floor, object frame.
 OUTWARDS = ((0, -1, 0), (0, 1, 0), (-1, 0, 0), (1, 0, 0), (0, 0, -1))
@@ -136,29 +135,12 @@ def wall_slopes(walls: Walls, number: int, p: Vector, level: Vector, leaving: Hi
     return jnp.where(outside, jnp.inf, low), jnp.where(outside, -jnp.inf, high)
 
 
-def wall_hit(
-    walls: Walls, ray: Ray, leaving: Hit | None, number: int, active: Flag | None, count_steps: bool, tangents: bool = False
-) -> Hit:
-    """The first hit of a world-frame ray on walls or floor; `number` is that of their object. `Hit.cell[0]` says which side."""
-    t, found, side = wall_distance(walls, ray, leaving, number)
-    found = found if active is None else found & active
-    valid = largest_component(ray.d) > 0
-    met = found & valid
-    t = jnp.where(found, t, 0)
-    hit = hit_on_side(walls, number, side, ray(t), ray.d, tangents)
-    # At the rim a wall comes before the terrain, whose lower side would be seen there.
-    t = t * jnp.where(hit.side > 0, 1 - _WIDE * jnp.finfo(t.dtype).eps, 1)
-    status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID))
-    return dataclasses.replace(
-        hit,
-        status=status.astype(jnp.int32),
-        object=jnp.where(met, hit.object, -1),
-        t=jnp.where(met, t, jnp.inf),
-        steps=jnp.zeros((), jnp.int32) if count_steps else None,
-    )
+def before_terrain(t: Scalar) -> Scalar:
+    """The t of a wall that is met from outside: at the rim the terrain, whose lower side would be seen there, comes behind."""
+    return t * (1 - _WIDE * jnp.finfo(t.dtype).eps)
 
 
-def hit_on_side(walls: Walls, number: int, side: Index, p: Vector, d: Vector, tangents: bool = False) -> Hit:
+def hit_on_side(walls: Walls, number: int, p: Vector, d: Vector, side: Index, tangents: bool) -> Hit:
     """The hit at a point of a wall, or of the floor, of a ray that comes along `d`; with t = 0."""
     local = walls.object_from_world.point(p)
     (size_x, size_y), dtype = walls.size, p.dtype
@@ -168,12 +150,7 @@ def hit_on_side(walls: Walls, number: int, side: Index, p: Vector, d: Vector, ta
     v = jnp.where(floor, local[1] / size_y, time_to(local[2] - walls.base, walls.tallest)[0])
     n = unit(walls.object_from_world.covector(outwards))
     zero = jnp.zeros((), dtype)
-    none = jnp.zeros((), jnp.int32)
-    faces = dot(n, d) < 0
-    hit = Hit(
-        status=jnp.full((), int(Status.HIT), jnp.int32), object=jnp.full((), number, jnp.int32), t=zero, p=p, n=n, ns=n,
-        uv=jnp.stack([u, v]), cell=jnp.stack([side, none]), triangle=none, side=jnp.where(faces, 1, -1).astype(jnp.int32),
-    )  # fmt: skip
+    hit = hit_of_closed_form(number, p, n, jnp.stack([u, v]), d, side)
     if not tangents:
         return hit
     per_u = jnp.where(along_x, jnp.stack([zero + size_x, zero, zero]), jnp.stack([zero, zero + size_y, zero]))

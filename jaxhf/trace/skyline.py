@@ -18,12 +18,12 @@ from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import greater, lesser, quotient
 from ..xla.materialise import materialise
 from .edges import STEPS
-from .grid import Grid, triangle_plane
+from .grid import Grid
 from .hit import Hit
-from .search import SKIPS, enough_steps
-from .triangle import plane_through, triangle_corners
+from .search import SKIPS, enough_steps, until_ended
+from .triangle import corners, plane_through, triangle_corners
 from .walk import MISS, Walk, walking
-from .walk_start import place_on_grid, walk_start
+from .walk_start import point_on_grid, walk_start
 
 
 def hidden_slopes(
@@ -102,10 +102,7 @@ def skyline_slope(
       above: False for the smallest slope: then what is above the second counts as the second, and the walk gives up beyond the
         first.
     """
-    ix, iy, x, y = place_on_grid(grid, leaving)
-    a, b, c = triangle_plane(grid, ix, iy, leaving.triangle == 1)
-    on_own = jnp.stack([x, y, c + a * (x - ix.astype(x.dtype)) + b * (y - iy.astype(y.dtype))])
-    o = jnp.where(leaving.object == number, on_own, grid.grid_from_world.point(p))
+    o = jnp.where(leaving.object == number, point_on_grid(grid, leaving), grid.grid_from_world.point(p))
     local, rise = jnp.stack([*grid.grid_from_world.vector(level)[:2], jnp.zeros_like(o[2])]), grid.grid_from_world.linear[2, 2]
     lowest, highest = between
     fixed = lax.stop_gradient((grid, Ray(o, local), level, leaving, lowest, highest, rise))
@@ -122,7 +119,7 @@ def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index, above: bool) ->
       grid: which may lean by an infinitesimal, for its derivative in the transform.
       o: in the grid's frame.
       level: a horizontal direction, world frame.
-      edge: see `Walk._edge`.
+      edge: see `_edge`.
     """
     known, edge = edge >= 0, jnp.maximum(edge, 0)
     first, kind, nx = edge // 3, edge % 3, grid.shape[1]
@@ -194,23 +191,64 @@ def _outermost_edge(
         state, slope, edge = carry
         here = tilted(slope)
         state = lax.fori_loop(0, SKIPS, lambda _, state: here.skip(state), state)
-        state, found = here.beside_cell(state, touching, above)
+        state, found = _beside_cell(here, state, touching, above)
         slope = raised(slope, found)
         goes_on = slope < highest if above else slope > lowest
         return jnp.where(goes_on, state, MISS), slope, jnp.where(found >= 0, found, edge)
 
     # Where the surface's border stands past a ray that comes from outside.
     first = lowest if above else highest
-    edge = jnp.where(~own & (walk.t_start > touching), tilted(first).border(state, above), -1)
+    edge = jnp.where(~own & (walk.t_start > touching), _border(tilted(first), state, above), -1)
     init = state, raised(first, edge), edge
-    bound = enough_steps(grid)
-    budget = bound if max_steps is None else min(max_steps, bound)
-    if not grid.early_exit:
-        state, _, edge = lax.fori_loop(0, budget, lambda _, carry: advance(carry), init)
-        return edge, walking(state)
-
-    def going(carry: tuple[Index, tuple[jax.Array, Scalar, Index]]) -> Flag:
-        return (carry[0] < budget) & walking(carry[1][0])
-
-    state, _, edge = lax.while_loop(going, lambda carry: (carry[0] + 1, advance(carry[1])), (jnp.zeros((), jnp.int32), init))[1]
+    state, _, edge = until_ended(advance, init, enough_steps(grid, max_steps), grid.early_exit)
     return edge, walking(state)
+
+
+def _beside_cell(walk: Walk, state: jax.Array, beyond: Scalar, above: bool) -> tuple[jax.Array, Index]:
+    """One cell, for a ray on one side of the surface that nothing stops: goes on, and says which edge is furthest past it.
+
+    Args:
+      state: of the walk.
+      beyond: up to which t no edge counts.
+      above: whether the ray is above the surface.
+
+    Returns:
+      The state in the next cell, and the edge that is seen from where t is 0 at the largest slope of those above the ray
+      (at the smallest of those below a ray that is below the surface), see `_edge`; -1 where none is, and in a larger
+      block, which is left alone.
+    """
+    side, ix, iy, size = walk.unpack(state)
+    visits = walking(state) & (size == 1)
+    cell = walk.cell(state, ix, iy, size)
+    far, near = walk.t_start + cell.out, walk.t_start + cell.diagonal
+    past_diagonal, past_exit = (-gap if above else gap for gap in (cell.gap_diagonal, cell.gap_out))
+    on_diagonal = jnp.where(cell.crosses & ~cell.on_own & (near > beyond), past_diagonal, 0)
+    on_exit = jnp.where(cell.skip_out | (far <= beyond), 0, past_exit)
+    # A diagonal that is not crossed may lie behind, with a `near` below 0.
+    kind = jnp.where((on_diagonal > 0) & (on_diagonal * far > on_exit * near), 2, cell.through_x.astype(jnp.int32))
+    rises = visits & cell.whole & (greater(on_diagonal, on_exit) > 0)
+    edge = materialise(jnp.where(rises, _edge(walk, ix, iy, kind, ahead=True), -1))
+    return jnp.where(visits, walk.onwards(side, ix, iy, size, cell.out_x, cell.out_y), state), edge
+
+
+def _border(walk: Walk, state: jax.Array, above: bool) -> Index:
+    """The edge by which a ray comes into the grid, see `_edge`; -1 where the ray is above it (below it, if not `above`)."""
+    _, ix, iy, _ = walk.unpack(state)
+    z00, z10, z01, z11 = corners(walk.rows, walk.nx, ix ^ walk.flip[0], iy ^ walk.flip[1], walk.first)
+    u, v = walk.x - ix.astype(walk.x.dtype), walk.y - iy.astype(walk.y.dtype)
+    through_x = walk.distance_x(ix) >= walk.distance_y(iy)
+    low = jnp.where(through_x, jnp.where(walk.back_x, z10, z00), jnp.where(walk.back_y, z01, z00))
+    high = jnp.where(through_x, jnp.where(walk.back_x, z11, z01), jnp.where(walk.back_y, z11, z10))
+    along = jnp.where(through_x, jnp.where(walk.back_y, 1 - v, v), jnp.where(walk.back_x, 1 - u, u))
+    gap = walk.gap(jnp.zeros_like(u), low, high, along)
+    rises = walking(state) & (gap < 0 if above else gap > 0)
+    return jnp.where(rises, _edge(walk, ix, iy, through_x.astype(jnp.int32), ahead=False), -1)
+
+
+def _edge(walk: Walk, ix: Index, iy: Index, kind: Index, ahead: bool) -> Index:
+    """3 * its first vertex + its kind: of the sides by which the ray leaves or enters a cell that along x (0) or y (1), or
+    the diagonal (2)."""
+    flip_x, flip_y = walk.flip
+    further_x, further_y = (kind == 1) & (walk.back_x != ahead), (kind == 0) & (walk.back_y != ahead)
+    x, y = (ix ^ flip_x) + further_x.astype(jnp.int32), (iy ^ flip_y) + further_y.astype(jnp.int32)
+    return 3 * (y * walk.nx + x) + kind

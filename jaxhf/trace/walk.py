@@ -21,7 +21,6 @@ from jaxtyping import Bool, Float, UInt32
 
 from ..core.types import Flag, Index, Scalar
 from ..core.vector import FAR, greater, lesser
-from ..xla.materialise import materialise
 from .pyramid import Pyramid
 from .status import Status
 from .triangle import corners
@@ -66,7 +65,7 @@ def walking(state: UInt32[jax.Array, "*batch"]) -> Bool[jax.Array, "*batch"]:
     return (state & 3) >= WALKING
 
 
-class _Cell(NamedTuple):
+class Cell(NamedTuple):
     """What a walk finds in one cell.
 
     Attributes:
@@ -164,11 +163,11 @@ class Walk(eqx.Module):
         return bits(status, 0) | bits(above, 2) | bits(code_x, 3) | bits(iy, 3 + self.bits_x)
 
     def _fields(self, state: jax.Array) -> tuple[Flag, Index, Index]:
-        """What `_pack` took besides the status."""
+        """What `pack` took besides the status."""
         code = (state >> 3).astype(jnp.int32) & ((1 << self.bits_x) - 1)
         return (state & 4) != 0, code, (state >> (3 + self.bits_x)).astype(jnp.int32)
 
-    def _unpack(self, state: jax.Array) -> tuple[Flag, Index, Index, Index]:
+    def unpack(self, state: jax.Array) -> tuple[Flag, Index, Index, Index]:
         """Whether the ray is above the surface, and its block's first cell and size."""
         above, code, iy = self._fields(state)
         size = code & -code
@@ -184,7 +183,7 @@ class Walk(eqx.Module):
 
         A cell of which the ray is not clear is left to `visit`.
         """
-        above, ix, iy, size = self._unpack(state)
+        above, ix, iy, size = self.unpack(state)
         near, out_x, out_y = self._passage(ix, iy, size)
         out = lesser(lesser(out_x, out_y), self.t_stop)
         # If it moves towards the surface, it is nearest to it where it leaves the block, else where it enters.
@@ -193,7 +192,7 @@ class Walk(eqx.Module):
         bound = self.pyramid.bound(above, 31 - lax.clz(size), ix ^ flip_x, iy ^ flip_y)
         height = jnp.where(above, height, -height)
         clear = height > bound
-        onwards = self._onwards(above, ix, iy, size, out_x, out_y)
+        onwards = self.onwards(above, ix, iy, size, out_x, out_y)
         inside = state
         if self.pyramid.levels:
             half = size >> 1
@@ -205,8 +204,8 @@ class Walk(eqx.Module):
 
     def visit(self, state: jax.Array) -> jax.Array:
         """One cell: looks for a change of sign at its diagonal and at its exit, else moves on; larger blocks are left alone."""
-        above, ix, iy, size = self._unpack(state)
-        cell = self._cell(state, ix, iy, size)
+        above, ix, iy, size = self.unpack(state)
+        cell = self.cell(state, ix, iy, size)
         met_first = cell.crosses & ~cell.on_own & _opposite(above, cell.gap_diagonal)
         met = cell.whole & (met_first | (~cell.skip_out & _opposite(above, cell.gap_out)))
         # A diagonal that is not crossed: which side of it the ray is on.
@@ -214,11 +213,11 @@ class Walk(eqx.Module):
         upper = jnp.where(cell.crosses, met_first == (self.rate > 0), before) != self.back_x
 
         above = jnp.where(cell.whole, above, cell.gap_out >= 0)  # behind a hole the side is found anew
-        onwards = self._onwards(above, ix, iy, size, cell.out_x, cell.out_y)
+        onwards = self.onwards(above, ix, iy, size, cell.out_x, cell.out_y)
         hit = self.pack(HIT, above, 2 * ix + upper.astype(jnp.int32), iy)
         return jnp.where(walking(state) & (size == 1), jnp.where(met, hit, onwards), state)
 
-    def _cell(self, state: jax.Array, ix: Index, iy: Index, size: Index) -> "_Cell":
+    def cell(self, state: jax.Array, ix: Index, iy: Index, size: Index) -> "Cell":
         near, out_x, out_y = self._passage(ix, iy, size)
         flip_x, flip_y = self.flip
         z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ flip_x, iy ^ flip_y, self.first)
@@ -245,68 +244,21 @@ class Walk(eqx.Module):
         u, v = along(out)
         low = jnp.where(through_x, jnp.where(self.back_x, z00, z10), jnp.where(self.back_y, z00, z01))
         high = jnp.where(through_x, jnp.where(self.back_x, z01, z11), jnp.where(self.back_y, z10, z11))
-        gap_out = self._gap(out, low, high, jnp.where(through_x, v, u))
-        gap_diagonal = self._gap(diagonal, z00, z11, along(diagonal)[0])
+        gap_out = self.gap(out, low, high, jnp.where(through_x, v, u))
+        gap_diagonal = self.gap(diagonal, z00, z11, along(diagonal)[0])
         if self.noise is not None:
             gap_out, gap_diagonal = (jnp.where(jnp.abs(gap) <= self.noise, 0, gap) for gap in (gap_out, gap_diagonal))
         gap_out = jnp.where(last, self.dz, gap_out)  # below the lowest height or above the highest: no rounding can hide it
-        return _Cell(
+        return Cell(
             whole, near, out, out_x, out_y, through_x, across, diagonal, crosses, on_own, skip_out, gap_out, gap_diagonal
         )
-
-    def beside_cell(self, state: jax.Array, beyond: Scalar, above: bool) -> tuple[jax.Array, Index]:
-        """One cell, for a ray on one side of the surface that nothing stops: goes on, and says which edge is furthest past it.
-
-        Args:
-          state: of the walk.
-          beyond: up to which t no edge counts.
-          above: whether the ray is above the surface.
-
-        Returns:
-          The state in the next cell, and the edge that is seen from where t is 0 at the largest slope of those above the ray
-          (at the smallest of those below a ray that is below the surface), see `_edge`; -1 where none is, and in a larger
-          block, which is left alone.
-        """
-        side, ix, iy, size = self._unpack(state)
-        visits = walking(state) & (size == 1)
-        cell = self._cell(state, ix, iy, size)
-        far, near = self.t_start + cell.out, self.t_start + cell.diagonal
-        past_diagonal, past_exit = (-gap if above else gap for gap in (cell.gap_diagonal, cell.gap_out))
-        on_diagonal = jnp.where(cell.crosses & ~cell.on_own & (near > beyond), past_diagonal, 0)
-        on_exit = jnp.where(cell.skip_out | (far <= beyond), 0, past_exit)
-        # A diagonal that is not crossed may lie behind, with a `near` below 0.
-        kind = jnp.where((on_diagonal > 0) & (on_diagonal * far > on_exit * near), 2, cell.through_x.astype(jnp.int32))
-        rises = visits & cell.whole & (greater(on_diagonal, on_exit) > 0)
-        edge = materialise(jnp.where(rises, self._edge(ix, iy, kind, ahead=True), -1))
-        return jnp.where(visits, self._onwards(side, ix, iy, size, cell.out_x, cell.out_y), state), edge
-
-    def border(self, state: jax.Array, above: bool) -> Index:
-        """The edge by which a ray comes into the grid, see `_edge`; -1 where the ray is above it (below it, if not `above`)."""
-        _, ix, iy, _ = self._unpack(state)
-        z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ self.flip[0], iy ^ self.flip[1], self.first)
-        u, v = self.x - ix.astype(self.x.dtype), self.y - iy.astype(self.y.dtype)
-        through_x = self.distance_x(ix) >= self.distance_y(iy)
-        low = jnp.where(through_x, jnp.where(self.back_x, z10, z00), jnp.where(self.back_y, z01, z00))
-        high = jnp.where(through_x, jnp.where(self.back_x, z11, z01), jnp.where(self.back_y, z11, z10))
-        along = jnp.where(through_x, jnp.where(self.back_y, 1 - v, v), jnp.where(self.back_x, 1 - u, u))
-        gap = self._gap(jnp.zeros_like(u), low, high, along)
-        rises = walking(state) & (gap < 0 if above else gap > 0)
-        return jnp.where(rises, self._edge(ix, iy, through_x.astype(jnp.int32), ahead=False), -1)
-
-    def _edge(self, ix: Index, iy: Index, kind: Index, ahead: bool) -> Index:
-        """3 * its first vertex + its kind: of the sides by which the ray leaves or enters a cell that along x (0) or y (1), or
-        the diagonal (2)."""
-        flip_x, flip_y = self.flip
-        further_x, further_y = (kind == 1) & (self.back_x != ahead), (kind == 0) & (self.back_y != ahead)
-        x, y = (ix ^ flip_x) + further_x.astype(jnp.int32), (iy ^ flip_y) + further_y.astype(jnp.int32)
-        return 3 * (y * self.nx + x) + kind
 
     @property
     def begins_upper(self) -> Flag:
         """Whether the ray goes from the upper to the lower triangle where it crosses a diagonal."""
         return (self.rate > 0) != self.back_x
 
-    def _onwards(self, above: Flag, ix: Index, iy: Index, size: Index, out_x: Scalar, out_y: Scalar) -> jax.Array:
+    def onwards(self, above: Flag, ix: Index, iy: Index, size: Index, out_x: Scalar, out_y: Scalar) -> jax.Array:
         """The state in the next block; in one of twice the size where the ray also leaves this block's parent."""
         through_x = out_x <= out_y
         next_x, next_y = jnp.where(through_x, ix + size, ix), jnp.where(through_x, iy, iy + size)
@@ -329,7 +281,7 @@ class Walk(eqx.Module):
         across = line.astype(self.x.dtype) - self.along_diagonals
         return across, across * self.inv_rate
 
-    def _gap(self, t: Scalar, low: Scalar, high: Scalar, along: Scalar) -> Scalar:
+    def gap(self, t: Scalar, low: Scalar, high: Scalar, along: Scalar) -> Scalar:
         """g at the crossing of an edge; relative to the ray's own height first, so that a flat surface leaves no rounding."""
         along = lesser(greater(along, jnp.zeros_like(along)), jnp.ones_like(along))
         return t * self.dz - ((low - self.z_ray) + along * (high - low))

@@ -6,10 +6,10 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..core.ray import Ray
-from ..core.types import Flag, Index, Scalar
+from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import FAR, finite, lesser
 from ..xla.materialise import materialise
-from .grid import Grid, triangle_plane
+from .grid import Grid, height_over, triangle_plane
 from .hit import Hit
 from .walk import LEAVING, MISS, WALKING, Walk, reciprocal
 
@@ -46,6 +46,12 @@ def place_on_grid(grid: Grid, hit: Hit) -> tuple[Index, Index, Scalar, Scalar]:
     return cell[0], cell[1], hit.uv[0] * cells_x, hit.uv[1] * cells_y
 
 
+def point_on_grid(grid: Grid, hit: Hit) -> Vector:
+    """The point of a hit on the plane of its triangle, in the grid's frame."""
+    ix, iy, x, y = place_on_grid(grid, hit)
+    return jnp.stack([x, y, height_over(grid, ix, iy, hit.triangle == 1, x, y)])
+
+
 def walk_start(
     grid: Grid, ray: Ray, leaving: Hit | None, number: int, t_max: Scalar | None, active: Flag | None
 ) -> tuple[Walk, jax.Array, Flag]:
@@ -74,8 +80,7 @@ def walk_start(
     start = None if leaving is None else _surface_start(grid, leaving, number)
     if start is not None:
         away, at = start.active, start
-        a, b, c = triangle_plane(grid, at.ix, at.iy, at.upper)
-        on_triangle = c + a * (at.x - at.ix.astype(x.dtype)) + b * (at.y - at.iy.astype(y.dtype))
+        on_triangle = height_over(grid, at.ix, at.iy, at.upper, at.x, at.y)
         enters, t_start = enters | away, jnp.where(away, 0, t_start)
         x, y, z_ray = jnp.where(away, at.x, x), jnp.where(away, at.y, y), jnp.where(away, on_triangle, z_ray)
 

@@ -143,7 +143,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
     "cylinder": (
         "plain",
         case(jaxhf.Object(jaxhf.Cylinder())),
-        [everywhere(cylinder.make_tube), everywhere(cylinder.tube_distance), recognised(intersect, "Tube")],
+        [everywhere(cylinder.make_tube), everywhere(cylinder.tube_distance), everywhere(cylinder.hit_on_tube)],
     ),
     "skirt": (
         "plain",
