@@ -5,9 +5,10 @@ import dataclasses
 import math
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import Any, get_args
+from typing import Any
 
 from ..core.errors import UserError
+from ..core.rules import Whole
 from ..core.settings import Settings
 
 Option = tuple[tuple[str, ...], dict[str, Any]]
@@ -100,9 +101,9 @@ def _knob(field: "dataclasses.Field[Any]") -> Option:
     if field.type is bool:
         off, about = f"--no-{name}", f"leave out {about}"
         return option(off, dest=field.name, action="store_false", default=argparse.SUPPRESS, help=about)
-    kind = whole_number if int in (field.type, *get_args(field.type)) else str
-    about = f"{about} [{field.metadata.get('none', field.default)}]"
-    return option(f"--{name}", type=kind, metavar=field.metadata.get("metavar"), default=argparse.SUPPRESS, help=about)
+    kind, metavar = (whole_number, "N") if isinstance(field.metadata["rule"], Whole) else (str, None)
+    metavar, about = field.metadata.get("metavar", metavar), f"{about} [{field.metadata.get('none', field.default)}]"
+    return option(f"--{name}", type=kind, metavar=metavar, default=argparse.SUPPRESS, help=about)
 
 
 def settings(options: argparse.Namespace) -> Settings:

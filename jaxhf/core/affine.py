@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from .errors import ArgumentError, UserError
+from .errors import UserError
 from .powers import floor_to_power_of_two
 from .ray import Ray
-from .types import MOST, AnyArray, Vector, VectorLeaf
+from .rules import require
+from .types import AnyArray, Number, Vector, VectorLeaf
 
 
 class Affine(eqx.Module):
@@ -86,16 +87,20 @@ def rotate(degrees: float, x: float, y: float, z: float) -> Float[np.ndarray, "4
 
 def require_invertible(owner: str, name: str, matrix: Any) -> None:
     """Raises ArgumentError on a shape other than 4x4, a last row other than 0 0 0 1, nan, or a singular linear part."""
-    if matrix.shape != (4, 4):
-        raise ArgumentError(owner, name, f"must be a 4x4 matrix, its shape is {matrix.shape}")
-    if not isinstance(matrix, np.ndarray):
-        return
-    if not np.isfinite(matrix).all():
-        raise ArgumentError(owner, name, f"must be finite, it is {matrix.tolist()}")
-    if np.abs(matrix).max() > MOST:
-        raise ArgumentError(owner, name, f"must be within -{MOST:g} and {MOST:g}, it is {matrix.tolist()}")
+    require(owner, name, matrix, invertible)
+
+
+def invertible(matrix: Any) -> str | None:
+    """The rule of `require_invertible`."""
+    wrong = _MATRIX(matrix)
+    if wrong or not isinstance(matrix, np.ndarray):
+        return wrong
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        raise ArgumentError(owner, name, f"must be affine (last row 0 0 0 1), its last row is {matrix[3].tolist()}")
+        return f"must be affine (last row 0 0 0 1), its last row is {matrix[3].tolist()}"
     columns = np.abs(matrix[:3, :3]).max(axis=0)
     if not columns.all() or abs(np.linalg.det(matrix[:3, :3] / columns)) < 1e-12:
-        raise ArgumentError(owner, name, f"must be invertible, it flattens space: {matrix[:3, :3].tolist()}")
+        return f"must be invertible, it flattens space: {matrix[:3, :3].tolist()}"
+    return None
+
+
+_MATRIX = Number(shape=(4, 4), shape_words="be a 4x4 matrix")

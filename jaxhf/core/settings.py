@@ -4,10 +4,10 @@ import dataclasses
 import inspect
 import math
 import textwrap
-from dataclasses import field
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from .errors import ArgumentError, whole_number
+from .rules import OneOf, Rule, Whole, flag, require_fields
 
 Traversal = Literal["pyramid", "dda"]
 Shading = Literal["smooth", "flat"]
@@ -18,6 +18,16 @@ MOST_SAMPLES = 2**20  # of a grid of 1024 x 1024 in each pixel
 _MOST = 2**31 - 1
 
 
+def _setting(default: Any, rule: Rule, help: str, **more: str) -> Any:
+    """A field of `Settings`.
+
+    Args:
+      help: for its documentation and the command line's --help.
+      more: `none`, what None stands for, and `metavar`, what the command line calls the value; that is N for whole numbers.
+    """
+    return dataclasses.field(default=default, metadata={"rule": rule, "help": help, **more})
+
+
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """How a scene is rendered. Frozen and hashable, so that it can be a static argument of a compiled function.
@@ -25,67 +35,55 @@ class Settings:
     The metadata of each field holds its help, which the end of this docstring and the command line's --help are made from.
     """
 
-    traversal: Traversal = field(
-        default="pyramid",
-        metadata={
-            "help": "search for a ray's first hit: pyramid, which skips blocks of cells by their bounds (Tevs et al. 2008), or "
-            "dda, cell by cell (Amanatides and Woo 1987); the hits are the same, bit for bit",
-            "metavar": "SEARCH",
-        },
+    traversal: Traversal = _setting(
+        "pyramid",
+        OneOf(Traversal),
+        "search for a ray's first hit: pyramid, which skips blocks of cells by their bounds (Tevs et al. 2008), or "
+        "dda, cell by cell (Amanatides and Woo 1987); the hits are the same, bit for bit",
+        metavar="SEARCH",
     )
-    max_steps: int | None = field(
-        default=None,
-        metadata={
-            "help": "step budget of one search; a ray that exhausts it is black, and the AOVs status and exhausted say so",
-            "none": "as many as any ray needs",
-            "metavar": "N",
-        },
+    max_steps: int | None = _setting(
+        None,
+        Whole(1, _MOST),
+        "step budget of one search; a ray that exhausts it is black, and the AOVs status and exhausted say so",
+        none="as many as any ray needs",
     )
-    early_exit: bool = field(
-        default=True,
-        metadata={
-            "help": "the end of a search when all rays of its batch have ended; without it each search is a loop of max_steps "
-            "steps, or of as many as any ray needs, nothing else is skipped either where no ray needs it, and all views of "
-            "a scene take the same time; the hits are the same, bit for bit",
-        },
+    early_exit: bool = _setting(
+        True,
+        flag,
+        "the end of a search when all rays of its batch have ended; without it each search is a loop of max_steps "
+        "steps, or of as many as any ray needs, nothing else is skipped either where no ray needs it, and all views of "
+        "a scene take the same time; the hits are the same, bit for bit",
     )
-    shading: Shading = field(
-        default="smooth", metadata={"help": "smooth, by interpolated normals, or flat, by the triangle's own normal"}
+    shading: Shading = _setting(
+        "smooth", OneOf(Shading), "smooth, by interpolated normals, or flat, by the triangle's own normal"
     )
-    normals: NormalScheme | None = field(
-        default=None,
-        metadata={
-            "help": "normals at the vertices: central, of central differences; four, the mean of four triangles; the mean of "
-            "the six that touch the vertex, weighted by area (six), by angle (six-angle) or equally (six-equal)",
-            "none": "six, but in a fit six-angle where its pictures show that",
-            "metavar": "SCHEME",
-        },
+    normals: NormalScheme | None = _setting(
+        None,
+        OneOf(NormalScheme),
+        "normals at the vertices: central, of central differences; four, the mean of four triangles; the mean of "
+        "the six that touch the vertex, weighted by area (six), by angle (six-angle) or equally (six-equal)",
+        none="six, but in a fit six-angle where its pictures show that",
+        metavar="SCHEME",
     )
-    shadows: bool = field(default=True, metadata={"help": "shadows of every light but the sky, which casts none"})
-    samples: int | None = field(
-        default=None,
-        metadata={
-            "help": "rays a pixel, a square number: the centres of a regular n x n grid",
-            "none": "the scene's, rounded up to a square",
-            "metavar": "N",
-        },
+    shadows: bool = _setting(True, flag, "shadows of every light but the sky, which casts none")
+    samples: int | None = _setting(
+        None,
+        Whole(1, MOST_SAMPLES),
+        "rays a pixel, a square number: the centres of a regular n x n grid",
+        none="the scene's, rounded up to a square",
     )
-    max_depth: int = field(
-        default=4, metadata={"help": "mirror bounces of a ray, beyond which the rest counts as black", "metavar": "N"}
+    max_depth: int = _setting(4, Whole(0, _MOST), "mirror bounces of a ray, beyond which the rest counts as black")
+    edge_samples: int | None = _setting(
+        None,
+        Whole(0, _MOST),
+        "points on terrain edges, in all, at which the derivative of moving silhouettes and shadow boundaries is "
+        "taken, and about as many samples more in the pixels that see them, see docs/concepts/boundary.md; 0: the "
+        "derivative that each sample has by itself, no more; a picture that is not differentiated takes none",
+        none="0, but in a fit, which chooses by what its scenes show",
     )
-    edge_samples: int | None = field(
-        default=None,
-        metadata={
-            "help": "points on terrain edges, in all, at which the derivative of moving silhouettes and shadow boundaries is "
-            "taken, and about as many samples more in the pixels that see them, see docs/concepts/boundary.md; 0: the "
-            "derivative that each sample has by itself, no more; a picture that is not differentiated takes none",
-            "none": "0, but in a fit, which chooses by what its scenes show",
-            "metavar": "N",
-        },
-    )
-    chunk: int = field(
-        default=1024,
-        metadata={"help": "rays traced together, rounded down to a square of 8 x 8, 16 x 16, ... pixels", "metavar": "RAYS"},
+    chunk: int = _setting(
+        1024, Whole(64), "rays traced together, rounded down to a square of 8 x 8, 16 x 16, ... pixels", metavar="RAYS"
     )
 
     @classmethod
@@ -104,24 +102,9 @@ class Settings:
         return cls(samples=64, edge_samples=300_000)
 
     def __post_init__(self):
-        for name, kind in (("traversal", Traversal), ("shading", Shading), ("normals", NormalScheme)):
-            if getattr(self, name) not in get_args(kind) and (name, getattr(self, name)) != ("normals", None):
-                raise ArgumentError(
-                    "Settings", name, f"must be one of {', '.join(get_args(kind))}; it is {getattr(self, name)!r}"
-                )
-        for name in ("early_exit", "shadows"):
-            if not isinstance(getattr(self, name), bool):
-                raise ArgumentError("Settings", name, f"must be True or False, it is {getattr(self, name)!r}")
-        for name, least in (("max_steps", 1), ("samples", 1), ("max_depth", 0), ("edge_samples", 0), ("chunk", 64)):
-            value = whole_number(getattr(self, name))
-            object.__setattr__(self, name, value)
-            if value is None and name in ("max_steps", "samples", "edge_samples"):
-                continue
-            if not isinstance(value, int) or isinstance(value, bool) or value < least:
-                raise ArgumentError("Settings", name, f"must be a whole number from {least} on, it is {value!r}")
-            most = MOST_SAMPLES if name == "samples" else _MOST
-            if name != "chunk" and value > most:
-                raise ArgumentError("Settings", name, f"must be at most {most}, it is {value}")
+        for knob in dataclasses.fields(self):
+            object.__setattr__(self, knob.name, whole_number(getattr(self, knob.name)))
+        require_fields(self)
         if self.chunk > _MOST_CHUNK:
             rule = f"must be at most {_MOST_CHUNK}, it is {self.chunk}; with 1024, the default, rays are traced fastest"
             raise ArgumentError("Settings", "chunk", rule)

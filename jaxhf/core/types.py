@@ -1,6 +1,7 @@
-"""Array aliases with named axes, and the one rule for what becomes a leaf of a scene."""
+"""Array aliases with named axes, what becomes a leaf of a scene, and the rules that numbers keep."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,19 +96,36 @@ def rgb_leaf(value: Any) -> Any:
     return leaf
 
 
-def require_number(owner: str, name: str, leaf: Any) -> None:
-    """Raises ArgumentError on anything but a single number."""
-    if leaf.shape != ():
-        raise ArgumentError(owner, name, f"must be one number, its shape is {leaf.shape}")
+class Number(NamedTuple):
+    """The rule of a number, or of an array. What is JAX's, and so may be traced, is asked for its shape alone.
+
+    Attributes:
+      words: what it must, "be positive and finite".
+      holds: whether it does, number by number; none may be beyond `MOST`.
+      shape: of the array; None: any.
+      shape_words: that shape in words, "hold three numbers".
+    """
+
+    words: str = "be finite"
+    holds: Callable[[Any], Any] = np.isfinite
+    shape: tuple[int, ...] | None = ()
+    shape_words: str = "be one number"
+
+    def __call__(self, value: Any) -> str | None:
+        if self.shape is not None and np.shape(value) != self.shape:
+            return f"must {self.shape_words}, its shape is {np.shape(value)}"
+        if isinstance(value, jax.Array):
+            return None
+        given = np.asarray(value)
+        for words, holds in ((self.words, self.holds(given)), (f"be within -{MOST:g} and {MOST:g}", np.abs(given) <= MOST)):
+            if not np.all(holds):
+                return f"must {words}, it is {given.tolist()}"
+        return None
 
 
-def require_finite(owner: str, name: str, leaf: Any) -> None:
-    """Raises ArgumentError where a value that is known now, not traced, holds a nan, an inf, or more than `MOST`."""
-    if not isinstance(leaf, np.ndarray):
-        return
-    if not np.isfinite(leaf).all():
-        raise ArgumentError(owner, name, f"must be finite, it is {np.array2string(leaf, separator=', ')}")
-    if not (np.abs(leaf) <= MOST).all():
-        raise ArgumentError(
-            owner, name, f"must be within -{MOST:g} and {MOST:g}, it is {np.array2string(leaf, separator=', ')}"
-        )
+FINITE = Number()
+NUMBERS = Number(shape=None)
+POSITIVE = Number("be positive and finite", lambda value: 0 < value < np.inf)
+ANGLE_OF_VIEW = Number("lie between 0 and 180 degrees", lambda value: 0 < value < 180)
+VECTOR = Number(shape=(3,), shape_words="hold three numbers")
+COLOUR = Number(shape=(3,), shape_words="be one number or three")  # one is a grey, see `rgb_leaf`

@@ -11,8 +11,9 @@ from jax.core import Tracer
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, UserError, kind_of
+from ..core.rules import require
 from ..core.settings import Settings
-from ..core.types import AnyArray, array_leaf, float_leaf, height_leaf, require_finite
+from ..core.types import NUMBERS, AnyArray, Number, array_leaf, float_leaf, height_leaf
 from ..rendering.render import heightfield_grids
 from ..scene.heightfield import Heightfield
 from ..trace.grid import Grid, make_grid
@@ -135,22 +136,20 @@ def as_numbers(owner: str, name: str, value: Any, dtype: Any) -> jax.Array:
         raise ArgumentError(owner, name, f"must be numbers, it is {kind_of(value)}") from error
 
 
-def known_numbers(owner: str, name: str, value: Any) -> Any:
-    """See `float_leaf`; ArgumentError where an argument is something else, or not finite and not traced."""
+def known_numbers(owner: str, name: str, value: Any, rule: Number = NUMBERS) -> Any:
+    """See `float_leaf`; ArgumentError where an argument is something else, or breaks a rule and is not traced."""
     try:
         leaf = float_leaf(value)
     except UserError as error:
         raise ArgumentError(owner, name, f"must be numbers, it is {kind_of(value)}") from error
-    require_finite(owner, name, leaf)
+    require(owner, name, leaf, rule)
     return leaf
 
 
 def number_pair(owner: str, name: str, value: Any) -> tuple[float, float]:
     """Two numbers that are known and finite."""
-    given = np.asarray(known_numbers(owner, name, value))
-    if given.shape != (2,):
-        raise ArgumentError(owner, name, f"must be two numbers, it is {value!r}")
-    return float(given[0]), float(given[1])
+    first, second = known_numbers(owner, name, value, Number(shape=(2,), shape_words="be two numbers"))
+    return float(first), float(second)
 
 
 def search_grid(data: Float[jax.Array, "nrow ncol"]) -> Grid:

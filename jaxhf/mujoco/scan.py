@@ -1,7 +1,7 @@
 """Height scans: the heights of the ground round a robot, at places that move with it."""
 
 import functools
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -14,7 +14,8 @@ from jaxtyping import Float
 from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, require_kind
 from ..core.ray import Ray
-from ..core.types import Point2, Scalar, Vector, require_number
+from ..core.rules import OneOf, require
+from ..core.types import FINITE, POSITIVE, Point2, Scalar, Vector
 from ..trace.status import Status
 from ..trace.triangle import plane_through
 from ..trace.walk import WalkResult
@@ -42,8 +43,7 @@ def grid_pattern(size: tuple[float, float] = (1.6, 1.0), resolution: float = 0.1
     sides = number_pair("grid_pattern", "size", size)
     if min(sides) < 0:
         raise ArgumentError("grid_pattern", "size", f"must not be negative, it is {size!r}")
-    if not 0 < resolution < np.inf:
-        raise ArgumentError("grid_pattern", "resolution", f"must be positive and finite, it is {resolution!r}")
+    require("grid_pattern", "resolution", float(resolution), POSITIVE)
     x, y = (np.arange(-length / 2, length / 2 + 1e-9, resolution) for length in sides)
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
 
@@ -75,10 +75,8 @@ def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, of
     """
     owner = "height_scan"
     pos, quat, places = on_sensors(owner, hfields, pos, quat, grid_pattern() if pattern is None else pattern, 2)
-    if align not in get_args(Align):
-        raise ArgumentError(owner, "align", f"must be one of {', '.join(get_args(Align))}; it is {align!r}")
-    offset = known_numbers(owner, "offset", offset)
-    require_number(owner, "offset", offset)
+    require(owner, "align", align, OneOf(Align))
+    offset = known_numbers(owner, "offset", offset, FINITE)
     starts = _starts(pos, quat, jnp.asarray(offset, pos.dtype), align=align)
     if hfields.upright and align != "base":
         return _look_up(hfields, starts, places)

@@ -7,7 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import ArgumentError, whole_number
+from ..core.errors import ArgumentError
+from ..core.rules import Whole, require
+from ..core.types import ANGLE_OF_VIEW, POSITIVE
 from ..scene.camera import require_size
 from ..xla.compilation import compiled
 from ..xla.transfers import takes_numbers
@@ -37,14 +39,10 @@ def lidar_pattern(
       ValueError: no channel, a resolution that is not positive, azimuths that do not rise.
     """
     owner = "lidar_pattern"
-    if not isinstance(whole_number(channels), int) or channels < 1:
-        raise ArgumentError(owner, "channels", f"must be a whole number from 1 on, it is {channels!r}")
-    if not 0 < resolution < np.inf:
-        raise ArgumentError(owner, "resolution", f"must be positive and finite, it is {resolution!r}")
-    (first, last), elevations = (
-        number_pair(owner, "horizontal_fov", horizontal_fov),
-        number_pair(owner, "vertical_fov", vertical_fov),
-    )
+    require(owner, "channels", channels, Whole(1))
+    require(owner, "resolution", float(resolution), POSITIVE)
+    first, last = number_pair(owner, "horizontal_fov", horizontal_fov)
+    elevations = number_pair(owner, "vertical_fov", vertical_fov)
     if not last > first:
         raise ArgumentError(owner, "horizontal_fov", f"must rise from the first to the last azimuth, it is {horizontal_fov!r}")
     steps = int(np.ceil((last - first) / resolution - 1e-9))
@@ -97,8 +95,7 @@ def depth_image(
       ValueError: shapes that do not fit, a size below 1, a fovy that is not between 0 and 180, focal lengths that are not
         positive.
     """
-    if not 0 < fovy < 180:
-        raise ArgumentError("depth_image", "fovy", f"must lie between 0 and 180 degrees, it is {fovy}")
+    require("depth_image", "fovy", float(fovy), ANGLE_OF_VIEW)
     require_size("depth_image", width, height)
     f = height / 2 / np.tan(np.radians(fovy) / 2)
     fx, fy, cx, cy = (f, f, width / 2, height / 2) if intrinsics is None else _lens(intrinsics)

@@ -1,6 +1,6 @@
 """Cameras: from a point of the picture to a ray in the world, and back."""
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -8,16 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.affine import Affine, affine, require_invertible
+from ..core.affine import Affine, affine, invertible
 from ..core.errors import ArgumentError, whole_number
 from ..core.ray import Ray
-from ..core.types import MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf, require_finite, require_number
+from ..core.rules import OneOf, Whole, require
+from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, VECTOR, MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf
 from ..core.vector import dot, unit
 from .framing import framing_pose
 from .heightfield import Heightfield
-from .show import known, numbers
+from .record import Record, known, numbers
 
 Convention = Literal["opencv", "opengl"]
+_PIXELS = Whole(1, unit="pixels")  # along a side of a picture
 
 
 class Projection(eqx.Module):
@@ -44,7 +46,7 @@ class Projection(eqx.Module):
         return Projection(jnp.stack(columns, axis=1), self(world.offset))
 
 
-class Perspective(eqx.Module):
+class Perspective(Record):
     """A pinhole camera.
 
     Attributes:
@@ -54,17 +56,11 @@ class Perspective(eqx.Module):
       width, height: of the picture, pixels.
     """
 
-    world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf)
-    fov: ScalarLeaf = eqx.field(converter=float_leaf, default=45.0)
-    width: int = eqx.field(converter=whole_number, static=True, default=512)
-    height: int = eqx.field(converter=whole_number, static=True, default=512)
+    world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf, metadata={"rule": invertible})
+    fov: ScalarLeaf = eqx.field(converter=float_leaf, default=45.0, metadata={"rule": ANGLE_OF_VIEW})
+    width: int = eqx.field(converter=whole_number, static=True, default=512, metadata={"rule": _PIXELS})
+    height: int = eqx.field(converter=whole_number, static=True, default=512, metadata={"rule": _PIXELS})
     _ahead: ScalarLeaf | None = eqx.field(default=None, kw_only=True)  # see `localise_camera`
-
-    def __check_init__(self):
-        _check_camera(self)
-        require_number("Perspective", "fov", self.fov)
-        if isinstance(self.fov, np.ndarray) and not 0 < self.fov < 180:
-            raise ArgumentError("Perspective", "fov", f"must lie between 0 and 180 degrees, it is {self.fov}")
 
     @classmethod
     def look_at(
@@ -102,17 +98,11 @@ class Perspective(eqx.Module):
         Raises:
           ValueError: focal lengths that are not positive, a matrix that is no pose, an unknown convention.
         """
-        if convention not in get_args(Convention):
-            raise ArgumentError(
-                "from_intrinsics", "convention", f"must be one of {', '.join(get_args(Convention))}; it is {convention!r}"
-            )
+        require("from_intrinsics", "convention", convention, OneOf(Convention))
         require_size("from_intrinsics", width, height)
         lens = {"fx": float_leaf(fx), "fy": float_leaf(fy), "cx": float_leaf(cx), "cy": float_leaf(cy)}
         for name, leaf in lens.items():
-            require_number("from_intrinsics", name, leaf)
-            require_finite("from_intrinsics", name, leaf)
-            if name in ("fx", "fy") and isinstance(leaf, np.ndarray) and not leaf > 0:
-                raise ArgumentError("from_intrinsics", name, f"must be positive, it is {leaf}")
+            require("from_intrinsics", name, leaf, POSITIVE if name in ("fx", "fy") else FINITE)
         pose = float_leaf(world_from_camera)
         _require_pose(pose)
         leaves, xp = [pose, *lens.values()], np
@@ -187,7 +177,7 @@ class Perspective(eqx.Module):
         return _shown(self, f"fov={numbers(self.fov)}")
 
 
-class Orthographic(eqx.Module):
+class Orthographic(Record):
     """A camera whose rays are parallel.
 
     Attributes:
@@ -196,17 +186,11 @@ class Orthographic(eqx.Module):
       width, height: of the picture, pixels.
     """
 
-    world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf)
-    extent: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
-    width: int = eqx.field(converter=whole_number, static=True, default=512)
-    height: int = eqx.field(converter=whole_number, static=True, default=512)
+    world_from_camera: MatrixLeaf = eqx.field(converter=float_leaf, metadata={"rule": invertible})
+    extent: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0, metadata={"rule": POSITIVE})
+    width: int = eqx.field(converter=whole_number, static=True, default=512, metadata={"rule": _PIXELS})
+    height: int = eqx.field(converter=whole_number, static=True, default=512, metadata={"rule": _PIXELS})
     _ahead: ScalarLeaf | None = eqx.field(default=None, kw_only=True)  # see `localise_camera`
-
-    def __check_init__(self):
-        _check_camera(self)
-        require_number("Orthographic", "extent", self.extent)
-        if isinstance(self.extent, np.ndarray) and not 0 < self.extent < np.inf:
-            raise ArgumentError("Orthographic", "extent", f"must be positive and finite, it is {self.extent}")
 
     @classmethod
     def look_at(
@@ -281,9 +265,7 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
     eye, target, up = float_leaf(eye), float_leaf(target), float_leaf(up)
     leaves = {"eye": eye, "target": target, "up": up}
     for name, leaf in leaves.items():
-        if leaf.shape != (3,):
-            raise ArgumentError("look_at", name, f"must hold three numbers, its shape is {leaf.shape}")
-        require_finite("look_at", name, leaf)
+        require("look_at", name, leaf, VECTOR)
     host = all(isinstance(leaf, np.ndarray) for leaf in leaves.values())
     xp = np if host else jnp
 
@@ -305,7 +287,7 @@ def _look_at(eye: Any, target: Any, up: Any) -> Any:
 
 def _require_pose(matrix: Any) -> None:
     """Raises ArgumentError on a matrix that does more than rotate and translate, as the wrong one of two would."""
-    require_invertible("from_intrinsics", "world_from_camera", matrix)
+    require("from_intrinsics", "world_from_camera", matrix, invertible)
     if isinstance(matrix, np.ndarray):
         turn = matrix[:3, :3]
         if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
@@ -315,12 +297,6 @@ def _require_pose(matrix: Any) -> None:
 
 
 def require_size(owner: str, width: Any, height: Any) -> None:
-    for side, value in (("width", width), ("height", height)):
-        if not isinstance(whole_number(value), int) or value < 1:
-            raise ArgumentError(owner, side, f"must be a whole number of pixels from 1 on, it is {value!r}")
-
-
-def _check_camera(camera: Camera) -> None:
-    kind = type(camera).__name__
-    require_invertible(kind, "world_from_camera", camera.world_from_camera)
-    require_size(kind, camera.width, camera.height)
+    """ArgumentError where a picture cannot have this size."""
+    require(owner, "width", width, _PIXELS)
+    require(owner, "height", height, _PIXELS)

@@ -4,11 +4,11 @@ import equinox as eqx
 import numpy as np
 
 from ..core.errors import ArgumentError
-from ..core.types import ScalarLeaf, float_leaf, require_finite, require_number
-from .show import fields
+from ..core.types import FINITE, POSITIVE, ScalarLeaf, float_leaf
+from .record import Record
 
 
-class Cylinder(eqx.Module):
+class Cylinder(Record):
     """A cylinder about the z axis of its object's frame, without caps; seen from both sides.
 
     (u, v): u = phi / 2 pi with phi = atan2(y, x) in [0, 2 pi), v runs from z_min to z_max (pbrt-v2, `Shape "cylinder"`).
@@ -17,19 +17,10 @@ class Cylinder(eqx.Module):
       radius, z_min, z_max: object units.
     """
 
-    radius: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
-    z_min: ScalarLeaf = eqx.field(converter=float_leaf, default=-1.0)
-    z_max: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0)
+    radius: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0, metadata={"rule": POSITIVE})
+    z_min: ScalarLeaf = eqx.field(converter=float_leaf, default=-1.0, metadata={"rule": FINITE})
+    z_max: ScalarLeaf = eqx.field(converter=float_leaf, default=1.0, metadata={"rule": FINITE})
 
-    def __check_init__(self):
-        for name in ("radius", "z_min", "z_max"):
-            require_number("Cylinder", name, getattr(self, name))
-        if isinstance(self.radius, np.ndarray) and not 0 < self.radius < np.inf:
-            raise ArgumentError("Cylinder", "radius", f"must be positive, it is {self.radius}")
+    def _require_consistent(self):
         if isinstance(self.z_min, np.ndarray) and isinstance(self.z_max, np.ndarray) and not self.z_min < self.z_max:
             raise ArgumentError("Cylinder", "z_min", f"must lie below z_max, they are {self.z_min} and {self.z_max}")
-        require_finite("Cylinder", "z_min", self.z_min)
-        require_finite("Cylinder", "z_max", self.z_max)
-
-    def __repr__(self) -> str:
-        return fields(self)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from ..core.errors import ArgumentError, require_kind
 from ..core.powers import next_power_of_two
 from ..core.types import AnyArray, height_leaf
-from .show import known, number, numbers
+from .record import known, number, numbers
 
 # So that a walk's state fits into 32 bits; each side of the grid counts as the next power of two.
 MOST_CELLS = 2**28

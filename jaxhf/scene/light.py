@@ -8,14 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..core.errors import ArgumentError, whole_number
-from ..core.types import ScalarLeaf, VectorLeaf, float_leaf, require_finite, require_number, rgb_leaf
-from .show import fields
+from ..core.rules import Whole
+from ..core.types import COLOUR, VECTOR, Number, ScalarLeaf, VectorLeaf, float_leaf, rgb_leaf
+from .record import Record
 from .sun import sun
 
 D = TypeVar("D", bound="Directional")
+_DIAMETER = Number("be above 0 and at most 10 degrees", lambda value: 0 < value <= 10)
 
 
-class Directional(eqx.Module):
+class Directional(Record):
     """Parallel light from infinitely far away.
 
     Attributes:
@@ -25,20 +27,16 @@ class Directional(eqx.Module):
       radiance: what the argument `irradiance` was called until 0.1; gives a DeprecationWarning.
     """
 
-    towards: VectorLeaf
-    irradiance: VectorLeaf
+    towards: VectorLeaf = eqx.field(converter=float_leaf, metadata={"rule": VECTOR})
+    irradiance: VectorLeaf = eqx.field(converter=rgb_leaf, metadata={"rule": COLOUR})
 
     def __init__(self, towards: Any, irradiance: Any = None, *, radiance: Any = None):
-        self.towards = float_leaf(towards)
-        self.irradiance = rgb_leaf(_chosen(irradiance, radiance, 5))  # two frames between are Equinox's
-        owner = type(self).__name__
-        _require_vector(owner, "towards", self.towards)
-        _require_vector(owner, "irradiance", self.irradiance)
-        if isinstance(self.towards, np.ndarray) and not self.towards.any():
-            raise ArgumentError(owner, "towards", "must not be zero, it is [0, 0, 0]")
+        self.towards = towards
+        self.irradiance = _chosen(irradiance, radiance, 5)  # two frames between are Equinox's
 
-    def __repr__(self) -> str:
-        return fields(self)
+    def _require_consistent(self):
+        if isinstance(self.towards, np.ndarray) and not self.towards.any():
+            raise ArgumentError(type(self).__name__, "towards", "must not be zero, it is [0, 0, 0]")
 
     @classmethod
     def from_angles(
@@ -100,29 +98,23 @@ class Sun(Directional):
         them: 32 keep behind a tower to 0.8 % what 8 keep to 4 %, see docs/measurements/settings.md.
     """
 
-    angular_diameter: ScalarLeaf
-    chords: int = eqx.field(static=True)
+    angular_diameter: ScalarLeaf = eqx.field(converter=float_leaf, metadata={"rule": _DIAMETER})
+    chords: int = eqx.field(converter=whole_number, static=True, default=8, metadata={"rule": Whole(1)})
 
     def __init__(
         self, towards: Any, irradiance: Any = None, angular_diameter: Any = 0.53, chords: Any = 8, *, radiance: Any = None
     ):
         super().__init__(towards, irradiance, radiance=radiance)
+        self.angular_diameter, self.chords = angular_diameter, chords
+
+    def _require_consistent(self):
+        super()._require_consistent()
         if isinstance(self.towards, np.ndarray) and not self.towards[2] > 0:
             altitude = np.rad2deg(np.arctan2(self.towards[2], np.hypot(*self.towards[:2])))
             raise ArgumentError("Sun", "towards", f"must point above the horizon, its altitude is {altitude:.2f} degrees")
-        self.angular_diameter, self.chords = float_leaf(angular_diameter), whole_number(chords)
-        if type(self.chords) is not int or self.chords < 1:
-            raise ArgumentError("Sun", "chords", f"must be a whole number from 1 on, it is {self.chords!r}")
-        require_number("Sun", "angular_diameter", self.angular_diameter)
-        if isinstance(self.angular_diameter, np.ndarray) and not 0 < self.angular_diameter <= 10:
-            rule = f"must be above 0 and at most 10 degrees, it is {self.angular_diameter}"
-            raise ArgumentError("Sun", "angular_diameter", rule)
-
-    def __repr__(self) -> str:
-        return fields(self).replace(", chords=8)", ")")
 
 
-class Point(eqx.Module):
+class Point(Record):
     """A point that shines equally in every direction.
 
     Attributes:
@@ -130,18 +122,11 @@ class Point(eqx.Module):
       intensity: power per solid angle, one number or (r, g, b); the irradiance at distance r is intensity / r².
     """
 
-    p: VectorLeaf = eqx.field(converter=float_leaf)
-    intensity: VectorLeaf = eqx.field(converter=rgb_leaf, default=1.0)
-
-    def __check_init__(self):
-        _require_vector("Point", "p", self.p)
-        _require_vector("Point", "intensity", self.intensity)
-
-    def __repr__(self) -> str:
-        return fields(self)
+    p: VectorLeaf = eqx.field(converter=float_leaf, metadata={"rule": VECTOR})
+    intensity: VectorLeaf = eqx.field(converter=rgb_leaf, default=1.0, metadata={"rule": COLOUR})
 
 
-class Sky(eqx.Module):
+class Sky(Record):
     """A sky of one colour: the background of the picture, and diffuse light from the upper hemisphere.
 
     A surface tilted by beta against the horizontal sees the share (1 + cos beta) / 2 of the sky, the isotropic sky of
@@ -154,16 +139,8 @@ class Sky(eqx.Module):
         are good for some per cent. The visible sky is computed at the vertices and interpolated between them. None: in none.
     """
 
-    radiance: VectorLeaf = eqx.field(converter=rgb_leaf)
-    occlusion: int | None = eqx.field(converter=whole_number, static=True, default=None)
-
-    def __check_init__(self):
-        _require_vector("Sky", "radiance", self.radiance)
-        if self.occlusion is not None and (type(self.occlusion) is not int or self.occlusion < 1):
-            raise ArgumentError("Sky", "occlusion", f"must be a whole number from 1 on, or None, it is {self.occlusion!r}")
-
-    def __repr__(self) -> str:
-        return fields(self).replace(", occlusion=None)", ")")
+    radiance: VectorLeaf = eqx.field(converter=rgb_leaf, metadata={"rule": COLOUR})
+    occlusion: int | None = eqx.field(converter=whole_number, static=True, default=None, metadata={"rule": Whole(1)})
 
 
 Light = Directional | Sun | Point | Sky
@@ -182,9 +159,3 @@ def _chosen(irradiance: Any, radiance: Any, stacklevel: int) -> Any:
         raise ArgumentError("Directional", "radiance", "must stand without irradiance, whose old name it is")
     warnings.warn("Directional: radiance is now called irradiance", DeprecationWarning, stacklevel=stacklevel)
     return radiance
-
-
-def _require_vector(owner: str, name: str, leaf: VectorLeaf) -> None:
-    if leaf.shape != (3,):
-        raise ArgumentError(owner, name, f"must hold three numbers, its shape is {leaf.shape}")
-    require_finite(owner, name, leaf)

@@ -9,7 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from ..core.errors import ArgumentError, UserError
+from ..core.errors import ArgumentError
+from ..core.rules import Whole, require
+from ..core.types import POSITIVE, Number
 from .heightfield import MOST_CELLS
 
 Pair = Sequence[float]
@@ -52,8 +54,7 @@ def waves(
       lengths: (shortest, longest) wave, as parts of the field's longer side.
       range: (lowest, highest).
     """
-    if count < 1:
-        raise ArgumentError("", "count", f"must be from 1 on, it is {count}")
+    require("", "count", count, Whole(1))
     if not 0 < lengths[0] <= lengths[1]:
         raise ArgumentError("", "lengths", f"must be (shortest, longest), both positive, they are {list(lengths)}")
     x, y = _positions(size)
@@ -78,8 +79,8 @@ def bumps(
       radius: their standard deviation, as a part of the field's longer side.
       range: (lowest, highest).
     """
-    if count < 1 or not radius > 0:
-        raise UserError(f"count and radius must be positive, they are {count} and {radius}")
+    require("", "count", count, Whole(1))
+    require("", "radius", radius, POSITIVE)
     x, y = _positions(size)
     total = np.zeros(np.shape(x))
     for along_x, along_y in _generator(seed).random((count, 2)):
@@ -93,8 +94,7 @@ def grid(size: Sequence[int], lines: int = 10) -> Float[np.ndarray, "h w 3"]:
     Returns:
       Linear colours, shape (h, w, 3).
     """
-    if lines < 1:
-        raise ArgumentError("", "lines", f"must be from 1 on, it is {lines}")
+    require("", "lines", lines, Whole(1))
     u, v = _texel_centres(size)
     h, w = size
     colour = np.stack(np.broadcast_arrays(0.25 + 0.65 * u, 0.25 + 0.65 * v, 0.35), axis=-1)
@@ -114,8 +114,7 @@ def checker(
     Returns:
       Linear colours, shape (h, w, 3).
     """
-    if squares < 1:
-        raise ArgumentError("", "squares", f"must be from 1 on, it is {squares}")
+    require("", "squares", squares, Whole(1))
     u, v = _texel_centres(size)
     odd = (np.floor(u * squares) + np.floor(v * squares)) % 2
     return _painted(np.broadcast_to(first, (*odd.shape, 3)), odd, second)
@@ -145,10 +144,8 @@ def sky(
     Returns:
       Linear colours, shape (h, w, 3).
     """
-    if not 0 <= clouds <= 1:
-        raise ArgumentError("", "clouds", f"must lie in 0..1, it is {clouds}")
-    if not sun_radius > 0:
-        raise ArgumentError("", "sun_radius", f"must be positive, it is {sun_radius}")
+    require("", "clouds", clouds, Number("lie in 0..1", lambda value: 0 <= value <= 1))
+    require("", "sun_radius", sun_radius, POSITIVE)
     u, v = _texel_centres(size)
     h, w = size
     colour = _painted(np.broadcast_to(horizon, (*np.broadcast_shapes(u.shape, v.shape), 3)), 1 - (1 - v) ** 2.5, zenith)
@@ -168,8 +165,7 @@ TEXTURES = {"grid": grid, "checker": checker, "sky": sky}
 
 
 def _generator(seed: int) -> np.random.Generator:
-    if seed < 0:
-        raise ArgumentError("", "seed", f"must be non-negative, it is {seed}")
+    require("", "seed", seed, Whole(0))
     return np.random.default_rng(seed)
 
 

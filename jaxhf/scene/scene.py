@@ -2,14 +2,15 @@
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, get_args
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ..core.affine import require_invertible
-from ..core.errors import ArgumentError, UserError, kind_of, whole_number
+from ..core.affine import invertible
+from ..core.errors import ArgumentError, UserError, kind_of, require_kind, whole_number
+from ..core.rules import Whole
 from ..core.settings import MOST_SAMPLES
 from ..core.types import AnyArray, MatrixLeaf, float_leaf, height_leaf
 from .camera import Camera
@@ -17,7 +18,7 @@ from .cylinder import Cylinder
 from .heightfield import Heightfield
 from .light import Light, Sky, Sun
 from .material import Material, Matte
-from .show import numbers
+from .record import Record, numbers
 from .skirt import Skirt
 
 Shape = Heightfield | Cylinder | Skirt
@@ -29,7 +30,7 @@ def _listed(values: Any) -> tuple[Any, ...]:
     return tuple(values)
 
 
-class Object(eqx.Module):
+class Object(Record):
     """A shape with its material and its transform.
 
     Attributes:
@@ -39,26 +40,24 @@ class Object(eqx.Module):
     """
 
     shape: Shape
-    material: Material = eqx.field(default_factory=lambda: Matte(0.7))
-    world_from_object: MatrixLeaf | None = None
+    material: Material
+    world_from_object: MatrixLeaf | None = eqx.field(default=None, metadata={"rule": invertible})
 
     def __init__(self, shape: Shape, material: Material | None = None, world_from_object: Any = None):
         self.shape = shape
         self.material = Matte(0.7) if material is None else material
         self.world_from_object = None if world_from_object is None else float_leaf(world_from_object)
-        if not isinstance(shape, Shape):
-            raise ArgumentError("Object", "shape", f"must be a Heightfield, Cylinder or Skirt, it is {type(shape).__name__}")
-        if not isinstance(self.material, Material):
-            raise ArgumentError("Object", "material", f"must be Matte or Mirror, it is {type(self.material).__name__}")
-        if self.world_from_object is not None:
-            require_invertible("Object", "world_from_object", self.world_from_object)
+
+    def _require_consistent(self):
+        require_kind("Object", "shape", self.shape, get_args(Shape), "a Heightfield, Cylinder or Skirt")
+        require_kind("Object", "material", self.material, get_args(Material), "Matte or Mirror")
 
     def __repr__(self) -> str:
         pose = "" if self.world_from_object is None else f", world_from_object={numbers(self.world_from_object)}"
         return f"Object({self.shape!r}, {self.material!r}{pose})"
 
 
-class Scene(eqx.Module):
+class Scene(Record):
     """Objects, the camera that sees them, and the lights.
 
     Attributes:
@@ -71,9 +70,9 @@ class Scene(eqx.Module):
     objects: tuple[Object, ...] = eqx.field(converter=_listed)
     camera: Camera
     lights: tuple[Light, ...] = eqx.field(converter=_listed, default=())
-    samples: int = eqx.field(converter=whole_number, static=True, default=1)
+    samples: int = eqx.field(converter=whole_number, static=True, default=1, metadata={"rule": Whole(1, MOST_SAMPLES)})
 
-    def __check_init__(self):
+    def _require_consistent(self):
         if not self.objects:
             raise ArgumentError("Scene", "objects", "must hold at least one Object, it is empty")
         for name, values, kinds in (
@@ -93,10 +92,6 @@ class Scene(eqx.Module):
                 if isinstance(obj.shape, (Heightfield | Skirt) if sun else Heightfield) and not _upright(obj.world_from_object):
                     rule = f"must keep heights upright under a {'Sun' if sun else 'Sky with occlusion'}"
                     raise ArgumentError("Scene", f"objects[{number}].world_from_object", rule)
-        if not isinstance(self.samples, int) or self.samples < 1:
-            raise ArgumentError("Scene", "samples", f"must be a whole number from 1 on, it is {self.samples!r}")
-        if self.samples > MOST_SAMPLES:
-            raise ArgumentError("Scene", "samples", f"must be at most {MOST_SAMPLES}, it is {self.samples}")
 
     @property
     def sky_occlusion(self) -> int | None:

@@ -11,9 +11,10 @@ from jax.core import Tracer
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
-from ..core.types import AnyArray, ScalarLeaf, float_leaf, height_leaf, require_finite, require_number
+from ..core.rules import require
+from ..core.types import FINITE, AnyArray, ScalarLeaf, float_leaf, height_leaf
 from .heightfield import Heightfield
-from .show import number, numbers
+from .record import number, numbers
 
 _border = functools.partial(height_leaf, "Skirt", "border")
 
@@ -51,8 +52,7 @@ class Skirt(eqx.Module):
         """
         z = field.heights
         level = float_leaf(base)
-        require_number("Skirt", "base", level)
-        require_finite("Skirt", "base", level)
+        require("Skirt", "base", level, FINITE)
         if isinstance(level, np.ndarray) and not isinstance(z, Tracer):
             z = jax.device_get(z)
             rim = np.concatenate([z[0], z[-1], z[:, 0], z[:, -1]])

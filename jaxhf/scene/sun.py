@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import ArgumentError
-from ..core.types import require_finite
+from ..core.rules import require
+from ..core.types import NUMBERS
 
 _J2000 = np.datetime64("2000-01-01T12:00:00", "us")
 _CLOCK = 64 / 86400  # days by which terrestrial time ran ahead of UTC in 2000; 29 s in 1950, 93 s at most until 2050
@@ -36,7 +37,7 @@ def sun(time: Any, latitude: Any, longitude: Any, *, refraction: bool = False) -
     days = _days("sun", time)
     latitude, longitude = np.asarray(latitude, np.float64), np.asarray(longitude, np.float64)
     for name, value, most in (("latitude", latitude, 90), ("longitude", longitude, 360)):
-        require_finite("sun", name, value)
+        require("sun", name, value, NUMBERS)
         if (np.abs(value) > most).any():
             raise ArgumentError("sun", name, f"must lie between -{most} and {most} degrees, it is {value}")
     right_ascension, declination, sidereal, parallax = _equatorial(days)

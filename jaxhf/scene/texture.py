@@ -1,6 +1,6 @@
 """Textures: images spread over a surface."""
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
+from ..core.rules import OneOf, require_fields
 from ..core.types import AnyArray, Point2, Vector, float_leaf
 from ..core.vector import within
 
@@ -37,11 +38,10 @@ class ImageTexture(eqx.Module):
 
     texels: Float[AnyArray, "h w 3"] = eqx.field(converter=_texels)
     at_vertices: bool = eqx.field(static=True, default=False, kw_only=True)
-    wrap: Wrap = eqx.field(static=True, default="repeat", kw_only=True)
+    wrap: Wrap = eqx.field(static=True, default="repeat", kw_only=True, metadata={"rule": OneOf(Wrap)})
 
     def __check_init__(self):
-        if self.wrap not in get_args(Wrap):
-            raise ArgumentError("ImageTexture", "wrap", f"must be one of {', '.join(get_args(Wrap))}; it is {self.wrap!r}")
+        require_fields(self)
         if len(self.texels.shape) != 3 or self.texels.shape[2] != 3 or 0 in self.texels.shape:
             raise ArgumentError("ImageTexture", "texels", f"must have shape (h, w, 3) or (h, w), theirs is {self.texels.shape}")
         if isinstance(self.texels, np.ndarray) and not np.isfinite(self.texels).all():

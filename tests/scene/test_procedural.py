@@ -84,13 +84,13 @@ def test_sky_is_bright_at_the_sun_and_blue_at_the_top():
         (fractal, {"size": [1, 5]}, r"size must be at least 2 x 2, it is \[1, 5\]"),
         (waves, {"size": [2**15, 2**15]}, f"at most {MOST_CELLS} pixels"),
         (fractal, {"range": (1.0, 0.0)}, r"range must be \(lowest, highest\), it is \[1.0, 0.0\]"),
-        (fractal, {"seed": -1}, "non-negative"),
-        (waves, {"count": 0}, "count must be from 1 on, it is 0"),
+        (fractal, {"seed": -1}, "seed must be a whole number from 0 on, it is -1"),
+        (waves, {"count": 0}, "count must be a whole number from 1 on, it is 0"),
         (waves, {"lengths": (0.5, 0.1)}, r"lengths must be \(shortest, longest\), both positive, they are \[0.5, 0.1\]"),
-        (bumps, {"radius": 0.0}, "count and radius must be positive, they are 12 and 0.0"),
-        (grid, {"lines": 0}, "lines must be from 1 on, it is 0"),
+        (bumps, {"radius": 0.0}, "radius must be positive and finite, it is 0.0"),
+        (grid, {"lines": 0}, "lines must be a whole number from 1 on, it is 0"),
         (sky, {"clouds": 1.5}, r"clouds must lie in 0..1, it is 1.5"),
-        (sky, {"sun_radius": 0.0}, "sun_radius must be positive, it is 0.0"),
+        (sky, {"sun_radius": 0.0}, "sun_radius must be positive and finite, it is 0.0"),
     ],
 )
 def test_bad_parameters_are_named(make, parameters, message):

@@ -4,13 +4,14 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
 from ...core.errors import ArgumentError, UserError
+from ...core.rules import OneOf, Whole
 from ...core.settings import Settings
 from ...scene.camera import Camera
 from ...scene.heightfield import Heightfield
@@ -57,10 +58,9 @@ _FIT: Keys = {
     **optional("levels", kind=number_list),
     **optional("uncertainty", kind=or_word(whole)),
 }
-_WHOLE_OR_FLAG = {int: whole, int | None: whole, bool: flag}
 _SETTINGS: Keys = {
-    name: Key(word if Literal in {get_origin(part) for part in (hint, *get_args(hint))} else _WHOLE_OR_FLAG[hint], None)
-    for name, hint in get_type_hints(Settings).items()
+    knob.name: Key({OneOf: word, Whole: whole}.get(type(knob.metadata["rule"]), flag), None)
+    for knob in dataclasses.fields(Settings)
 }
 
 

@@ -1,4 +1,4 @@
-"""How the parts of a scene print: by their numbers, short, also while they are traced."""
+"""What the parts of a scene have in common: their fields keep rules, and they print by their numbers, also while traced."""
 
 import dataclasses
 from typing import Any
@@ -6,6 +6,28 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+
+from ..core.rules import require_fields
+
+
+class Record(eqx.Module):
+    """A part of a scene. What is not traced in its fields keeps the rules that their metadata hold, see `Rule`."""
+
+    def __check_init__(self):
+        require_fields(self)
+        self._require_consistent()
+
+    def _require_consistent(self):
+        """ArgumentError where fields that keep their rules do not go with each other."""
+
+    def __repr__(self) -> str:
+        """The fields by their numbers, but for static ones that have their defaults: "Sky(radiance=(0.4, 0.4, 0.4))"."""
+        values = (
+            f"{field.name}={numbers(getattr(self, field.name))}"
+            for field in dataclasses.fields(self)
+            if not (field.metadata.get("static") and getattr(self, field.name) == field.default)
+        )
+        return f"{type(self).__name__}({', '.join(values)})"
 
 
 def known(leaf: Any) -> np.ndarray | None:
@@ -30,9 +52,3 @@ def number(value: Any) -> str:
     """A float by its first three digits after the point, or by its first three where it is below 1: "4500000.25", "0.0159"."""
     value = float(value) + 0.0  # -0 becomes 0
     return f"{value:.3f}".rstrip("0").rstrip(".") if 1 <= abs(value) < 1e15 else f"{value:.3g}"
-
-
-def fields(module: Any) -> str:
-    """The `repr` of a module whose fields are all numbers: "Sky(radiance=(0.4, 0.4, 0.4))"."""
-    values = (f"{field.name}={numbers(getattr(module, field.name))}" for field in dataclasses.fields(module))
-    return f"{type(module).__name__}({', '.join(values)})"
