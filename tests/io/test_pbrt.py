@@ -11,8 +11,8 @@ from alike import assert_same
 
 import jaxhf
 from jaxhf import Cylinder, Directional, Matte, Mirror, Object, Point, SceneError
-from jaxhf.io.pbrt import reader
-from jaxhf.io.pbrt.reader import load_pbrt
+from jaxhf.io.scenes.pbrt import reader
+from jaxhf.io.scenes.pbrt.reader import load_pbrt
 
 CAMERA = 'Camera "perspective" "float fov" [45]'
 FIELD = 'Shape "heightfield" "integer nu" [2] "integer nv" [2] "float Pz" [0 1 2 3]'

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.errors import ArgumentError, kind_of
-from ..core.extras import import_extra
-from .files import PathLike, replacing, require_writable
-from .images import linear_from_srgb
+from ...core.errors import ArgumentError, kind_of
+from ...core.extras import import_extra
+from ..files import PathLike, replacing, require_writable
+from ..pictures.images import linear_from_srgb
 from .terrain import Terrain
 
 MESHES = (".glb", ".obj", ".ply")

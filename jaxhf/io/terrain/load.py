@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from ..core.extras import import_extra
-from .codecs import read_grey
-from .errors import FileError
-from .files import PathLike, by_ending, read_npy, reading, require_file
-from .gdal import DRIVERS
+from ...core.extras import import_extra
+from ..errors import FileError
+from ..files import PathLike, by_ending, read_npy, reading, require_file
+from ..gdal import DRIVERS
+from ..pictures.codecs import read_grey
 from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
 from .grids import read_asc, read_hgt, read_mujoco
 from .rasters import read_raster

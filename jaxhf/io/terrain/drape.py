@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .errors import FileError
-from .files import PathLike, reading, require_file
-from .gdal import opened
-from .images import linear_from_srgb, load_image
+from ..errors import FileError
+from ..files import PathLike, reading, require_file
+from ..gdal import opened
+from ..pictures.images import linear_from_srgb, load_image
 from .terrain import Terrain
 
 _MOST = 4096  # texels along a side

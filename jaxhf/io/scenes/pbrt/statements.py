@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import SceneError, nearest
+from ...errors import SceneError, nearest
 from .tokens import Token, Values, tokenize
 
 Parameters = Mapping[str, Token]  # the defaults of a kind's parameters, by the keys of the file such as "float fov"

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ...core.affine import rotate, scale, translate
-from ...core.errors import UserError
-from ...core.precision import fitted
-from ...scene.cylinder import Cylinder
-from ...scene.heightfield import Heightfield
-from ...scene.light import Directional, Light, Point
+from ....core.affine import rotate, scale, translate
+from ....core.errors import UserError
+from ....core.precision import fitted
+from ....scene.cylinder import Cylinder
+from ....scene.heightfield import Heightfield
+from ....scene.light import Directional, Light, Point
 from .statements import Arguments, Rule, kinds
 
 Matrix = Float[np.ndarray, "4 4"]

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import FileError
-from ..load_terrain import read_terrain
-from ..resample import at_vertices
-from ..terrain import Terrain
+from ...errors import FileError
+from ...terrain.load import read_terrain
+from ...terrain.resample import at_vertices
+from ...terrain.terrain import Terrain
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import FileError
-from .files import require_pixels
+from ..errors import FileError
+from ..files import require_pixels
 from .georeference import WGS84_DEGREES, Georeference, coordinate_system
 from .sidecars import system_of
 from .terrain import Terrain, heights_of

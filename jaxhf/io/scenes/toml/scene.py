@@ -13,20 +13,20 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ...core.affine import require_invertible
-from ...core.errors import ArgumentError
-from ...core.precision import fitted
-from ...scene import procedural
-from ...scene.camera import Camera
-from ...scene.cylinder import Cylinder
-from ...scene.heightfield import Heightfield
-from ...scene.light import Directional, Light
-from ...scene.scene import Object, Scene
-from ...scene.texture import ImageTexture, Wrap
-from ..errors import SceneError, nearest, resolve_inside
-from ..images import TRANSFERS, load_image
-from ..load_terrain import jacksboro_file, read_terrain
-from ..terrain import Terrain
+from ....core.affine import require_invertible
+from ....core.errors import ArgumentError
+from ....core.precision import fitted
+from ....scene import procedural
+from ....scene.camera import Camera
+from ....scene.cylinder import Cylinder
+from ....scene.heightfield import Heightfield
+from ....scene.light import Directional, Light
+from ....scene.scene import Object, Scene
+from ....scene.texture import ImageTexture, Wrap
+from ...errors import SceneError, nearest, resolve_inside
+from ...pictures.images import TRANSFERS, load_image
+from ...terrain.load import jacksboro_file, read_terrain
+from ...terrain.terrain import Terrain
 from .checks import Part
 from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, OBJECT, ORIGINS, SCENE, TEXTURES, Key, Keys
 from .values import word

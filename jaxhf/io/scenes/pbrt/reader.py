@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ...core.affine import require_invertible
-from ...scene.camera import Perspective
-from ...scene.light import Light
-from ...scene.material import Material, Matte, Mirror
-from ...scene.scene import Object, Scene
-from ...scene.texture import ImageTexture
-from ..errors import SceneError, nearest, resolve_inside
-from ..images import load_image
+from ....core.affine import require_invertible
+from ....scene.camera import Perspective
+from ....scene.light import Light
+from ....scene.material import Material, Matte, Mirror
+from ....scene.scene import Object, Scene
+from ....scene.texture import ImageTexture
+from ...errors import SceneError, nearest, resolve_inside
+from ...pictures.images import load_image
 from .parts import DEFAULT_SAMPLES, KINDS, LIGHTS, RULES, SAMPLERS, SHAPES, TRANSFORMS, Matrix
 from .statements import Arguments, Statement, statements
 from .tokens import Token, located

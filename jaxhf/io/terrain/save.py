@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .codecs import write_png
-from .errors import FileError
-from .exr import write_channels
-from .files import PathLike, reading, replacing, require_file, require_writable, write_npy
+from ..errors import FileError
+from ..files import PathLike, reading, replacing, require_file, require_writable, write_npy
+from ..pictures.codecs import write_png
+from ..pictures.exr import write_channels
 from .grids import write_asc
 from .rasters import georeference_of, geotiff
 from .sidecars import beside

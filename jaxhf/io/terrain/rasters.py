@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ArgumentError
-from ..core.extras import import_extra
-from .codecs import write_png
-from .errors import FileError
-from .files import PathLike, replacing, require_writable, write_npy
-from .gdal import opened
+from ...core.errors import ArgumentError
+from ...core.extras import import_extra
+from ..errors import FileError
+from ..files import PathLike, replacing, require_writable, write_npy
+from ..gdal import opened
+from ..pictures.codecs import write_png
 from .georeference import Georeference, coordinate_system
 from .sidecars import beside
 from .terrain import Terrain, heights_of

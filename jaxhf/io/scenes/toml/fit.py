@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
-from ...core.errors import ArgumentError, UserError
-from ...core.settings import Settings
-from ...scene.camera import Camera
-from ...scene.heightfield import Heightfield
-from ...scene.light import Light
-from ...scene.scene import Object, Scene
-from ..files import PathLike, by_ending, require_file, require_precision
-from ..georeference import CoordinateSystem
-from ..images import load_image, load_numbers
+from ....core.errors import ArgumentError, UserError
+from ....core.settings import Settings
+from ....scene.camera import Camera
+from ....scene.heightfield import Heightfield
+from ....scene.light import Light
+from ....scene.scene import Object, Scene
+from ...files import PathLike, by_ending, require_file, require_precision
+from ...pictures.images import load_image, load_numbers
+from ...terrain.georeference import CoordinateSystem
+from ...terrain.terrain import Terrain
 from ..pbrt.reader import load_pbrt
-from ..terrain import Terrain
 from .checks import Part
 from .priors import Sought, known_deviations, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene, transfer_of
