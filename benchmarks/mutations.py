@@ -48,7 +48,7 @@ tiles: rendering/tiles.py -> rendering/test_render.py rendering/test_bits.py
 tiles: rendering/samples.py -> rendering/test_render.py boundary/test_edges.py
 tiles: rendering/chunks.py -> rendering/test_cast.py rendering/test_bits.py
 maps: maps/hillshade.py maps/slope.py maps/surface.py maps/choices.py -> maps/test_maps.py
-maps: maps/ramp.py maps/relief.py -> maps/test_maps.py cli/test_hillshade.py '-k=tint or colour or pales or adds'
+maps: maps/r*.py io/terrain/colours.py -> maps/test_maps.py cli/test_hillshade.py '-k=tint or colour or pales or adds'
 maps: maps/shadows.py -> maps/test_shadows.py
 maps: maps/skyview.py maps/windows.py -> maps/test_skyview.py
 mujoco: mujoco/[hprs]*[dreys].py -> mujoco/test_sensors.py mujoco/test_ray.py --optimised
