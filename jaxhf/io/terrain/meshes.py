@@ -36,9 +36,8 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
       uv: whether each vertex has its position in the footprint, 0..1 to the east and to the north, for an image to be draped.
 
     Raises:
-      ValueError: the ending is not known, trimesh is missing, `path` is a folder, no cell has four heights, or `base`,
-        `colours` or `uv` cannot be; see there.
-      FileNotFoundError, PermissionError: the folder does not exist, or cannot be written to.
+      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or no cell has four heights, or `base`, `colours`
+        or `uv` cannot be, see there.
     """
     path = require_writable_mesh(path)
     if not hasattr(terrain, "dx"):  # as of a Heightfield, which would import JAX here

@@ -17,22 +17,22 @@ from ..gdal import opened
 from ..pictures.codecs import write_png
 from .georeference import Georeference, coordinate_system
 from .sidecars import beside
-from .terrain import Terrain, heights_of
+from .terrain import Nodata, Terrain, heights_of
 
 
-def read_raster(path: Path, nodata: float | None, overrules: bool) -> Terrain:
-    """The heights in a raster, in its own coordinates; `nodata` counts where the file names none, or where it `overrules`."""
+def read_raster(path: Path, nodata: Nodata) -> Terrain:
+    """The heights in a raster, in its own coordinates."""
     with opened(path) as dataset:
         if dataset.count != 1:
             raise FileError(f"heights must be one band, it has {dataset.count}")
-        tagged, (scale,), (offset,) = dataset.nodata, dataset.scales, dataset.offsets
+        (scale,), (offset,) = dataset.scales, dataset.offsets
         if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
             raise FileError(f"its scale and offset must be finite, the scale not zero; they are {scale} and {offset}")
-        used = tagged if nodata is None or (tagged is not None and not overrules) else nodata
+        used = nodata(dataset.nodata)
         heights = heights_of(dataset.read(1), used, scale, offset)
         if any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[0]):
             heights[dataset.dataset_mask() == 0] = np.nan
-        terrain = _placed(heights, dataset, nodata if used is None else used)
+        terrain = _placed(heights, dataset, used)
         if terrain.georeference is None:
             return terrain
         named = terrain.georeference._replace(z_unit=dataset.units[0] or "")

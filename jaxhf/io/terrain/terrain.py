@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import warnings
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +26,8 @@ from .georeference import (
 
 if TYPE_CHECKING:
     from ...scene.heightfield import Heightfield
+
+Nodata = Callable[[float | None], float | None]  # what means no height, where a file names this value, or none, for it
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
