@@ -5,10 +5,9 @@ that is not there. What is read means what pbrt-v2 makes of it, but for the name
 which they stand, not to the first one.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -90,16 +89,53 @@ class _Reader:
 
     def _execute(self, statement: Statement) -> None:
         word = statement.word
-        directive = _DIRECTIVES.get(word.text)
-        if directive is None:
-            raise word.error(f"unknown directive {str(word)!r}; {nearest(word.text[:60], _DIRECTIVES)}")
+        if word.text not in _BLOCKS:
+            raise word.error(f"unknown directive {str(word)!r}; {nearest(word.text[:60], _BLOCKS)}")
         if self.block == "end":
             raise word.error(f"{word} must not follow WorldEnd")
-        block, takes, run = directive
-        if block not in ("any", self.block):
+        if _BLOCKS[word.text] not in ("any", self.block):
             late = self.world is not None
             raise word.error(f"{word} must {'not ' if late else ''}follow WorldBegin")
-        run(self, takes(statement))
+        match word.text:
+            case "AttributeBegin" | "TransformBegin":
+                self.saved.append((statement.nothing(), self.matrix, self.material, self.textures))
+            case "AttributeEnd" | "TransformEnd":
+                self._restore(statement.nothing())
+            case "WorldBegin":
+                self._world_begin(statement.nothing())
+            case "WorldEnd":
+                self._world_end(statement.nothing())
+            case "Include":
+                self._include(statement.name())
+            case "Identity":
+                statement.nothing()
+                self.matrix = np.eye(4)
+            case "CoordinateSystem":
+                self.frames[statement.name().name()] = self.matrix
+            case "CoordSysTransform":
+                self._enter_frame(statement.name())
+            case "Texture":
+                self._declare_texture(statement)
+            case directive if directive in KINDS:
+                self._set(statement.arguments(KINDS[directive], RULES))
+            case _:
+                self._concatenate(statement)
+
+    def _set(self, args: Arguments) -> None:
+        """Of PixelFilter and SurfaceIntegrator nothing: their parameters have one value each, which is checked by now."""
+        match args.word.text:
+            case "Film":
+                self.resolution = args["integer xresolution"], args["integer yresolution"]
+            case "Sampler":
+                self._sampler(args)
+            case "Camera":
+                self.camera, self.frames["camera"] = args, np.linalg.inv(self.matrix)
+            case "LightSource":
+                self._light_source(args)
+            case "Material":
+                self.material = args
+            case "Shape":
+                self._shape(args)
 
     # Blocks, files, attributes.
 
@@ -124,9 +160,6 @@ class _Reader:
         if not self.objects:
             raise word.error("there must be a Shape before WorldEnd")
         self.block = "end"
-
-    def _save(self, begin: Token) -> None:
-        self.saved.append((begin, self.matrix, self.material, self.textures))
 
     def _restore(self, end: Token) -> None:
         opened = end.text.replace("End", "Begin")
@@ -153,21 +186,12 @@ class _Reader:
                 require_invertible("", "the current transformation", matrix)
             self.matrix = matrix
 
-    def _identity(self, _: Token) -> None:
-        self.matrix = np.eye(4)
-
-    def _name_frame(self, name: Token) -> None:
-        self.frames[name.name()] = self.matrix
-
     def _enter_frame(self, name: Token) -> None:
         if name.name() not in self.frames:
             raise name.error(f"unknown coordinate system {name}; {nearest(name.name(), self.frames)}")
         self.matrix = self.frames[name.name()]
 
-    # The camera and its picture.
-
-    def _film(self, args: Arguments) -> None:
-        self.resolution = args["integer xresolution"], args["integer yresolution"]
+    # The parts of the scene.
 
     def _sampler(self, args: Arguments) -> None:
         if args.kind == "bestcandidate":
@@ -178,16 +202,6 @@ class _Reader:
         side = args["integer xsamples"]
         args.require("integer ysamples", args["integer ysamples"] == side, f"equal xsamples, {side}")
         self.samples = side * side
-
-    def _only_checked(self, args: Arguments) -> None:
-        """Of a directive whose parameters may have one value only."""
-
-    def _camera(self, args: Arguments) -> None:
-        with located(args.word):
-            self.frames["camera"] = np.linalg.inv(self.matrix)
-        self.camera = args
-
-    # The world.
 
     def _light_source(self, args: Arguments) -> None:
         with located(args.word):
@@ -207,9 +221,6 @@ class _Reader:
         with located(place):
             path = resolve_inside(self.root, self.files[-1].parent, args["string filename"])
         self.textures = {**self.textures, name.name(): (path, place)}
-
-    def _set_material(self, args: Arguments) -> None:
-        self.material = args
 
     def _shape(self, args: Arguments) -> None:
         with located(args.word):
@@ -242,34 +253,10 @@ class _Reader:
         return self.images[path]
 
 
-def _arguments(statement: Statement) -> Arguments:
-    return statement.arguments(KINDS[statement.word.text], RULES)
-
-
-def _all(statement: Statement) -> Statement:
-    return statement
-
-
-# Where a directive may stand ("options", "world", "any"), what it takes, and what it does.
-_DIRECTIVES: Mapping[str, tuple[str, Callable[[Statement], Any], Callable[[_Reader, Any], None]]] = {
-    "AttributeBegin": ("world", Statement.nothing, _Reader._save),
-    "AttributeEnd": ("world", Statement.nothing, _Reader._restore),
-    "Camera": ("options", _arguments, _Reader._camera),
-    "CoordSysTransform": ("any", Statement.name, _Reader._enter_frame),
-    "CoordinateSystem": ("any", Statement.name, _Reader._name_frame),
-    "Film": ("options", _arguments, _Reader._film),
-    "Identity": ("any", Statement.nothing, _Reader._identity),
-    "Include": ("any", Statement.name, _Reader._include),
-    "LightSource": ("world", _arguments, _Reader._light_source),
-    "Material": ("world", _arguments, _Reader._set_material),
-    "PixelFilter": ("options", _arguments, _Reader._only_checked),
-    "Sampler": ("options", _arguments, _Reader._sampler),
-    "Shape": ("world", _arguments, _Reader._shape),
-    "SurfaceIntegrator": ("options", _arguments, _Reader._only_checked),
-    "Texture": ("world", _all, _Reader._declare_texture),
-    "TransformBegin": ("world", Statement.nothing, _Reader._save),
-    "TransformEnd": ("world", Statement.nothing, _Reader._restore),
-    "WorldBegin": ("options", Statement.nothing, _Reader._world_begin),
-    "WorldEnd": ("world", Statement.nothing, _Reader._world_end),
-    **dict.fromkeys(("ConcatTransform", "Transform", *TRANSFORMS), ("any", _all, _Reader._concatenate)),
+_BLOCKS: Mapping[str, str] = {  # where a directive may stand
+    **dict.fromkeys(("Camera", "Film", "PixelFilter", "Sampler", "SurfaceIntegrator", "WorldBegin"), "options"),
+    **dict.fromkeys(("AttributeBegin", "AttributeEnd", "TransformBegin", "TransformEnd", "WorldEnd"), "world"),
+    **dict.fromkeys(("LightSource", "Material", "Shape", "Texture"), "world"),
+    **dict.fromkeys(("CoordSysTransform", "CoordinateSystem", "Identity", "Include"), "any"),
+    **dict.fromkeys(("ConcatTransform", "Transform", *TRANSFORMS), "any"),
 }

@@ -15,7 +15,7 @@ Parameters = Mapping[str, Any]  # the defaults of a kind's parameters by their d
 Kinds = Mapping[str, Parameters]
 Rule = tuple[Callable[[Any], bool], str]  # whether a value is allowed, and what it must be
 
-_COUNTS = {"color": 3, "point": 3, "float Pz": None}  # of values, by type or declaration; None: any, and one where it is absent
+_COUNTS = {"color": 3, "point": 3, "float Pz": None}  # of values, by type or declaration: else one; None: any number
 
 
 @dataclass(frozen=True)
