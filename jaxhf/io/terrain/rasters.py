@@ -12,7 +12,7 @@ import numpy as np
 from ...core.errors import ArgumentError
 from ...core.extras import import_extra
 from ..errors import FileError
-from ..files import PathLike, replacing, require_writable, write_npy
+from ..files import PathLike, reading, replacing, require_writable, write_npy
 from ..gdal import opened
 from ..pictures.codecs import write_png
 from .georeference import Georeference, coordinate_system
@@ -39,12 +39,13 @@ def read_raster(path: Path, nodata: Nodata) -> Terrain:
         return dataclasses.replace(terrain, georeference=named)
 
 
-def georeference_of(path: Path) -> tuple[Terrain, tuple[int, int]]:
-    """A raster's place, on a terrain of 2 x 2 heights, and its shape (ny, nx)."""
-    with opened(path) as dataset:
-        shape = dataset.height, dataset.width
-        corner = _placed(np.zeros((2, 2), np.float32), dataset, dataset.nodata)
-        return corner, shape
+def placed_like(terrain: Terrain, like: Path) -> Terrain:
+    """The heights of a terrain where a raster of their shape lies; FileError where it has another."""
+    with reading(like), opened(like) as dataset:
+        place, shape = _placed(np.zeros((2, 2), np.float32), dataset, dataset.nodata), (dataset.height, dataset.width)
+        if shape != terrain.heights.shape:
+            raise FileError(f"it must have the shape of the heights, {terrain.heights.shape}; it has {shape}")
+    return dataclasses.replace(place, heights=terrain.heights)
 
 
 def _placed(heights: np.ndarray, dataset: Any, nodata: float | None) -> Terrain:
