@@ -1,4 +1,4 @@
-"""The parts of a .pbrt scene: which parameters each kind of them takes, and what is made of these."""
+"""The parts of a .pbrt scene: which parameters each kind of them takes; transformations and heightfields."""
 
 from collections.abc import Callable, Mapping
 from typing import Any

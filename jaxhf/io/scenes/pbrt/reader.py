@@ -117,12 +117,12 @@ class _Reader:
             case "Texture":
                 self._declare_texture(statement)
             case directive if directive in KINDS:
-                self._set(statement.arguments(KINDS[directive], RULES))
+                self._take(statement.arguments(KINDS[directive], RULES))
             case _:
                 self._concatenate(statement)
 
-    def _set(self, args: Arguments) -> None:
-        """Of PixelFilter and SurfaceIntegrator nothing: their parameters have one value each, which is checked by now."""
+    def _take(self, args: Arguments) -> None:
+        """Takes what a directive with a kind says. PixelFilter and SurfaceIntegrator may only say what is done anyway."""
         match args.word.text:
             case "Film":
                 self.resolution = args["integer xresolution"], args["integer yresolution"]

@@ -91,7 +91,7 @@ def _light(part: Part, terrain: Terrain | None) -> Light:
 
 
 def read_objects(part: Part, dtype: np.dtype) -> list[tuple[Object, Provenance | None]]:
-    """The objects of a scene with its textures; beside heightfields, where they are from."""
+    """The objects of a scene with its textures; beside each heightfield, where it is from."""
     textures = {name: _texture(part.at("textures", name)) for name in part.table.get("textures", {})}
     return [_object(item, textures, dtype) for item in part.all("objects")]
 
