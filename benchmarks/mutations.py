@@ -48,19 +48,19 @@ tiles: rendering/tiles.py -> rendering/test_render.py rendering/test_bits.py
 tiles: rendering/samples.py -> rendering/test_render.py boundary/test_edges.py
 tiles: rendering/chunks.py -> rendering/test_cast.py rendering/test_bits.py
 maps: maps/hillshade.py maps/slope.py maps/surface.py maps/choices.py -> maps/test_maps.py
-maps: maps/ramp.py maps/relief.py -> maps/test_maps.py cli/test_hillshade.py '-k=tint or colour or pales or adds'
+maps: maps/r*.py io/terrain/colours.py -> maps/test_maps.py cli/test_hillshade.py '-k=tint or colour or pales or adds'
 maps: maps/shadows.py -> maps/test_shadows.py
 maps: maps/skyview.py maps/windows.py -> maps/test_skyview.py
 mujoco: mujoco/[hprs]*[dreys].py -> mujoco/test_sensors.py mujoco/test_ray.py --optimised
 mujoco: mujoco/scan.py -> mujoco/test_scan.py --optimised
-io: io/images.py io/codecs.py io/exr.py io/png.py -> io/test_images.py io/test_full_disk.py
-io: io/files.py io/films.py -> io/test_images.py io/test_files.py io/test_full_disk.py
+io: io/pictures/[ceip]*.py -> io/test_images.py io/test_full_disk.py
+io: io/files.py io/pictures/films.py -> io/test_images.py io/test_files.py io/test_full_disk.py
 io: scene/procedural.py -> scene/test_procedural.py
-io: io/pbrt/*.py -> io/test_pbrt.py
-io: io/toml/*.py io/scenes.py -> io/test_toml.py io/test_fit_case.py
-io: io/meshes.py -> io/test_meshes.py
-io: io/g*.py -> io/test_grids.py io/test_terrain.py io/test_rasters.py
-io: io/l*.py io/r*.py io/s*n.py io/sidecars.py io/terrain.py -> io/test_terrain.py io/test_grids.py io/test_rasters.py
+io: io/scenes/pbrt/*.py -> io/test_pbrt.py
+io: io/scenes/toml/*.py io/scenes/load.py -> io/test_toml.py io/test_fit_case.py
+io: io/terrain/meshes.py -> io/test_meshes.py
+io: io/gdal.py io/terrain/g*.py -> io/test_grids.py io/test_terrain.py io/test_rasters.py
+io: io/terrain/[lrst]*.py -> io/test_terrain.py io/test_grids.py io/test_rasters.py
 boundary: boundary/*.py -> boundary
 fitting: fitting/[lj]*.py -> fitting/test_linearise.py fitting/test_fit_stops.py
 fitting: fitting/n*.py fitting/uncertainty.py -> fitting/test_normal_matrix.py fitting/test_noise.py

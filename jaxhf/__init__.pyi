@@ -5,12 +5,12 @@ from .core.version import __version__ as __version__
 from .fitting.fit import Fit as Fit, fit as fit
 from .fitting.history import Step as Step, Stop as Stop
 from .io.errors import SceneError as SceneError
-from .io.images import load_image as load_image, save_image as save_image
-from .io.load_terrain import jacksboro as jacksboro, load_heights as load_heights
-from .io.meshes import save_mesh as save_mesh
-from .io.save_terrain import save_heights as save_heights
-from .io.scenes import load_scene as load_scene
-from .io.terrain import Terrain as Terrain
+from .io.pictures.images import load_image as load_image, save_image as save_image
+from .io.scenes.load import load_scene as load_scene
+from .io.terrain.load import jacksboro as jacksboro, load_heights as load_heights
+from .io.terrain.meshes import save_mesh as save_mesh
+from .io.terrain.save import save_heights as save_heights
+from .io.terrain.terrain import Terrain as Terrain
 from .maps.hillshade import hillshade as hillshade
 from .maps.relief import color_relief as color_relief, relief as relief
 from .maps.skyview import horizon as horizon, sky_view as sky_view

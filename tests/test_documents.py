@@ -24,7 +24,7 @@ from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 
 import jaxhf
 from jaxhf.cli.main import main
-from jaxhf.io.toml.fit import load_case
+from jaxhf.io.scenes.toml.fit import load_case
 from jaxhf.scene.procedural import fractal
 from jaxhf.xla.machine import available_bytes
 

@@ -8,7 +8,7 @@ import numpy as np
 from ..core.errors import counted
 
 if TYPE_CHECKING:
-    from ..io.terrain import Terrain
+    from ..io.terrain.terrain import Terrain
     from ..scene.heightfield import Heightfield
     from ..scene.scene import Scene
 
@@ -30,7 +30,7 @@ def scene_lines(scene: "Scene") -> Iterator[str]:
 
 def terrain_lines(path: str, terrain: "Terrain") -> Iterator[str]:
     """Size, spacing, place, reference system and range of a terrain in its file's own coordinates."""
-    from ..io.georeference import Georeference, coordinate_system
+    from ..io.terrain.georeference import Georeference, coordinate_system
 
     ny, nx = terrain.heights.shape
     yield f"{path}: {ny} rows, {nx} columns of {terrain.heights.dtype}"

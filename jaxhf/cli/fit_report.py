@@ -14,7 +14,7 @@ from ..fitting.view import differences, sun
 from ..scene.heightfield import Heightfield
 
 if TYPE_CHECKING:
-    from ..io.toml.fit import Case
+    from ..io.scenes.toml.fit import Case
 
 _FAR = 4  # standard deviations at which the colours of residuals end
 _PAGE = """<!doctype html>

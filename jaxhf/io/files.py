@@ -129,7 +129,11 @@ def replacing_all(paths: Iterable[Path]) -> Iterator[list[Path]]:
             os.replace(temporary, path)
         for folder in {path.parent for path in paths}:
             with contextlib.suppress(OSError):  # Windows opens no folders, some network file systems synchronise none
-                _synchronise_folder(folder)
+                descriptor = os.open(folder, os.O_RDONLY)
+                try:
+                    os.fsync(descriptor)
+                finally:
+                    os.close(descriptor)
     except OSError as error:
         if error.errno is None:
             raise
@@ -163,14 +167,6 @@ def utf8_name(path: Path) -> Iterator[str]:
         yield named
 
 
-def _synchronise_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 _NEEDS = {  # the package that writes a format, and the extra that installs it
     ".exr": ("OpenEXR", "exr"),
     ".mp4": ("av", "video"),
@@ -189,9 +185,8 @@ def require_writable(owner: str, what: str, endings: Iterable[str], path: PathLi
       path: the file.
 
     Raises:
-      FileError: another ending, a package for it that is missing, or `path` is a folder.
-      FileNotFoundError: the folder does not exist.
-      PermissionError: the folder cannot be written to.
+      FileError: another ending, or a package for it that is missing.
+      FileError, FileNotFoundError, PermissionError: as `require_folder`.
     """
     path = file_path(owner, path)
     by_ending(dict.fromkeys(endings), path, f"write {what} with")

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from ..core.errors import ArgumentError
 from ..core.precision import fitted, numbers
-from ..io.terrain import Terrain
+from ..io.terrain.terrain import Terrain
 
 Heights = ArrayLike | Terrain
 

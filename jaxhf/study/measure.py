@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from ..core.settings import Settings
 from ..io.files import reading, replacing
-from ..io.scenes import load_scene
+from ..io.scenes.load import load_scene
 from ..rendering.cast import cast_camera
 from ..rendering.render import render
 from ..scene.scene import Scene

@@ -15,7 +15,7 @@ from ..core.settings import Settings
 from ..core.version import __version__
 from ..io.errors import FileError
 from ..io.files import PathLike
-from ..io.scenes import load_scene
+from ..io.scenes.load import load_scene
 from ..preparation.world import resolve_settings
 from ..scene.light import Sky
 from ..scene.material import Mirror

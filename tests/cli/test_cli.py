@@ -177,7 +177,7 @@ def test_no_memory_is_an_error_in_one_line(monkeypatch, command, error):
     def fail(*_):
         raise error
 
-    monkeypatch.setattr("jaxhf.io.scenes.load_scene", fail)
+    monkeypatch.setattr("jaxhf.io.scenes.load.load_scene", fail)
     said = "jaxhf: error: memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)\n"
     assert command("info", SCENE) == (2, "", said)
 

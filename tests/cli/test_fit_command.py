@@ -21,7 +21,7 @@ from PIL import Image
 
 import jaxhf
 from jaxhf.core.affine import rotate
-from jaxhf.io.toml.fit import load_case
+from jaxhf.io.scenes.toml.fit import load_case
 
 if sys.platform != "win32":
     import pty

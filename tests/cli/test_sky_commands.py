@@ -98,7 +98,7 @@ def test_a_bar_tells_what_is_done_until_ctrl_c(run, name, heights, tmp_path, mon
 
 def test_a_full_disk_leaves_none_of_several_maps(run, tmp_path, monkeypatch):
     pytest.importorskip("rasterio")
-    from jaxhf.io import rasters
+    from jaxhf.io.terrain import rasters
 
     geotiff, written = rasters.geotiff, []
 

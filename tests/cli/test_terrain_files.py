@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxhf import Terrain, save_heights
-from jaxhf.io.georeference import WGS84_DEGREES, Georeference, coordinate_system
+from jaxhf.io.terrain.georeference import WGS84_DEGREES, Georeference, coordinate_system
 
 DEGREES = Georeference(WGS84_DEGREES, nodata=-9999.0)
 

@@ -12,8 +12,8 @@ import jaxhf
 from jaxhf.cli import block as looks
 from jaxhf.cli.commands.view import _sun, _sun_path
 from jaxhf.core.errors import UserError
-from jaxhf.io.georeference import WGS84_DEGREES, Georeference
-from jaxhf.io.terrain import Terrain
+from jaxhf.io.terrain.georeference import WGS84_DEGREES, Georeference
+from jaxhf.io.terrain.terrain import Terrain
 from jaxhf.rendering import render as _render
 
 SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
@@ -125,9 +125,9 @@ def test_a_picture_from_somewhere_through_haze_of_what_is_laid_over_it(tmp_path,
 
 def test_a_geotiff_is_draped_where_it_lies(tmp_path):
     rasterio = pytest.importorskip("rasterio")
-    from jaxhf.io.drape import load_drape
     from jaxhf.io.errors import FileError
-    from jaxhf.io.load_terrain import load_heights
+    from jaxhf.io.terrain.drape import load_drape
+    from jaxhf.io.terrain.load import load_heights
 
     def write(path, bands, corner, step, system="EPSG:32632"):
         return geotiffs.write(path, bands, (step, 0, corner[0], 0, -step, corner[1]), system)
@@ -164,6 +164,6 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
 def test_there_is_a_terrain_to_try(terrain, tmp_path, monkeypatch, command):
     """Here another, as that of matplotlib takes seconds; docs/index.md shows it."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("jaxhf.io.load_terrain.jacksboro_file", lambda: terrain)
+    monkeypatch.setattr("jaxhf.io.terrain.load.jacksboro_file", lambda: terrain)
     assert command("view", "--demo", *SMALL)[0] == 0
     assert np.ptp(imageio.imread("in.png")) > 100

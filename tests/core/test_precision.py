@@ -11,7 +11,7 @@ import jaxhf
 import jaxhf.mujoco
 from jaxhf.core.precision import rounding
 from jaxhf.fitting.basis import make_heights
-from jaxhf.io.terrain import Terrain, heights_of
+from jaxhf.io.terrain.terrain import Terrain, heights_of
 
 RELIEF = np.random.default_rng(0).uniform(size=(5, 6))  # of about 1 m
 RADII = 3.39e6 + RELIEF  # of Mars, where float32 has steps of 0.25

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+import pytest
 
 import jaxhf
 from jaxhf.fitting.history import Pace, printed_progress

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 import jaxhf
-from jaxhf.io.georeference import CoordinateSystem
-from jaxhf.io.resample import at_vertices
-from jaxhf.io.toml.fit import load_case
+from jaxhf.io.scenes.toml.fit import load_case
+from jaxhf.io.terrain.georeference import CoordinateSystem
+from jaxhf.io.terrain.resample import at_vertices
 
 SCENE = """[camera]
 type = "perspective"

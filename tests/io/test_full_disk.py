@@ -16,8 +16,8 @@ import numpy as np
 from jaxhf import Terrain, save_heights, save_image
 from jaxhf.io.checkpoint import save_checkpoint
 from jaxhf.io.files import save_text
-from jaxhf.io.meshes import save_mesh
-from jaxhf.io.rasters import save_raster
+from jaxhf.io.terrain.meshes import save_mesh
+from jaxhf.io.terrain.rasters import save_raster
 
 folder = pathlib.Path(sys.argv[1])
 rng = np.random.default_rng(0)

@@ -8,8 +8,8 @@ from alike import placed
 from PIL import Image
 
 from jaxhf import Terrain, load_heights, save_heights, save_image
-from jaxhf.io.georeference import CoordinateSystem, Georeference, coordinate_system
-from jaxhf.io.load_terrain import read_terrain
+from jaxhf.io.terrain.georeference import CoordinateSystem, Georeference, coordinate_system
+from jaxhf.io.terrain.load import read_terrain
 
 UTM = 'LOCAL_CS["a grid of the county",UNIT["metre",1]]'
 HEIGHTS = np.array([[1, 2.5, np.nan], [4, 5, 6]], np.float32)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from jaxhf import load_image, save_image
 from jaxhf.io.files import MAX_PIXELS
-from jaxhf.io.images import load_numbers, require_writable
+from jaxhf.io.pictures.images import load_numbers, require_writable
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 import jaxhf
 from jaxhf import Terrain
-from jaxhf.io.meshes import save_mesh
+from jaxhf.io.terrain.meshes import save_mesh
 
 trimesh = pytest.importorskip("trimesh")
 

@@ -11,8 +11,8 @@ from alike import assert_same
 
 import jaxhf
 from jaxhf import Cylinder, Directional, Matte, Mirror, Object, Point, SceneError
-from jaxhf.io.pbrt import reader
-from jaxhf.io.pbrt.reader import load_pbrt
+from jaxhf.io.scenes.pbrt import reader
+from jaxhf.io.scenes.pbrt.reader import load_pbrt
 
 CAMERA = 'Camera "perspective" "float fov" [45]'
 FIELD = 'Shape "heightfield" "integer nu" [2] "integer nv" [2] "float Pz" [0 1 2 3]'
@@ -269,7 +269,7 @@ WORLD_ERRORS = [
     (f'{MATTE}\n"float sigma"\n10', 4, "sigma must be 0 (rough surfaces are not supported), it is 10.0"),
     (f'{MATTE}\n"color Kd" [.5]', 3, "'color Kd' takes 3 numbers, found 1 number"),
     (f'{MATTE}\n"float Kd" .5', 3, "Material \"matte\" takes 'color Kd' or 'texture Kd', not 'float Kd'"),
-    (f'{MATTE}\n"color Kd" [1 -1 1]\n{FIELD}', 3, "Kd must be 0 or more, it is [ 1. -1.  1.]"),
+    (f'{MATTE}\n"color Kd" [1 -1 1]', 3, "Kd must be 0 or more, it is [ 1. -1.  1.]"),
     ('LightSource "point"\n"color I" [1 -1 1]', 3, "I must be 0 or more"),
     ('LightSource "distant" "color L" [1 1 1]\n"color scale" [1 -1 1]', 3, "scale must be 0 or more"),
     ('Material "mirror"\n"color Kd" [1 1 1]', 3, "unknown parameter 'color Kd' of Material \"mirror\""),

@@ -8,7 +8,7 @@ from geotiffs import write
 
 from jaxhf import Terrain, load_heights, save_heights
 from jaxhf.cli.main import main
-from jaxhf.io.rasters import save_raster
+from jaxhf.io.terrain.rasters import save_raster
 
 rasterio = pytest.importorskip("rasterio")
 

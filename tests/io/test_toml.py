@@ -14,11 +14,11 @@ from PIL import Image
 
 import jaxhf
 from jaxhf import Directional, Heightfield, ImageTexture, Matte, Mirror, Orthographic, Perspective, SceneError, load_scene
-from jaxhf.io.georeference import WGS84_DEGREES, Georeference
-from jaxhf.io.toml import tables
-from jaxhf.io.toml.fit import load_case
-from jaxhf.io.toml.lines import line_of
-from jaxhf.io.toml.values import STEPS
+from jaxhf.io.scenes.toml import tables
+from jaxhf.io.scenes.toml.fit import load_case
+from jaxhf.io.scenes.toml.lines import line_of
+from jaxhf.io.scenes.toml.values import STEPS
+from jaxhf.io.terrain.georeference import WGS84_DEGREES, Georeference
 from jaxhf.scene.procedural import bumps, grid
 
 SCENES = sorted((Path(__file__).parents[2] / "scenes").glob("*.toml"))

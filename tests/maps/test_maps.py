@@ -126,7 +126,7 @@ def test_planes_by_hand(algorithm, east, north):
 
 
 def test_degrees_become_metres_unless_a_scale_is_given():
-    from jaxhf.io.georeference import WGS84, CoordinateSystem, metres_per_degree
+    from jaxhf.io.terrain.georeference import WGS84, CoordinateSystem, metres_per_degree
 
     heights = rough(30, 40)
     degrees = Terrain(heights, 1 / 3600, 1 / 3600, 7.0, 46.0, CoordinateSystem(degrees=True, globe=WGS84))

@@ -11,9 +11,9 @@ from ..command import Command
 
 
 def run(options: argparse.Namespace) -> None:
-    from ...io.load_terrain import load_heights
-    from ...io.meshes import MESHES, require_writable_mesh, save_mesh
-    from ...io.save_terrain import HEIGHTS, require_writable_heights, save_heights
+    from ...io.terrain.load import load_heights
+    from ...io.terrain.meshes import MESHES, require_writable_mesh, save_mesh
+    from ...io.terrain.save import HEIGHTS, require_writable_heights, save_heights
     from ..describe import heightfield_line
 
     ending = Path(options.output).suffix.lower()

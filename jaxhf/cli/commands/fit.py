@@ -15,7 +15,7 @@ from ..overwriting import require_no_input
 if TYPE_CHECKING:
     from ...fitting.fit import Fit
     from ...fitting.history import Draws, Step
-    from ...io.toml.fit import Case
+    from ...io.scenes.toml.fit import Case
 
 _USUAL_STEPS = 30  # of a fit, until it says what is to come
 _EARLY = 50.0  # seconds: most fits compile no longer, and JAX reports a compilation only when it is done
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
     import numpy as np
 
     from ...io.files import save_text
-    from ...io.toml.fit import load_case
+    from ...io.scenes.toml.fit import load_case
     from ..fit_report import facts, report
     from ..limits import require_memory
     from ..scene_warnings import warn
@@ -66,7 +66,7 @@ def _require_writable(options: argparse.Namespace, *heights: Path) -> None:
     """Refuses before the fit what could not be written after it."""
     from ...core.extras import import_extra
     from ...io.files import require_writable_text
-    from ...io.save_terrain import require_writable_heights
+    from ...io.terrain.save import require_writable_heights
 
     for path in heights:
         require_writable_heights(path, (".npy", ".npz", ".tif", ".tiff"))  # which hold any heights, and holes
@@ -99,9 +99,9 @@ def _fit(case: "Case", checkpoint: Path, resume: bool) -> "Fit":
 def _save(case: "Case", found: "Fit", heights: Path, std: Path, albedo: Path) -> None:
     import numpy as np
 
-    from ...io.images import save_image
-    from ...io.save_terrain import save_heights
-    from ...io.terrain import Terrain
+    from ...io.pictures.images import save_image
+    from ...io.terrain.save import save_heights
+    from ...io.terrain.terrain import Terrain
 
     field = case.scenes[0].heightfields[0]
     for path, values in ((heights, found.heights), (std, found.std)):

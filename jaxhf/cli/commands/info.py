@@ -10,7 +10,7 @@ from ..command import Command
 def run(options: argparse.Namespace) -> None:
     from ...core.errors import counted
     from ...io.files import by_ending
-    from ...io.load_terrain import ENDINGS, read_terrain
+    from ...io.terrain.load import ENDINGS, read_terrain
 
     of_scene = dict.fromkeys((".toml", ".pbrt"), True)
     if not by_ending({**dict.fromkeys(ENDINGS, False), **of_scene}, Path(options.file), "describe"):
@@ -18,7 +18,7 @@ def run(options: argparse.Namespace) -> None:
 
         print("\n".join(terrain_lines(options.file, read_terrain(options.file))))
         return
-    from ...io.scenes import load_scene
+    from ...io.scenes.load import load_scene
     from ..describe import scene_lines
     from ..scene_warnings import warn
 

@@ -14,7 +14,7 @@ from ..arguments import choice, flag, number, option
 from ..command import Command
 
 if TYPE_CHECKING:
-    from ...io.terrain import Terrain
+    from ...io.terrain.terrain import Terrain
 
 _BYTES = ".tif (8 bits, keeps its place), .png (and a world file) or .npy"
 _COLOURED = ".tif (keeps its place), .png (and a world file) or .npy"
@@ -100,8 +100,8 @@ def _make(options: argparse.Namespace, function: Callable[..., Any], kind: str, 
       kind: what the map is, for the report.
       nodata: the value in it that means that there is none.
     """
-    from ...io.load_terrain import read_terrain
-    from ...io.rasters import require_writable_raster, save_raster
+    from ...io.terrain.load import read_terrain
+    from ...io.terrain.rasters import require_writable_raster, save_raster
 
     path = require_writable_raster(options.output)
     begin = time.perf_counter()

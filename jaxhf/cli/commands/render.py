@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ...io.images import require_writable, save_image
+    from ...io.pictures.images import require_writable, save_image
     from ..scene_warnings import warn
 
     if options.aovs and Path(options.output).suffix.lower() != ".exr":
@@ -60,7 +60,7 @@ def _load(options: argparse.Namespace) -> "Scene":
     """The scene in the precision and in the size of the options; one of width and height keeps the proportions."""
     import numpy as np
 
-    from ...io.scenes import load_scene
+    from ...io.scenes.load import load_scene
     from ...scene.views import resized
 
     scene = load_scene(options.scene, np.dtype(options.precision))

@@ -13,7 +13,7 @@ from ..command import Command
 from .maps import STEPS, report_spacing, require_numbers
 
 if TYPE_CHECKING:
-    from ...io.terrain import Terrain
+    from ...io.terrain.terrain import Terrain
 
 
 def _options(written: str, special: arguments.Option) -> dict[str, tuple[arguments.Option, ...]]:
@@ -25,7 +25,7 @@ def _options(written: str, special: arguments.Option) -> dict[str, tuple[argumen
 def _read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
     """The terrain as the file places it, and in metres, in the precision that is asked for."""
     from ...io.errors import FileError
-    from ...io.load_terrain import read_terrain
+    from ...io.terrain.load import read_terrain
 
     options.azimuths = 32 if options.azimuths is None else options.azimuths
     stored = read_terrain(options.terrain, options.z_scale, options.nodata)
@@ -42,7 +42,7 @@ def _read(options: argparse.Namespace) -> "tuple[Terrain, Terrain]":
 def _skyview(options: argparse.Namespace) -> None:
     import numpy as np
 
-    from ...io.rasters import require_writable_raster, save_raster
+    from ...io.terrain.rasters import require_writable_raster, save_raster
 
     path = require_writable_raster(options.output)
     stored, terrain = _read(options)
@@ -64,7 +64,7 @@ def _horizon(options: argparse.Namespace) -> None:
     import numpy as np
 
     from ...io.files import replacing_all, write_npy
-    from ...io.rasters import geotiff, require_writable_raster
+    from ...io.terrain.rasters import geotiff, require_writable_raster
 
     require_numbers(options.output, "angles")
     path, one = require_writable_raster(options.output), options.azimuth is not None

@@ -17,7 +17,7 @@ from ..command import Command
 if TYPE_CHECKING:
     import numpy as np
 
-    from ...io.terrain import Terrain
+    from ...io.terrain.terrain import Terrain
     from ...scene.camera import Perspective
     from ...scene.heightfield import Heightfield
     from ...scene.scene import Scene
@@ -87,9 +87,9 @@ def _size(text: str) -> tuple[int, int]:
 
 def _output(options: argparse.Namespace) -> tuple[Path, bool]:
     """The file, and whether it is a film; UserError where options do not go together."""
-    from ...io.films import FILMS, require_writable_film
-    from ...io.images import PICTURES, require_writable
-    from ...io.load_terrain import jacksboro_file
+    from ...io.pictures.films import FILMS, require_writable_film
+    from ...io.pictures.images import PICTURES, require_writable
+    from ...io.terrain.load import jacksboro_file
     from ..overwriting import require_no_input
 
     if options.demo == (options.terrain is not None):
@@ -115,8 +115,8 @@ def _output(options: argparse.Namespace) -> tuple[Path, bool]:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ...io.images import save_image
-    from ...io.load_terrain import load_heights
+    from ...io.pictures.images import save_image
+    from ...io.terrain.load import load_heights
 
     output, film = _output(options)
     begin = time.perf_counter()
@@ -173,8 +173,8 @@ def _solid(options: argparse.Namespace, terrain: "Terrain", factor: float) -> "t
 def _colours(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray":
     import numpy as np
 
-    from ...io.drape import load_drape
-    from ...io.images import linear_from_srgb
+    from ...io.pictures.images import linear_from_srgb
+    from ...io.terrain.drape import load_drape
     from ...maps.relief import color_relief
 
     if options.drape is not None:
@@ -206,8 +206,8 @@ def _film(output: Path, scene: "Scene", cameras: "Sequence[Perspective]", looks:
     """A frame for each camera and look; the terrain is prepared once."""
     import numpy as np
 
-    from ...io.films import writing_film
-    from ...io.images import srgb_from_linear
+    from ...io.pictures.films import writing_film
+    from ...io.pictures.images import srgb_from_linear
     from ...rendering.render import prepare
     from ..block import lights, photograph
     from ..progress import bar

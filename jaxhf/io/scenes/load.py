@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ..scene.scene import Scene
-from .files import PathLike, by_ending, require_file, require_precision
+from ...scene.scene import Scene
+from ..files import PathLike, by_ending, require_file, require_precision
 from .pbrt.reader import load_pbrt
 from .toml.scene import load_toml
 

@@ -13,21 +13,22 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ...core.affine import require_invertible
-from ...core.errors import ArgumentError
-from ...core.precision import fitted
-from ...scene import procedural
-from ...scene.camera import Camera
-from ...scene.cylinder import Cylinder
-from ...scene.heightfield import Heightfield
-from ...scene.light import Directional, Light
-from ...scene.scene import Object, Scene
-from ...scene.texture import ImageTexture, Wrap
-from ..errors import SceneError, nearest, resolve_inside
-from ..images import TRANSFERS, load_image
-from ..load_terrain import jacksboro_file, read_terrain
-from ..terrain import Terrain
+from ....core.affine import require_invertible
+from ....core.errors import ArgumentError
+from ....core.precision import fitted
+from ....scene import procedural
+from ....scene.camera import Camera
+from ....scene.cylinder import Cylinder
+from ....scene.heightfield import Heightfield
+from ....scene.light import Directional, Light
+from ....scene.scene import Object, Scene
+from ....scene.texture import ImageTexture, Wrap
+from ...errors import SceneError, nearest, resolve_inside
+from ...pictures.images import TRANSFERS, load_image
+from ...terrain.load import jacksboro_file, read_terrain
+from ...terrain.terrain import Terrain
 from .checks import Part
+from .priors import Provenance
 from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, OBJECT, ORIGINS, SCENE, TEXTURES, Key, Keys
 from .values import word
 
@@ -38,7 +39,7 @@ def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
     values = read_scene(part)
     camera = read_camera(part.at("camera"))
     objects = read_objects(part, np.dtype(dtype))
-    lights = read_lights(part, next((stored for _, stored in objects if stored is not None), None))
+    lights = read_lights(part, next((known.stored for _, known in objects if known and known.stored), None))
     return part.made(Scene, [item for item, _ in objects], camera, lights, samples=values["samples"])
 
 
@@ -89,8 +90,8 @@ def _light(part: Part, terrain: Terrain | None) -> Light:
     return light
 
 
-def read_objects(part: Part, dtype: np.dtype) -> list[tuple[Object, Terrain | None]]:
-    """The objects of a scene with its textures; beside those from a terrain file, this file in its own coordinates."""
+def read_objects(part: Part, dtype: np.dtype) -> list[tuple[Object, Provenance | None]]:
+    """The objects of a scene with its textures; beside each heightfield, where it is from."""
     textures = {name: _texture(part.at("textures", name)) for name in part.table.get("textures", {})}
     return [_object(item, textures, dtype) for item in part.all("objects")]
 
@@ -122,7 +123,7 @@ def named_file(part: Part, name: str) -> Path:
     return resolve_inside(part.path.parent, part.path.parent, name)
 
 
-def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> tuple[Object, Terrain | None]:
+def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> tuple[Object, Provenance | None]:
     is_field = part.choice("shape", ("heightfield", "cylinder")) == "heightfield"
     make_material, material_keys = MATERIALS[part.choice("material", MATERIALS, "matte")]
     common: Keys = {**OBJECT, **material_keys}
@@ -132,10 +133,10 @@ def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> t
     material = part.made(make_material, **{name: _painted(part.at(name), values[name], textures) for name in material_keys})
     shape_values = {name: values[name] for name in shape_keys}
     if is_field:
-        shape, stored = part.made(_heightfield, part, shape_values, dtype)
+        shape, known = part.made(_heightfield, part, shape_values, dtype)
     else:
-        shape, stored = part.made(Cylinder, **shape_values), None
-    return Object(shape, material, world), stored
+        shape, known = part.made(Cylinder, **shape_values), None
+    return Object(shape, material, world), known
 
 
 def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
@@ -161,19 +162,21 @@ def _field_keys(part: Part, common: Keys) -> Keys:
     return {**ORIGINS[origin], **GRID, **source}
 
 
-def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> tuple[Heightfield, Terrain | None]:
+def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> tuple[Heightfield, Provenance]:
     if values["z_scale"] == 0:
         raise ArgumentError("", "z_scale", "must not be zero, it is 0")
     source = values.get("source")
     grid = {name: values[name] for name in ("dx", "dy", "x0", "y0") if values[name] is not None}
     if "file" in values or source == "jacksboro":
 
-        def load() -> tuple[Terrain, Terrain]:
-            path = named_file(part, values["file"]) if "file" in values else jacksboro_file()
-            stored = read_terrain(path, values["z_scale"], values.get("nodata"))
-            return stored.in_metres(**grid), stored
+        def load() -> Provenance:
+            path = named_file(part, values["file"]) if "file" in values else None
+            z_scale, nodata = values["z_scale"], values.get("nodata")
+            stored = read_terrain(path or jacksboro_file(), z_scale, nodata)
+            return Provenance(stored.in_metres(**grid), stored, path, bool(grid), z_scale, nodata)
 
-        terrain, stored = part.at("source" if source else "file").made(load)
-        return terrain.heightfield(dtype), stored
+        known = part.at("source" if source else "file").made(load)
+        return known.placed.heightfield(dtype), known
     heights = procedural.HEIGHTS[source](**{name: values[name] for name in HEIGHTS[source]}) if source else values["heights"]
-    return Heightfield(fitted(heights * values["z_scale"], dtype), **grid), None
+    field = Heightfield(fitted(heights * values["z_scale"], dtype), **grid)
+    return field, Provenance.of(field, grid, values["z_scale"])

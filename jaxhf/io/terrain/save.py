@@ -1,6 +1,5 @@
 """Heights to terrain files that `load_heights` reads back as they were."""
 
-import dataclasses
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -8,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .codecs import write_png
-from .errors import FileError
-from .exr import write_channels
-from .files import PathLike, reading, replacing, require_file, require_writable, write_npy
+from ..errors import FileError
+from ..files import PathLike, replacing, require_file, require_writable, write_npy
+from ..pictures.codecs import write_png
+from ..pictures.exr import write_channels
 from .grids import write_asc
-from .rasters import georeference_of, geotiff
+from .rasters import geotiff, placed_like
 from .sidecars import beside
 from .terrain import Terrain
 
@@ -42,20 +41,12 @@ def save_heights(path: PathLike, terrain: Terrain | ArrayLike, like: PathLike | 
     path = require_writable_heights(path)
     terrain = _terrain(path, terrain)
     if like is not None and path.suffix.lower() in (".tif", ".tiff"):
-        terrain = _placed_like(terrain, require_file(like))
+        terrain = placed_like(terrain, require_file(like))
     with replacing(path, beside(path, terrain)) as temporary:
         try:
             _WRITERS[path.suffix.lower()](temporary, terrain)
         except FileError as error:
             raise FileError(f"{path}: {error}") from error
-
-
-def _placed_like(terrain: Terrain, like: Path) -> Terrain:
-    with reading(like):
-        place, shape = georeference_of(like)
-        if shape != terrain.heights.shape:
-            raise FileError(f"it must have the shape of the heights, {terrain.heights.shape}; it has {shape}")
-    return dataclasses.replace(place, heights=terrain.heights)
 
 
 def _terrain(path: Path, given: Any) -> Terrain:

@@ -3,15 +3,16 @@
 import dataclasses
 import math
 import warnings
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import DTypeLike
 
-from ..core.errors import ArgumentError
-from ..core.precision import WORTH_A_WARNING, fitted, numbers, rounding
-from .errors import FileError
+from ...core.errors import ArgumentError
+from ...core.precision import WORTH_A_WARNING, fitted, numbers, rounding
+from ..errors import FileError
 from .georeference import (
     WGS84,
     WGS84_DEGREES,
@@ -24,7 +25,9 @@ from .georeference import (
 )
 
 if TYPE_CHECKING:
-    from ..scene.heightfield import Heightfield
+    from ...scene.heightfield import Heightfield
+
+Nodata = Callable[[float | None], float | None]  # what means no height, where a file names this value, or none, for it
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -137,7 +140,7 @@ class Terrain:
         Raises:
           ValueError: heights do not fit into `dtype`, or there are more than a `Heightfield` holds.
         """
-        from ..scene.heightfield import Heightfield  # with JAX, which converting a file does without
+        from ...scene.heightfield import Heightfield  # with JAX, which converting a file does without
 
         heights = self.heights if dtype is None else fitted(self.heights, dtype)
         return Heightfield(heights, self.dx, self.dy, self.x0, self.y0)

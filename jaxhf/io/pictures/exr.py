@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.extras import import_extra
-from .errors import FileError
-from .files import require_pixels, utf8_name
+from ...core.extras import import_extra
+from ..errors import FileError
+from ..files import require_pixels, utf8_name
 
 
 def read_channels(path: Path) -> dict[str, np.ndarray]:

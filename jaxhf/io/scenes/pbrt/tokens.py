@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ...core.errors import UserError
-from ..errors import SceneError
+from ....core.errors import UserError
+from ...errors import SceneError
 
 Values = Float[np.ndarray, " n"] | tuple[str, ...]
 

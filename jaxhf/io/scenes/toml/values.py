@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ...core.affine import rotate, scale, translate
-from ...core.types import MOST
-from ..errors import nearest
+from ....core.affine import rotate, scale, translate
+from ....core.types import MOST
+from ...errors import nearest
 
 _FARTHEST = 1e18  # of a position: squares of distances are numbers in single precision
 

@@ -5,8 +5,8 @@ import math
 import re
 from typing import NamedTuple
 
-from ..core.extras import import_extra
-from .errors import FileError
+from ...core.extras import import_extra
+from ..errors import FileError
 
 
 class Ellipsoid(NamedTuple):

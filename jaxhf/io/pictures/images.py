@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from ..core.errors import ArgumentError
-from . import files
+from ...core.errors import ArgumentError
+from .. import files
+from ..errors import FileError
+from ..files import PathLike, by_ending, reading, replacing, require_file
 from .codecs import OF_BYTES, READERS, WRITERS
-from .errors import FileError
 from .exr import channels_of, write_channels
-from .files import PathLike, by_ending, reading, replacing, require_file
 
 
 def load_image(path: PathLike, *, transfer: str | None = None) -> Float32[np.ndarray, "h w 3"]:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..core.errors import ArgumentError, kind_of
-from ..core.extras import import_extra
-from .files import PathLike, replacing, require_writable
-from .images import linear_from_srgb
+from ...core.errors import ArgumentError, kind_of
+from ...core.extras import import_extra
+from ..files import PathLike, replacing, require_writable
+from ..pictures.images import linear_from_srgb
 from .terrain import Terrain
 
 MESHES = (".glb", ".obj", ".ply")
@@ -36,9 +36,8 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
       uv: whether each vertex has its position in the footprint, 0..1 to the east and to the north, for an image to be draped.
 
     Raises:
-      ValueError: the ending is not known, trimesh is missing, `path` is a folder, no cell has four heights, or `base`,
-        `colours` or `uv` cannot be; see there.
-      FileNotFoundError, PermissionError: the folder does not exist, or cannot be written to.
+      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or no cell has four heights, or `base`, `colours`
+        or `uv` cannot be, see there.
     """
     path = require_writable_mesh(path)
     if not hasattr(terrain, "dx"):  # as of a Heightfield, which would import JAX here

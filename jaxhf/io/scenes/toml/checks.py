@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ...core.errors import ArgumentError, UserError
-from ..errors import SceneError, nearest
+from ....core.errors import ArgumentError, UserError
+from ...errors import SceneError, nearest
 from .lines import Where, follow, line_of
 from .tables import Keys
 

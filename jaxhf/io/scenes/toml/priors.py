@@ -1,23 +1,26 @@
-"""Start and prior heights of a fit file: terrain files, resampled to the vertices of the terrain that is sought."""
+"""Where a heightfield is from, and the start and prior heights of a fit file, resampled to its vertices."""
 
 import dataclasses
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import FileError
-from ..load_terrain import read_terrain
-from ..resample import at_vertices
-from ..terrain import Terrain
+from ....scene.heightfield import Heightfield
+from ...errors import FileError
+from ...terrain.georeference import CoordinateSystem
+from ...terrain.load import read_terrain
+from ...terrain.resample import at_vertices
+from ...terrain.terrain import Terrain
 
 
 @dataclasses.dataclass(frozen=True)
-class Sought:
-    """The heightfield that a fit recovers, as far as other files of heights depend on it.
+class Provenance:
+    """Where a heightfield is from, as far as other files of heights depend on it.
 
     Attributes:
-      placed: where the scene puts it; None: the scene has no heightfield.
+      placed: where the scene puts it; None: there is no heightfield.
       stored: its file, in that file's coordinates; None: there is none.
       path: that file.
       moved: whether its table has any of dx, dy, x0 and y0.
@@ -31,13 +34,19 @@ class Sought:
     z_scale: float = 1.0
     nodata: float | None = None
 
+    @classmethod
+    def of(cls, field: Heightfield, grid: Collection[str] = (), z_scale: float = 1.0) -> "Provenance":
+        """That of heights in no file. They have a `crs` if `grid`, the keys of their table, has x0, y0 and the cell size."""
+        crs = CoordinateSystem() if {"x0", "y0"} <= set(grid) and not {"dx", "dy"}.isdisjoint(grid) else None
+        return cls(Terrain(np.asarray(field.heights), field.dx, field.dy, field.x0, field.y0, crs), z_scale=z_scale)
+
     @property
     def like(self) -> Path | None:
         """The GeoTIFF whose georeference the heights have; None: there is none."""
         return self.path if self.path and not self.moved and self.path.suffix.lower() in (".tif", ".tiff") else None
 
     def grid(self, path: Path, other: Terrain) -> Terrain | None:
-        """The sought grid in coordinates that can be compared with those of `other`, which is the file `path`.
+        """Its grid in coordinates that can be compared with those of `other`, which is the file `path`.
 
         They are those of the terrain's own file if both files are in degrees, name the same system, or are one file: the
         scene may have moved or scaled the terrain. Else they are the scene's.
@@ -49,7 +58,7 @@ class Sought:
         return self.stored if same else self.placed
 
 
-def known_heights(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
+def known_heights(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
     """Heights as `start` and `prior` of `fit` take them.
 
     If the file and the terrain both have a `crs`: its heights, resampled to the terrain's vertices. Else the heights of the
@@ -58,8 +67,8 @@ def known_heights(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
     Raises:
       FileNotFoundError, ValueError: as `load_heights`; or the file does not cover the terrain, or has holes in it.
     """
-    terrain = read_terrain(path, sought.z_scale, sought.nodata, nodata_overrules=False)
-    heights, grid = terrain.heights, sought.grid(path, terrain)
+    terrain = read_terrain(path, field.z_scale, field.nodata, nodata_overrules=False)
+    heights, grid = terrain.heights, field.grid(path, terrain)
     if terrain.crs is not None and grid is not None and grid.crs is not None:
         if terrain.crs.degrees and not grid.crs.degrees:
             raise FileError("it must lie in the coordinates of the terrain, it lies in degrees")
@@ -73,6 +82,6 @@ def known_heights(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
     return heights
 
 
-def known_deviations(sought: Sought, path: Path) -> Float[np.ndarray, "my mx"]:
+def known_deviations(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
     """Standard deviations of such heights; they have no sign."""
-    return known_heights(dataclasses.replace(sought, z_scale=abs(sought.z_scale)), path)
+    return known_heights(dataclasses.replace(field, z_scale=abs(field.z_scale)), path)

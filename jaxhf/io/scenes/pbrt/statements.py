@@ -8,14 +8,14 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import SceneError, nearest
+from ...errors import SceneError, nearest
 from .tokens import Token, Values, tokenize
 
-Parameters = Mapping[str, Token]  # the defaults of a kind's parameters, by the keys of the file such as "float fov"
+Parameters = Mapping[str, Any]  # the defaults of a kind's parameters by their declarations, "float fov"; ...: must be given
 Kinds = Mapping[str, Parameters]
 Rule = tuple[Callable[[Any], bool], str]  # whether a value is allowed, and what it must be
 
-_REQUIRED, _MANY = "[]", "[...]"  # in place of a default
+_COUNTS = {"color": 3, "point": 3, "float Pz": None}  # of values, by type or declaration: else one; None: any number
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,6 @@ class Arguments:
     def require(self, declared: str, valid: bool, rule: str) -> None:
         if not valid:
             raise self.error(declared, f"{declared.split()[1]} must {rule}, it is {self.values[declared]}")
-
-    def colour(self, declared: str) -> Any:
-        """Of a light or a surface: SceneError where it is negative."""
-        self.require(declared, bool(np.all(self[declared] >= 0)), "be 0 or more")
-        return self[declared]
 
 
 @dataclass(frozen=True)
@@ -98,7 +93,7 @@ class Statement:
         defaults = kinds.get(kind.name())
         if defaults is None:
             raise kind.error(f"unknown {word} {kind}; {nearest(kind.name()[:60], kinds)}")
-        values: dict[str, Any] = {}
+        values = dict(defaults)
         tokens: dict[str, Token] = {}
         pairs = self.rest[at + 1 :]
         for k in range(0, len(pairs), 2):
@@ -108,15 +103,13 @@ class Statement:
             if k + 1 == len(pairs):
                 raise pairs[k].error(f"{declared!r} has no value")
             tokens[declared] = pairs[k + 1]
-            values[declared] = _value(declared, pairs[k + 1], defaults[declared].text == _MANY)
-        for declared, default in defaults.items():
-            if declared not in tokens:
-                if default.text in (_REQUIRED, _MANY):
-                    raise word.error(f"{word} {kind} must have a parameter {declared!r}")
-                values[declared] = _value(declared, default, False)
+            values[declared] = _value(declared, pairs[k + 1])
+        for declared, value in values.items():
+            if value is ...:
+                raise word.error(f"{word} {kind} must have a parameter {declared!r}")
         found = Arguments(word, kind.name(), values, tokens)
         for declared, (holds, rule) in rules.items():
-            if declared in values:
+            if declared in tokens:
                 found.require(declared, holds(values[declared]), rule)
         return found
 
@@ -137,16 +130,6 @@ def statements(path: Path, text: str) -> Iterator[Statement]:
         yield Statement(word, tuple(rest))
 
 
-def kinds(text: str) -> Mapping[str, Kinds]:
-    """The kinds of each directive in statements that give every parameter its default."""
-    found: dict[str, dict[str, Parameters]] = {}
-    for statement in statements(Path(), text):
-        kind, *pairs = statement.rest
-        defaults = {name.name(): value for name, value in zip(pairs[::2], pairs[1::2], strict=True)}
-        found.setdefault(statement.word.text, {})[kind.name()] = defaults
-    return found
-
-
 def _declared(place: str, token: Token, table: Parameters) -> str:
     """The key in `table` that `token` declares."""
     if token.kind != "string":
@@ -160,17 +143,18 @@ def _declared(place: str, token: Token, table: Parameters) -> str:
     raise token.error(f"unknown parameter {declared!r} of {place}; {nearest(declared[:60], table)}")
 
 
-def _value(declared: str, token: Token, many: bool) -> Any:
+def _value(declared: str, token: Token) -> Any:
     """The value of a parameter: one of Python's, an array where it has three numbers or more, or a string."""
     kind = declared.split()[0]
-    values, count, is_text = token.values(), 3 if kind in ("color", "point") else 1, kind in ("string", "texture", "bool")
-    if isinstance(values, tuple) != is_text or not (many or len(values) == count):
-        raise token.error(f"{declared!r} takes {_amount(None if many else count, is_text)}, found {_counted(values)}")
+    values, is_text = token.values(), kind in ("string", "texture", "bool")
+    count = _COUNTS.get(declared, _COUNTS.get(kind, 1))
+    if isinstance(values, tuple) != is_text or count not in (None, len(values)):
+        raise token.error(f"{declared!r} takes {_amount(count, is_text)}, found {_counted(values)}")
     if isinstance(values, tuple):
         if kind == "bool" and values[0] not in ("true", "false"):
             raise token.error(f'{declared!r} must be "true" or "false", it is {values[0]!r}')
         return values[0] == "true" if kind == "bool" else values[0]
-    if many:
+    if count is None:
         return values
     if not np.isfinite(values).all():
         raise token.error(f"{declared!r} must be finite, it is {token}")

@@ -9,42 +9,43 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ArgumentError
-from ..core.extras import import_extra
-from .codecs import write_png
-from .errors import FileError
-from .files import PathLike, replacing, require_writable, write_npy
-from .gdal import opened
+from ...core.errors import ArgumentError
+from ...core.extras import import_extra
+from ..errors import FileError
+from ..files import PathLike, reading, replacing, require_writable, write_npy
+from ..gdal import opened
+from ..pictures.codecs import write_png
 from .georeference import Georeference, coordinate_system
 from .sidecars import beside
-from .terrain import Terrain, heights_of
+from .terrain import Nodata, Terrain, heights_of
 
 
-def read_raster(path: Path, nodata: float | None, overrules: bool) -> Terrain:
-    """The heights in a raster, in its own coordinates; `nodata` counts where the file names none, or where it `overrules`."""
+def read_raster(path: Path, nodata: Nodata) -> Terrain:
+    """The heights in a raster, in its own coordinates."""
     with opened(path) as dataset:
         if dataset.count != 1:
             raise FileError(f"heights must be one band, it has {dataset.count}")
-        tagged, (scale,), (offset,) = dataset.nodata, dataset.scales, dataset.offsets
+        (scale,), (offset,) = dataset.scales, dataset.offsets
         if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
             raise FileError(f"its scale and offset must be finite, the scale not zero; they are {scale} and {offset}")
-        used = tagged if nodata is None or (tagged is not None and not overrules) else nodata
+        used = nodata(dataset.nodata)
         heights = heights_of(dataset.read(1), used, scale, offset)
         if any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[0]):
             heights[dataset.dataset_mask() == 0] = np.nan
-        terrain = _placed(heights, dataset, nodata if used is None else used)
+        terrain = _placed(heights, dataset, used)
         if terrain.georeference is None:
             return terrain
         named = terrain.georeference._replace(z_unit=dataset.units[0] or "")
         return dataclasses.replace(terrain, georeference=named)
 
 
-def georeference_of(path: Path) -> tuple[Terrain, tuple[int, int]]:
-    """A raster's place, on a terrain of 2 x 2 heights, and its shape (ny, nx)."""
-    with opened(path) as dataset:
-        shape = dataset.height, dataset.width
-        corner = _placed(np.zeros((2, 2), np.float32), dataset, dataset.nodata)
-        return corner, shape
+def placed_like(terrain: Terrain, like: Path) -> Terrain:
+    """The heights of a terrain where a raster of their shape lies; FileError where it has another."""
+    with reading(like), opened(like) as dataset:
+        place, shape = _placed(np.zeros((2, 2), np.float32), dataset, dataset.nodata), (dataset.height, dataset.width)
+        if shape != terrain.heights.shape:
+            raise FileError(f"it must have the shape of the heights, {terrain.heights.shape}; it has {shape}")
+    return dataclasses.replace(place, heights=terrain.heights)
 
 
 def _placed(heights: np.ndarray, dataset: Any, nodata: float | None) -> Terrain:

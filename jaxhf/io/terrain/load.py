@@ -14,16 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from ..core.extras import import_extra
-from .codecs import read_grey
-from .errors import FileError
-from .files import PathLike, by_ending, read_npy, reading, require_file
-from .gdal import DRIVERS
+from ...core.extras import import_extra
+from ..errors import FileError
+from ..files import PathLike, by_ending, read_npy, reading, require_file
+from ..gdal import DRIVERS
+from ..pictures.codecs import read_grey
 from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
 from .grids import read_asc, read_hgt, read_mujoco
 from .rasters import read_raster
 from .sidecars import by_world_file
-from .terrain import Terrain, heights_of
+from .terrain import Nodata, Terrain, heights_of
 
 
 def load_heights(
@@ -74,12 +74,16 @@ def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = No
 
     Without `nodata_overrules`, `nodata` counts only where the file names no such value.
     """
+
+    def chosen(named: float | None) -> float | None:
+        return named if nodata is None or (named is not None and not nodata_overrules) else nodata
+
     path = require_file(path)
     reader = by_ending(_READERS, path, "read heights from")
     with reading(path):
         if not math.isfinite(z_scale) or z_scale == 0:
             raise FileError(f"z_scale must be finite and not zero, it is {z_scale}")
-        terrain = stored = reader(path, nodata, nodata_overrules)
+        terrain = stored = reader(path, chosen)
         if z_scale != 1:
             with np.errstate(over="ignore", invalid="ignore"):
                 scaled = terrain.heights * terrain.heights.dtype.type(z_scale)
@@ -127,15 +131,12 @@ def jacksboro_file() -> str:
     return str(matplotlib.cbook.get_sample_data("jacksboro_fault_dem.npz", asfileobj=False))
 
 
-# One reader a format: its path, the value that means that there is no height, and whether that overrules the file's own.
-
-
-def _read_npy(path: Path, nodata: float | None, _: bool) -> Terrain:
+def _read_npy(path: Path, nodata: Nodata) -> Terrain:
     with path.open("rb") as file:
-        return Terrain(heights_of(read_npy(file, path.stat().st_size), nodata))
+        return Terrain(heights_of(read_npy(file, path.stat().st_size), nodata(None)))
 
 
-def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
+def _read_npz(path: Path, nodata: Nodata) -> Terrain:
     with zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
 
@@ -161,25 +162,25 @@ def _read_npz(path: Path, nodata: float | None, _: bool) -> Terrain:
                 place = Georeference(str(array("crs", "U")), scale, offset, nodata_there, bool(number("point")), unit)
                 plain = place[1:3] == Georeference()[1:3]
                 grid |= {"georeference": place, "crs": coordinate_system(place.wkt) if plain else CoordinateSystem()}
-            return Terrain(heights_of(array(name), nodata), **grid)
+            return Terrain(heights_of(array(name), nodata(None)), **grid)
         if "elevation" not in members:
             raise FileError(f"it must hold an array 'heights', or only one, it holds {', '.join(sorted(members))}")
         missing = {"dx", "dy", "xmin", "ymin", "ymax"} - members.keys()
         if missing:
             raise FileError(f"beside 'elevation' it must hold {', '.join(sorted(missing))}")
-        heights = heights_of(array("elevation")[::-1], nodata)
+        heights = heights_of(array("elevation")[::-1], nodata(None))
         south = min(number("ymin"), number("ymax"))  # matplotlib's file has them swapped
         dx, dy = number("dx"), number("dy")
         crs, place = CoordinateSystem(degrees=True, globe=WGS84), Georeference(WGS84_DEGREES)
         return Terrain(heights, dx, dy, number("xmin") + dx / 2, south + dy / 2, crs, place)
 
 
-def _read_image(path: Path, nodata: float | None, _: bool) -> Terrain:
-    heights = heights_of(read_grey(path)[::-1], nodata)
+def _read_image(path: Path, nodata: Nodata) -> Terrain:
+    heights = heights_of(read_grey(path)[::-1], nodata(None))
     return by_world_file(path, heights) if path.suffix.lower() == ".png" else Terrain(heights)
 
 
-_READERS: dict[str, Callable[[Path, float | None, bool], Terrain]] = {
+_READERS: dict[str, Callable[[Path, Nodata], Terrain]] = {
     ".npy": _read_npy,
     ".npz": _read_npz,
     ".asc": read_asc,

@@ -5,12 +5,12 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from ...core.errors import ArgumentError
-from ...scene import procedural
-from ...scene.camera import Camera, Orthographic, Perspective
-from ...scene.cylinder import Cylinder
-from ...scene.light import Directional, Light, Point, Sky, Sun
-from ...scene.material import Material, Matte, Mirror
+from ....core.errors import ArgumentError
+from ....scene import procedural
+from ....scene.camera import Camera, Orthographic, Perspective
+from ....scene.cylinder import Cylinder
+from ....scene.light import Directional, Light, Point, Sky, Sun
+from ....scene.material import Material, Matte, Mirror
 from . import values as kinds
 
 

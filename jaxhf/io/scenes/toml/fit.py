@@ -1,7 +1,7 @@
 """Reads what to recover from which pictures: a scene with tables about pictures; `docs/guides/fit-files.md` describes it."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,20 +10,18 @@ import numpy as np
 from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
-from ...core.errors import ArgumentError, UserError
-from ...core.rules import OneOf, Whole
-from ...core.settings import Settings
-from ...scene.camera import Camera
-from ...scene.heightfield import Heightfield
-from ...scene.light import Light
-from ...scene.scene import Object, Scene
-from ..files import PathLike, by_ending, require_file, require_precision
-from ..georeference import CoordinateSystem
-from ..images import load_image, load_numbers
+from ....core.errors import ArgumentError, UserError
+from ....core.rules import OneOf, Whole
+from ....core.settings import Settings
+from ....scene.camera import Camera
+from ....scene.heightfield import Heightfield
+from ....scene.light import Light
+from ....scene.scene import Object, Scene
+from ...files import PathLike, by_ending, require_file, require_precision
+from ...pictures.images import load_image, load_numbers
 from ..pbrt.reader import load_pbrt
-from ..terrain import Terrain
 from .checks import Part
-from .priors import Sought, known_deviations, known_heights
+from .priors import Provenance, known_deviations, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene, transfer_of
 from .tables import SCENE, Key, Keys, optional
 from .values import flag, number, number_list, numbers, or_word, table, tables, whole, word
@@ -109,7 +107,7 @@ class _Base(NamedTuple):
     lights: tuple[Light, ...]
     samples: int
     camera: Callable[[tuple[int, ...]], Camera] | None
-    sought: Sought
+    field: Provenance  # of the first heightfield, which the fit recovers
 
 
 def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
@@ -132,14 +130,14 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     for name in ("start", "prior", "prior_std"):
         if isinstance(options.get(name), str):
             known = known_deviations if name == "prior_std" else known_heights
-            options[name] = _read(chosen, name, partial(known, base.sought), options[name])
+            options[name] = _read(chosen, name, partial(known, base.field), options[name])
     pictures = [_picture(picture, base, chosen, noise) for picture in part.all("pictures")]
     scenes, targets, weights, noises, names = zip(*pictures, strict=True)
     known = [value for value in noises if value is not None]
     if known and len(known) < len(noises):
         place = part.at("pictures", noises.index(None))
         raise place.error(f"{place.name} must have a noise, as another picture has one; or none, then it is estimated")
-    return Case(scenes, targets, weights, tuple(known) or None, settings, options, names, base.sought.like, part)
+    return Case(scenes, targets, weights, tuple(known) or None, settings, options, names, base.field.like, part)
 
 
 def _picture(
@@ -148,7 +146,7 @@ def _picture(
     """A picture's scene, radiance, weights, noise and name; `noise` is that of the table `chosen`, for all pictures."""
     given = part.read(_PICTURE)
     target = _read(part, "image", partial(load_image, transfer=transfer_of(part)), given["image"])
-    lights = base.lights if given["lights"] is None else read_lights(part, base.sought.stored)
+    lights = base.lights if given["lights"] is None else read_lights(part, base.field.stored)
     scene = part.made(Scene, base.objects, _camera(part, base, target.shape[:2]), lights, base.samples)
     weights = _weights(part, given, target)
     place, noise = (chosen, noise) if given["noise"] is None else (part, given["noise"])
@@ -176,35 +174,16 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
         other = open_toml(path)
         return _toml_base(other, read_scene(other)["samples"], dtype)
     scene = load_pbrt(path, dtype)
-    sought = _sought(part, [{}] * len(scene.objects), [(item, None) for item in scene.objects])
-    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, sought)
+    fields = (Provenance.of(item.shape) for item in scene.objects if isinstance(item.shape, Heightfield))
+    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, next(fields, Provenance()))
 
 
 def _toml_base(part: Part, samples: int, dtype: np.dtype) -> _Base:
     objects = read_objects(part, dtype)
     camera = partial(_sized, part.at("camera")) if "camera" in part.table else None
-    sought = _sought(part, part.table["objects"], objects)
-    lights = read_lights(part, sought.stored)
-    return _Base(tuple(item for item, _ in objects), tuple(lights), samples, camera, sought)
-
-
-def _sought(part: Part, tables: Sequence[dict[str, Any]], objects: Sequence[tuple[Object, Terrain | None]]) -> Sought:
-    """The first heightfield; each object has a table of `tables`, which is empty where it is not from TOML."""
-    for keys, (item, stored) in zip(tables, objects, strict=True):
-        if isinstance(item.shape, Heightfield):
-            given = {name: float(keys[name]) for name in ("dx", "dy", "x0", "y0") if name in keys}
-            placed = _placed(item.shape, given) if stored is None else stored.in_metres(**given)
-            path = named_file(part, keys["file"]) if "file" in keys else None
-            nodata = float(keys["nodata"]) if "nodata" in keys else None
-            return Sought(placed, stored, path, bool(given), float(keys.get("z_scale", 1)), nodata)
-    return Sought()
-
-
-def _placed(field: Heightfield, given: dict[str, float]) -> Terrain:
-    """Heights that come from no file, with a `crs` if their table gives x0, y0 and the cell size."""
-    known = {"x0", "y0"} <= given.keys() and not given.keys().isdisjoint(("dx", "dy"))
-    crs = CoordinateSystem() if known else None
-    return Terrain(np.asarray(field.heights), field.dx, field.dy, field.x0, field.y0, crs)
+    field = next((field for _, field in objects if field is not None), Provenance())
+    lights = read_lights(part, field.stored)
+    return _Base(tuple(item for item, _ in objects), tuple(lights), samples, camera, field)
 
 
 def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any:

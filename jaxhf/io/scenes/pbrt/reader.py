@@ -5,33 +5,32 @@ that is not there. What is read means what pbrt-v2 makes of it, but for the name
 which they stand, not to the first one.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ...core.affine import require_invertible
-from ...scene.camera import Perspective
-from ...scene.light import Light
-from ...scene.material import Material, Matte, Mirror
-from ...scene.scene import Object, Scene
-from ...scene.texture import ImageTexture
-from ..errors import SceneError, nearest, resolve_inside
-from ..images import load_image
-from .parts import DEFAULT_SAMPLES, KINDS, LIGHTS, RULES, SAMPLERS, SHAPES, TRANSFORMS, Matrix
+from ....core.affine import require_invertible
+from ....scene.camera import Perspective
+from ....scene.cylinder import Cylinder
+from ....scene.light import Directional, Light, Point
+from ....scene.material import Material, Matte, Mirror
+from ....scene.scene import Object, Scene
+from ....scene.texture import ImageTexture
+from ...errors import SceneError, nearest, resolve_inside
+from ...pictures.images import load_image
+from .parts import KINDS, RULES, TRANSFORMS, Matrix, heightfield
 from .statements import Arguments, Statement, statements
 from .tokens import Token, located
 
 
-def load_pbrt(path: str | Path, dtype: DTypeLike = np.float32) -> Scene:
+def load_pbrt(path: Path, dtype: DTypeLike = np.float32) -> Scene:
     """The scene that a .pbrt file describes; arguments and errors as those of `load_scene`.
 
     What it includes, and its images, must lie in its folder or below; a name is relative to the file in which it stands.
     """
-    path = Path(path)
     reader = _Reader(root=path.parent.resolve(), dtype=np.dtype(dtype))
     try:
         text = _read_text(path)
@@ -50,30 +49,27 @@ def _read_text(path: Path) -> str:
     return path.read_text(encoding="utf-8-sig", errors="replace")
 
 
-@dataclass(frozen=True)
-class _Graphics:
-    """What AttributeBegin saves and AttributeEnd brings back; `world_from_object` is pbrt's current transformation."""
-
-    world_from_object: Matrix = field(default_factory=lambda: np.eye(4))
-    material: Arguments | None = None
-    textures: Mapping[str, tuple[Path, Token]] = field(default_factory=dict)  # the picture, and where it is named
-
-
 @dataclass
 class _Reader:
-    """The scene as far as it has been read. Before WorldBegin the current transformation is camera_from_world."""
+    """The scene as far as it has been read.
+
+    `matrix` is pbrt's current transformation: camera_from_world before WorldBegin, world_from_object behind it. AttributeBegin
+    saves it with `material` and `textures`.
+    """
 
     root: Path
     dtype: np.dtype
     block: str = "options"
     world: Token | None = None
-    graphics: _Graphics = field(default_factory=_Graphics)
-    saved: list[tuple[Token, _Graphics]] = field(default_factory=list)
+    matrix: Matrix = field(default_factory=lambda: np.eye(4))
+    material: Arguments | None = None
+    textures: dict[str, tuple[Path, Token]] = field(default_factory=dict)  # the picture, and where it is named
+    saved: list[tuple[Token, Matrix, Arguments | None, dict[str, tuple[Path, Token]]]] = field(default_factory=list)
     frames: dict[str, Matrix] = field(default_factory=dict)
     images: dict[Path, ImageTexture] = field(default_factory=dict)
     files: list[Path] = field(default_factory=list)
     resolution: tuple[int, int] = (640, 480)
-    samples: int = DEFAULT_SAMPLES
+    samples: int = 4  # of the "lowdiscrepancy" sampler that pbrt-v2 takes where a scene names none
     camera: Arguments | None = None
     objects: list[Object] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
@@ -93,16 +89,53 @@ class _Reader:
 
     def _execute(self, statement: Statement) -> None:
         word = statement.word
-        directive = _DIRECTIVES.get(word.text)
-        if directive is None:
-            raise word.error(f"unknown directive {str(word)!r}; {nearest(word.text[:60], _DIRECTIVES)}")
+        if word.text not in _BLOCKS:
+            raise word.error(f"unknown directive {str(word)!r}; {nearest(word.text[:60], _BLOCKS)}")
         if self.block == "end":
             raise word.error(f"{word} must not follow WorldEnd")
-        block, takes, run = directive
-        if block not in ("any", self.block):
+        if _BLOCKS[word.text] not in ("any", self.block):
             late = self.world is not None
             raise word.error(f"{word} must {'not ' if late else ''}follow WorldBegin")
-        run(self, takes(statement))
+        match word.text:
+            case "AttributeBegin" | "TransformBegin":
+                self.saved.append((statement.nothing(), self.matrix, self.material, self.textures))
+            case "AttributeEnd" | "TransformEnd":
+                self._restore(statement.nothing())
+            case "WorldBegin":
+                self._world_begin(statement.nothing())
+            case "WorldEnd":
+                self._world_end(statement.nothing())
+            case "Include":
+                self._include(statement.name())
+            case "Identity":
+                statement.nothing()
+                self.matrix = np.eye(4)
+            case "CoordinateSystem":
+                self.frames[statement.name().name()] = self.matrix
+            case "CoordSysTransform":
+                self._enter_frame(statement.name())
+            case "Texture":
+                self._declare_texture(statement)
+            case directive if directive in KINDS:
+                self._take(statement.arguments(KINDS[directive], RULES))
+            case _:
+                self._concatenate(statement)
+
+    def _take(self, args: Arguments) -> None:
+        """Takes what a directive with a kind says. PixelFilter and SurfaceIntegrator may only say what is done anyway."""
+        match args.word.text:
+            case "Film":
+                self.resolution = args["integer xresolution"], args["integer yresolution"]
+            case "Sampler":
+                self._sampler(args)
+            case "Camera":
+                self.camera, self.frames["camera"] = args, np.linalg.inv(self.matrix)
+            case "LightSource":
+                self._light_source(args)
+            case "Material":
+                self.material = args
+            case "Shape":
+                self._shape(args)
 
     # Blocks, files, attributes.
 
@@ -118,34 +151,26 @@ class _Reader:
         if self.camera is None:
             raise word.error("there must be a Camera before WorldBegin")
         self.block, self.world = "world", word
-        self._set_transform(np.eye(4))
-        self.frames["world"] = np.eye(4)
+        self.matrix = self.frames["world"] = np.eye(4)
 
     def _world_end(self, word: Token) -> None:
         if self.saved:
-            begin, _ = self.saved[-1]
+            begin, *_ = self.saved[-1]
             raise begin.error(f"this {begin} has no {begin.text.replace('Begin', 'End')}")
         if not self.objects:
             raise word.error("there must be a Shape before WorldEnd")
         self.block = "end"
-
-    def _save(self, begin: Token) -> None:
-        self.saved.append((begin, self.graphics))
 
     def _restore(self, end: Token) -> None:
         opened = end.text.replace("End", "Begin")
         if not self.saved or self.saved[-1][0].text != opened:
             last = f"; the last to be opened is {self.saved[-1][0]} in line {self.saved[-1][0].line}" if self.saved else ""
             raise end.error(f"this {end} has no {opened}{last}")
-        _, graphics = self.saved.pop()
-        if end.text == "TransformEnd":
-            graphics = replace(self.graphics, world_from_object=graphics.world_from_object)
-        self.graphics = graphics
+        _, self.matrix, material, textures = self.saved.pop()
+        if end.text == "AttributeEnd":
+            self.material, self.textures = material, textures
 
     # Transforms: the current one is multiplied from the right, so that the last directive acts first on points.
-
-    def _set_transform(self, matrix: Matrix) -> None:
-        self.graphics = replace(self.graphics, world_from_object=matrix)
 
     def _concatenate(self, statement: Statement) -> None:
         word = statement.word
@@ -157,42 +182,35 @@ class _Reader:
                 matrix = statement.matrix()
             require_invertible("", word.text, matrix)
             if word.text != "Transform":
-                matrix = self.graphics.world_from_object @ matrix
+                matrix = self.matrix @ matrix
                 require_invertible("", "the current transformation", matrix)
-            self._set_transform(matrix)
-
-    def _identity(self, _: Token) -> None:
-        self._set_transform(np.eye(4))
-
-    def _name_frame(self, name: Token) -> None:
-        self.frames[name.name()] = self.graphics.world_from_object
+            self.matrix = matrix
 
     def _enter_frame(self, name: Token) -> None:
         if name.name() not in self.frames:
             raise name.error(f"unknown coordinate system {name}; {nearest(name.name(), self.frames)}")
-        self._set_transform(self.frames[name.name()])
+        self.matrix = self.frames[name.name()]
 
-    # The camera and its picture.
-
-    def _film(self, args: Arguments) -> None:
-        self.resolution = args["integer xresolution"], args["integer yresolution"]
+    # The parts of the scene.
 
     def _sampler(self, args: Arguments) -> None:
-        self.samples = SAMPLERS[args.kind](args)
-
-    def _only_checked(self, args: Arguments) -> None:
-        """Of a directive whose parameters may have one value only."""
-
-    def _camera(self, args: Arguments) -> None:
-        with located(args.word):
-            self.frames["camera"] = np.linalg.inv(self.graphics.world_from_object)
-        self.camera = args
-
-    # The world.
+        if args.kind == "bestcandidate":
+            self.samples = args["integer pixelsamples"]
+            return
+        if args["bool jitter"]:
+            raise args.error("bool jitter", 'jitter must be "false": jittered samples, the default, are not supported')
+        side = args["integer xsamples"]
+        args.require("integer ysamples", args["integer ysamples"] == side, f"equal xsamples, {side}")
+        self.samples = side * side
 
     def _light_source(self, args: Arguments) -> None:
         with located(args.word):
-            self.lights.append(LIGHTS[args.kind](args, self.graphics.world_from_object))
+            if args.kind == "point":  # pbrt-v2 moves it by "from" after the transformation, so "from" counts in world units
+                light = Point(self.matrix[:3, 3] + args["point from"], args["color I"] * args["color scale"])
+            else:
+                towards = self.matrix[:3, :3] @ (args["point from"] - args["point to"])
+                light = Directional(towards, args["color L"] * args["color scale"])
+            self.lights.append(light)
 
     def _declare_texture(self, statement: Statement) -> None:
         name, value_type = statement.string(0), statement.string(1)
@@ -202,29 +220,29 @@ class _Reader:
         place = args.tokens["string filename"]
         with located(place):
             path = resolve_inside(self.root, self.files[-1].parent, args["string filename"])
-        self.graphics = replace(self.graphics, textures={**self.graphics.textures, name.name(): (path, place)})
-
-    def _set_material(self, args: Arguments) -> None:
-        self.graphics = replace(self.graphics, material=args)
+        self.textures = {**self.textures, name.name(): (path, place)}
 
     def _shape(self, args: Arguments) -> None:
-        matrix = self.graphics.world_from_object
         with located(args.word):
-            shape = SHAPES[args.kind](args, self.dtype)
-            self.objects.append(Object(shape, self._material(), None if np.array_equal(matrix, np.eye(4)) else matrix))
+            if args.kind == "heightfield":
+                shape = heightfield(args, self.dtype)
+            else:
+                shape = Cylinder(args["float radius"], args["float zmin"], args["float zmax"])
+            world_from_object = None if np.array_equal(self.matrix, np.eye(4)) else self.matrix
+            self.objects.append(Object(shape, self._made_material(), world_from_object))
 
-    def _material(self) -> Material:
+    def _made_material(self) -> Material:
         """Made where a shape uses it, with the textures of that place: pbrt-v2 lets a texture follow its material."""
-        args = self.graphics.material
+        args = self.material
         if args is None:
             return Matte(0.5)
         with located(args.word):
             if args.kind == "mirror":
-                return Mirror(args.colour("color Kr"))
-            return Matte(self._texture(args) if "texture Kd" in args.tokens else args.colour("color Kd"))
+                return Mirror(args["color Kr"])
+            return Matte(args["color Kd"] if args["texture Kd"] is None else self._texture(args))
 
     def _texture(self, args: Arguments) -> ImageTexture:
-        name, known = args["texture Kd"], self.graphics.textures
+        name, known = args["texture Kd"], self.textures
         if name not in known:
             hint = nearest(name[:60], known) if known else "there is none"
             raise args.error("texture Kd", f"unknown texture {name!r}; {hint}")
@@ -235,34 +253,10 @@ class _Reader:
         return self.images[path]
 
 
-def _arguments(statement: Statement) -> Arguments:
-    return statement.arguments(KINDS[statement.word.text], RULES)
-
-
-def _all(statement: Statement) -> Statement:
-    return statement
-
-
-# Where a directive may stand ("options", "world", "any"), what it takes, and what it does.
-_DIRECTIVES: Mapping[str, tuple[str, Callable[[Statement], Any], Callable[[_Reader, Any], None]]] = {
-    "AttributeBegin": ("world", Statement.nothing, _Reader._save),
-    "AttributeEnd": ("world", Statement.nothing, _Reader._restore),
-    "Camera": ("options", _arguments, _Reader._camera),
-    "CoordSysTransform": ("any", Statement.name, _Reader._enter_frame),
-    "CoordinateSystem": ("any", Statement.name, _Reader._name_frame),
-    "Film": ("options", _arguments, _Reader._film),
-    "Identity": ("any", Statement.nothing, _Reader._identity),
-    "Include": ("any", Statement.name, _Reader._include),
-    "LightSource": ("world", _arguments, _Reader._light_source),
-    "Material": ("world", _arguments, _Reader._set_material),
-    "PixelFilter": ("options", _arguments, _Reader._only_checked),
-    "Sampler": ("options", _arguments, _Reader._sampler),
-    "Shape": ("world", _arguments, _Reader._shape),
-    "SurfaceIntegrator": ("options", _arguments, _Reader._only_checked),
-    "Texture": ("world", _all, _Reader._declare_texture),
-    "TransformBegin": ("world", Statement.nothing, _Reader._save),
-    "TransformEnd": ("world", Statement.nothing, _Reader._restore),
-    "WorldBegin": ("options", Statement.nothing, _Reader._world_begin),
-    "WorldEnd": ("world", Statement.nothing, _Reader._world_end),
-    **dict.fromkeys(("ConcatTransform", "Transform", *TRANSFORMS), ("any", _all, _Reader._concatenate)),
+_BLOCKS: Mapping[str, str] = {  # where a directive may stand
+    **dict.fromkeys(("Camera", "Film", "PixelFilter", "Sampler", "SurfaceIntegrator", "WorldBegin"), "options"),
+    **dict.fromkeys(("AttributeBegin", "AttributeEnd", "TransformBegin", "TransformEnd", "WorldEnd"), "world"),
+    **dict.fromkeys(("LightSource", "Material", "Shape", "Texture"), "world"),
+    **dict.fromkeys(("CoordSysTransform", "CoordinateSystem", "Identity", "Include"), "any"),
+    **dict.fromkeys(("ConcatTransform", "Transform", *TRANSFORMS), "any"),
 }

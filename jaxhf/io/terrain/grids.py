@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import FileError
-from .files import require_pixels
+from ..errors import FileError
+from ..files import require_pixels
 from .georeference import WGS84_DEGREES, Georeference, coordinate_system
 from .sidecars import system_of
-from .terrain import Terrain, heights_of
+from .terrain import Nodata, Terrain, heights_of
 
 _KEYS = ["ncols", "nrows", "xllcorner", "xllcenter", "yllcorner", "yllcenter", "cellsize", "dx", "dy", "nodata_value"]
 
 
-def read_asc(path: Path, nodata: float | None, overrules: bool) -> Terrain:
+def read_asc(path: Path, nodata: Nodata) -> Terrain:
     """An ESRI ASCII grid, in float32, with the reference system of the .prj beside it."""
     text = path.read_text(encoding="latin-1")
     header: dict[str, float] = {}
@@ -43,8 +43,7 @@ def read_asc(path: Path, nodata: float | None, overrules: bool) -> Terrain:
             raise FileError("it is damaged: not all of its heights are numbers") from error
     if values.size != ny * nx:
         raise FileError(f"it is cut off or damaged: {nx} x {ny} heights take {nx * ny} numbers, it holds {values.size}")
-    tagged = header.get("nodata_value")
-    used = nodata if tagged is None or (nodata is not None and overrules) else tagged
+    used = nodata(header.get("nodata_value"))
     wkt, crs = system_of(path)
     place = Georeference(wkt, nodata=used, point="xllcenter" in header)
     return Terrain(heights_of(values.reshape(ny, nx)[::-1], used), dx, dy, west, south, crs, place)
@@ -69,7 +68,7 @@ def write_asc(path: Path, terrain: Terrain) -> None:
         file.writelines(" ".join([digits % height for height in row.tolist()]) + "\n" for row in rows)
 
 
-def read_hgt(path: Path, nodata: float | None, overrules: bool) -> Terrain:
+def read_hgt(path: Path, nodata: Nodata) -> Terrain:
     """A tile of SRTM: heights in metres at every 1" or 3" of a degree, whose south-western corner is the file's name."""
     name = re.match(r"([NS])(\d{2})([EW])(\d{3})", path.name, re.IGNORECASE)
     if name is None:
@@ -79,13 +78,13 @@ def read_hgt(path: Path, nodata: float | None, overrules: bool) -> Terrain:
     if side is None:
         raise FileError(f"it must hold 1201 x 1201 or 3601 x 3601 heights of two bytes, its size is {size} bytes")
     y0, x0 = (float(number) * (-1 if letter in "SWsw" else 1) for letter, number in ((name[1], name[2]), (name[3], name[4])))
-    void = -32768.0 if nodata is None or not overrules else nodata
+    void = nodata(-32768.0)
     heights = heights_of(np.fromfile(path, ">i2").reshape(side, side)[::-1], void)
     place = Georeference(WGS84_DEGREES, nodata=void, point=True)
     return Terrain(heights, 1 / (side - 1), 1 / (side - 1), x0, y0, coordinate_system(WGS84_DEGREES), place)
 
 
-def read_mujoco(path: Path, nodata: float | None, _: bool) -> Terrain:
+def read_mujoco(path: Path, nodata: Nodata) -> Terrain:
     """A height field of MuJoCo: rows and columns as int32, then float32, row 0 at -y. MuJoCo scales them to 0..1, we do not."""
     data = path.read_bytes()
     if len(data) < 8:
@@ -94,4 +93,4 @@ def read_mujoco(path: Path, nodata: float | None, _: bool) -> Terrain:
     require_pixels(ny, nx)
     if len(data) != 8 + 4 * ny * nx:
         raise FileError(f"it is cut off or damaged: {nx} x {ny} heights take {4 * ny * nx} bytes, it holds {len(data) - 8}")
-    return Terrain(heights_of(np.frombuffer(data, "<f4", offset=8).reshape(ny, nx), nodata))
+    return Terrain(heights_of(np.frombuffer(data, "<f4", offset=8).reshape(ny, nx), nodata(None)))

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from .errors import FileError
+from ..errors import FileError
 from .terrain import Terrain
 
 

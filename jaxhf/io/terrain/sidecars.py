@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import FileError
+from ..errors import FileError
 from .georeference import CoordinateSystem, Georeference, coordinate_system
 from .terrain import Terrain
 

@@ -9,7 +9,7 @@ import imageio.v3 as imageio
 import numpy as np
 from jaxtyping import UInt8
 
-from .files import PathLike, replacing, require_writable
+from ..files import PathLike, replacing, require_writable
 
 Add = Callable[[UInt8[np.ndarray, "h w 3"]], None]
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .errors import FileError
-from .files import PathLike, reading, require_file
-from .gdal import opened
-from .images import linear_from_srgb, load_image
+from ..errors import FileError
+from ..files import PathLike, reading, require_file
+from ..gdal import opened
+from ..pictures.images import linear_from_srgb, load_image
 from .terrain import Terrain
 
 _MOST = 4096  # texels along a side
@@ -28,8 +28,7 @@ def load_drape(path: PathLike, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
     """
     path = require_file(path)
     if path.suffix.lower() not in (".tif", ".tiff"):
-        image = np.asarray(load_image(path, transfer="srgb"))
-        return image[::-1] if image.ndim == 3 else np.repeat(image[::-1, :, None], 3, axis=-1)
+        return load_image(path, transfer="srgb")[::-1]
     with reading(path):
         return _placed(path, terrain)
 

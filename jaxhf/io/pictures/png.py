@@ -3,8 +3,8 @@
 import struct
 import zlib
 
-from .errors import FileError
-from .files import require_pixels
+from ..errors import FileError
+from ..files import require_pixels
 
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _ADAM7 = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))

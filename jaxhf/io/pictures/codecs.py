@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from .errors import FileError
+from ..errors import FileError
+from ..files import read_npy, require_pixels, write_npy
+from ..gdal import opened
 from .exr import channels_of, read_channels, read_exr, write_channels
-from .files import read_npy, require_pixels, write_npy
-from .gdal import opened
 from .png import require_whole
 
 

@@ -1,0 +1,1 @@
+"""Pictures and films: files to arrays, rows from the top, and back."""

@@ -1,0 +1,1 @@
+"""Scene files of either format, and cases for a fit."""
