@@ -39,7 +39,7 @@ def slope(
         rise = np.sqrt(x * x + y * y) / run
         return np.minimum(100 * rise, np.finfo(np.float32).max) if percent else np.arctan(rise) * (180 / np.pi)
 
-    return over_windows(ground.north_first(), formula, compute_edges, NODATA, np.float32)[::-1].copy()
+    return over_windows(ground.heights, formula, compute_edges, np.float32(NODATA))
 
 
 def aspect(
@@ -77,4 +77,4 @@ def aspect(
         angle = np.where(angle == turn, np.float32(0), angle)
         return np.where((west == 0) & (south == 0), nothing, angle)
 
-    return over_windows(ground.north_first(), formula, compute_edges, nothing, np.float32)[::-1].copy()
+    return over_windows(ground.heights, formula, compute_edges, nothing)
