@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
     mesh = worthwhile_mesh(rays) if options.devices is None else local_mesh()
     require_memory(scene, mesh.size)
     compiling, begin = CompileTime(), time.perf_counter()
-    with compiled_bar(compiling.so_far, unit=" pixels", unit_scale=True) as advance:
+    with compiled_bar(unit=" pixels", unit_scale=True) as advance:
         image, found = render(scene, settings, aovs=tuple(dict.fromkeys(("exhausted", *aovs))), progress=advance, mesh=mesh)
     seconds = max(time.perf_counter() - begin - compiling.seconds, 1e-9)
     save_image(options.output, image, aovs={name: found[name] for name in aovs})
