@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.extras import import_extra
 from ..fitting.fit import Fit
 from ..fitting.view import differences, sun
 from ..scene.heightfield import Heightfield
@@ -28,7 +27,7 @@ img {{ max-width: 100% }} th {{ text-align: left; padding-right: 2em; font-weigh
 
 
 def report(title: str, case: "Case", found: Fit) -> str:
-    """An HTML page that needs no other file; ValueError where matplotlib is not installed."""
+    """An HTML page that needs no other file; its plots are matplotlib's."""
     rows = [*_summary(case, found), *facts(case, found)]
     table = "".join(f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in rows)
     figures = (
@@ -85,7 +84,6 @@ def _listed(values: Any, digits: int) -> str:
 
 
 def _figure(rows: int, columns: int, height: float) -> tuple[Any, np.ndarray]:
-    import_extra("matplotlib", "a report needs", "plot")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, height), layout="constrained")
