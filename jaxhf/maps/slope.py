@@ -23,11 +23,8 @@ def slope(
     """The steepest slope at each vertex, in degrees (or percent): shape (ny, nx), float32, -9999 where there is no value.
 
     Args:
-      heights, dx, dy, scale, algorithm, compute_edges: see `hillshade`.
+      heights, dx, dy, scale, algorithm, compute_edges: see `hillshade`, whose errors it has, too.
       percent: rise over run, times 100.
-
-    Raises:
-      ArgumentError: as `hillshade`.
     """
     require_one_of("slope", "algorithm", algorithm, ALGORITHMS)
     ground = surface("slope", heights, dx, dy, scale)
@@ -55,12 +52,9 @@ def aspect(
     As in GDAL cells count as square: where they are not, a diagonal slope's aspect is that of the grid, not of the ground.
 
     Args:
-      heights, algorithm, compute_edges: see `hillshade`.
+      heights, algorithm, compute_edges: see `hillshade`, whose errors it has, too.
       trigonometric: counterclockwise from east.
       zero_for_flat: 0 in place of -9999.
-
-    Raises:
-      ArgumentError: as `hillshade`.
     """
     require_one_of("aspect", "algorithm", algorithm, ALGORITHMS)
     ground = surface("aspect", heights, 1.0, scale=1.0)
