@@ -102,12 +102,12 @@ def _heights(found: Fit, field: Heightfield) -> Any:
     )  # fmt: skip
     # Rows grow to the north, for which matplotlib takes a negative spacing.
     relief = LightSource(315, 45).hillshade(heights, dx=field.dx, dy=-field.dy)
-    span = {"vmin": heights.min(), "vmax": heights.max()}
+    span, most = {"vmin": heights.min(), "vmax": heights.max()}, float(np.abs(heights - start).max()) or 1.0
     panels: list[tuple[str, np.ndarray, dict[str, Any]]] = [
         ("found", heights, span),
         ("found, lit from the north-west", relief, {"cmap": "gray", "vmin": 0, "vmax": 1}),
         ("of the scene, before", start, span),
-        ("found - before", heights - start, {"cmap": "RdBu_r", **_symmetric(heights - start)}),
+        ("found - before", heights - start, {"cmap": "RdBu_r", "vmin": -most, "vmax": most}),
     ]
     if found.std is not None:
         panels.append(("standard deviation", np.where(np.isfinite(found.std), found.std, np.nan), {"cmap": "magma"}))
@@ -124,11 +124,6 @@ def _heights(found: Fit, field: Heightfield) -> Any:
         if style.get("cmap") != "gray":
             figure.colorbar(shown, ax=axis)
     return figure
-
-
-def _symmetric(values: np.ndarray) -> dict[str, float]:
-    top = float(np.abs(values).max()) or 1.0
-    return {"vmin": -top, "vmax": top}
 
 
 def _pictures(found: Fit, targets: Sequence[np.ndarray], names: Sequence[str]) -> Any:
