@@ -86,19 +86,20 @@ def with_water(
     return np.fmax(heights, np.where(np.isnan(heights), np.nan, level)).astype(heights.dtype), np.where(deep > 0, sea, colours)
 
 
-def block(field: Heightfield, colours: Any, camera: Perspective, look: Look, base: float | None) -> Scene:
+def block(
+    field: Heightfield, colours: Float[np.ndarray, "h w 3"], camera: Perspective, look: Look, base: float | None
+) -> Scene:
     """A terrain with walls and a floor, under the sun and a sky.
 
     Args:
       field: the terrain.
-      colours: linear, 0 to 1: one (3,), of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
+      colours: linear, 0 to 1: of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
       camera: that is to see it.
       look: the sun.
       base: the level of the floor; None: neither walls nor a floor.
     """
-    at_vertices = np.shape(colours)[:-1] == field.heights.shape
-    colours = jnp.asarray(colours, field.heights.dtype)
-    albedo = ImageTexture(colours, at_vertices=at_vertices, wrap="clamp") if colours.ndim == 3 else colours
+    at_vertices = colours.shape[:2] == field.heights.shape
+    albedo = ImageTexture(jnp.asarray(colours, field.heights.dtype), at_vertices=at_vertices, wrap="clamp")
     objects = [Object(field, Matte(albedo))]
     if base is not None:
         objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))
