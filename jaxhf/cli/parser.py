@@ -45,12 +45,15 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
-    def read(self, words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
-        """What is known of these words, and the rest."""
+    def read(self, words: Sequence[str]) -> argparse.Namespace:
+        """What these words say; SystemExit, after one line, where there is something wrong with them."""
         try:
-            return self.parse_known_args(words)
+            options, unknown = self.parse_known_args(words)
         except argparse.ArgumentError as error:
             self.error(" ".join(filter(None, (error.argument_name, error.message))))
+        if unknown:
+            self.error(_unexpected(unknown, self))
+        return options
 
 
 def parser_of(command: Command) -> _Parser:
@@ -68,7 +71,7 @@ def parser_of(command: Command) -> _Parser:
 
 
 def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options of the command that these words name; SystemExit, after one line, where there is something wrong with them.
+    """The options of the command that these words name, with its `run`; see `_Parser.read`.
 
     Args:
       words: None: those of this process.
@@ -82,16 +85,10 @@ def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
     overview.add_argument("--version", action="version", version=f"jaxhf {__version__}")
     overview.add_argument("name", metavar="COMMAND", help=argparse.SUPPRESS)
     end = next((k for k, word in enumerate(words, 1) if not word.startswith("-")), len(words))
-    found, unknown = overview.read(words[:end])
-    if unknown:
-        _refuse(overview, unknown)
-    if found.name not in COMMANDS:
-        overview.error(_unknown_command(found.name))
-    parser = parser_of(COMMANDS[found.name])
-    options, unknown = parser.read(words[end:])
-    if unknown:
-        _refuse(parser, unknown)
-    return options
+    name = overview.read(words[:end]).name
+    if name not in COMMANDS:
+        overview.error(_unknown_command(name))
+    return parser_of(COMMANDS[name]).read(words[end:])
 
 
 def _unknown_command(word: str) -> str:
@@ -102,18 +99,18 @@ def _unknown_command(word: str) -> str:
     return f"unknown command {word!r}; {nearest(word, COMMANDS)}"
 
 
-def _refuse(parser: _Parser, unknown: Sequence[str]) -> NoReturn:
-    """Says which option may have been meant, or which command has it."""
-    word = next((word for word in unknown if word.startswith("-")), None)
+def _unexpected(words: Sequence[str], parser: _Parser) -> str:
+    """That a parser does not know these words; which of its options may have been meant, or which command has it."""
+    word = next((word for word in words if word.startswith("-")), None)
     if word is None:
-        parser.error(f"unexpected argument {unknown[0]!r}")
+        return f"unexpected argument {words[0]!r}"
     import difflib
 
     word = word.partition("=")[0]
     close = difflib.get_close_matches(word[2:], _options(parser), n=1)
     others = [name for name, command in COMMANDS.items() if word[2:] in _options(parser_of(command))]
     tail = f"; jaxhf {others[0]} has it" if others else ""
-    parser.error(f"unknown option {word}" + (f"; did you mean --{close[0]}?" if close else tail))
+    return f"unknown option {word}" + (f"; did you mean --{close[0]}?" if close else tail)
 
 
 def _options(parser: _Parser) -> list[str]:
