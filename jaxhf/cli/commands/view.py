@@ -136,16 +136,17 @@ def run(options: argparse.Namespace) -> None:
     z, colours, base = _solid(options, terrain, factor)
     arguments.set_up_jax(options)
     field = Heightfield(z, terrain.dx, terrain.dy)
-    cameras, looks = _frames(options, field, base, path, film)
-    scene = block(field, colours, cameras[0], looks[0], base)
+    frames = _frames(options, field, base, path, film)
+    camera, look = frames[0]
+    scene = block(field, colours, camera, look, base)
     require_memory(scene, local_mesh().size)
     ready, said = prepare(scene), "{} x {} pixels".format(*options.size)
     if film:
-        _film(output, ready, cameras, looks)
-        said = f"{len(cameras)} frames of {said}"
+        _film(output, ready, frames)
+        said = f"{len(frames)} frames of {said}"
     else:
-        with bar(total=looks[0].samples, unit=" samples", delay=0.5) as shown:
-            save_image(output, photograph(ready, cameras[0], looks[0], shown.update))
+        with bar(total=look.samples, unit=" samples", delay=0.5) as shown:
+            save_image(output, photograph(ready, camera, look, shown.update))
     print(f"{output}: {said}, heights x {factor:g}, {time.perf_counter() - begin:.1f} s")
 
 
@@ -180,7 +181,7 @@ def _solid(options: argparse.Namespace, terrain: "Terrain", factor: float) -> "t
 
 def _frames(
     options: argparse.Namespace, field: "Heightfield", base: float | None, path: "np.ndarray | None", film: bool
-) -> "tuple[list[Perspective], list[Look]]":
+) -> "list[tuple[Perspective, Look]]":
     """A camera and a look for each frame: round the terrain, or in a moving sun, whose `path` it is; for a picture one."""
     from ...scene.camera import Perspective
     from ..block import Look
@@ -195,11 +196,11 @@ def _frames(
         )
         for turn in ([360 * k / options.frames for k in range(options.frames)] if around else [0])
     ]
-    return cameras * len(looks), looks * len(cameras)
+    return [(camera, look) for camera in cameras for look in looks]  # of which one is alone
 
 
-def _film(output: Path, ready: "Prepared", cameras: "Sequence[Perspective]", looks: "Sequence[Look]") -> None:
-    """A frame for each camera and look."""
+def _film(output: Path, ready: "Prepared", frames: "Sequence[tuple[Perspective, Look]]") -> None:
+    """Writes frames of a block that was prepared in the light of the first one."""
     import numpy as np
 
     from ...io.films import writing_film
@@ -207,9 +208,9 @@ def _film(output: Path, ready: "Prepared", cameras: "Sequence[Perspective]", loo
     from ..block import lights, photograph
     from ..progress import bar
 
-    with writing_film(output, 24) as add, bar(total=len(looks), unit=" frames") as shown:
-        for camera, look in zip(cameras, looks, strict=True):
-            lit = ready if look is looks[0] else ready.with_lights(lights(ready.scene.heightfields[0], look))
+    with writing_film(output, 24) as add, bar(total=len(frames), unit=" frames") as shown:
+        for camera, look in frames:
+            lit = ready if look is frames[0][1] else ready.with_lights(lights(ready.scene.heightfields[0], look))
             image = photograph(lit, camera, look)
             add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
             shown.update()
