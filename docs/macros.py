@@ -48,11 +48,10 @@ def settings() -> str:
 
 def commands() -> str:
     """What each command's --help says, which its table of options holds."""
-    from jaxhf.cli.parser import Commands
+    from jaxhf.cli.parser import COMMANDS, parser_of
 
     os.environ["COLUMNS"] = "88"  # which argparse fills
-    parsers = Commands().parsers
-    return "\n\n".join(f"## {name}\n\n```text\n{parser.format_help()}```" for name, parser in parsers.items())
+    return "\n\n".join(f"## {name}\n\n```text\n{parser_of(command).format_help()}```" for name, command in COMMANDS.items())
 
 
 def define_env(env: Any) -> None:

@@ -69,10 +69,11 @@ PLACES = {  # what stands in these modules alone
     "lax.map(": MAPS_OVER_RAYS | {"xla/devices", "preparation/horizon", "fitting/jacobian", "mujoco/hfield"},
     "jax.jit": {"xla/compilation", "xla/insides", "xla/kernel", "xla/masked"},
     "shard_map(": {"xla/devices"},
+    "default_backend(": {"xla/devices", "xla/kept", "study/plan"},  # in the last to tell measurements apart
 }
 
 
-def test_rays_are_batched_and_compiled_in_few_places():
+def test_batches_compilation_and_backends_have_few_places():
     texts = {"/".join(_parts(path)): path.read_text() for path in MODULES}
     for word, places in PLACES.items():
         assert not {name for name, text in texts.items() if word in text} - places, word

@@ -33,9 +33,9 @@ def number(name: str, metavar: str, help: str, default: float | None = None, rul
     return option(name, type=partial(_converted, real_number, rule), metavar=metavar, default=default, help=help, **more)
 
 
-def whole(name: str, metavar: str, help: str, least: int | None = None) -> Option:
+def whole(name: str, metavar: str, help: str, least: int | None = None, default: int | None = None) -> Option:
     rule = _ANY if least is None else (f"a whole number from {least} on", lambda value: value >= least)
-    return option(name, type=partial(_converted, whole_number, rule), metavar=metavar, help=help)
+    return option(name, type=partial(_converted, whole_number, rule), metavar=metavar, default=default, help=help)
 
 
 def choice(name: str, names: Sequence[str], help: str, default: str | None = None) -> Option:
@@ -52,7 +52,6 @@ def _converted(convert: Callable[[str], Any], rule: Rule, text: str) -> Any:
 
 
 def real_number(text: str) -> float:
-    """What argparse takes for `type=float`, with a message of our own."""
     try:
         return float(text)
     except ValueError:
@@ -108,11 +107,6 @@ def _knob(field: "dataclasses.Field[Any]") -> Option:
 
 def settings(options: argparse.Namespace) -> Settings:
     return Settings(**{name: value for name, value in vars(options).items() if name in Settings.__dataclass_fields__})
-
-
-def examples(*commands: str) -> str:
-    """The end of a command's --help."""
-    return "\n  ".join(("examples:", *commands))
 
 
 def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
-from ..rendering.render import Prepared, prepare, render
+from ..rendering.render import Prepared, render
 from ..scene.camera import Perspective
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Light, Sky
@@ -86,19 +86,20 @@ def with_water(
     return np.fmax(heights, np.where(np.isnan(heights), np.nan, level)).astype(heights.dtype), np.where(deep > 0, sea, colours)
 
 
-def block(field: Heightfield, colours: Any, camera: Perspective, look: Look, base: float | None) -> Scene:
+def block(
+    field: Heightfield, colours: Float[np.ndarray, "h w 3"], camera: Perspective, look: Look, base: float | None
+) -> Scene:
     """A terrain with walls and a floor, under the sun and a sky.
 
     Args:
       field: the terrain.
-      colours: linear, 0 to 1: one (3,), of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
+      colours: linear, 0 to 1: of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
       camera: that is to see it.
       look: the sun.
       base: the level of the floor; None: neither walls nor a floor.
     """
-    at_vertices = np.shape(colours)[:-1] == field.heights.shape
-    colours = jnp.asarray(colours, field.heights.dtype)
-    albedo = ImageTexture(colours, at_vertices=at_vertices, wrap="clamp") if colours.ndim == 3 else colours
+    at_vertices = colours.shape[:2] == field.heights.shape
+    albedo = ImageTexture(jnp.asarray(colours, field.heights.dtype), at_vertices=at_vertices, wrap="clamp")
     objects = [Object(field, Matte(albedo))]
     if base is not None:
         objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))
@@ -113,26 +114,27 @@ def lights(field: Heightfield, look: Look) -> list[Light]:
 
 
 def photograph(
-    scene: Scene | Prepared, camera: Perspective, look: Look, progress: Callable[[], Any] | None = None
+    ready: Prepared, camera: Perspective, look: Look, progress: Callable[[], Any] | None = None
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance of a `block`, with haze before a background.
+    """Linear radiance of a prepared `block`, with haze before a background.
 
     Each of a pixel's samples gets haze by its own distance, so it is a picture of its own, from a camera that looks past the
     pixel's centre.
 
     Args:
-      scene: the block, which may be prepared.
+      ready: the block, in the lights of this look.
       camera: that sees it.
       look: the haze and the samples.
       progress: called after each sample.
     """
     side = math.isqrt(look.samples)
-    scene = scene if isinstance(scene, Prepared) else prepare(scene)
-    size = _length(scene.scene.objects[0].shape)
+    field = ready.scene.heightfields[0]
+    ny, nx = field.heights.shape
+    size = math.hypot((nx - 1) * field.dx, (ny - 1) * field.dy)
     total = np.zeros((camera.height, camera.width, 3))
     for k in range(side * side):
         dx, dy = ((k % side + 0.5) / side - 0.5, (k // side + 0.5) / side - 0.5)
-        image, aovs = render(scene.with_camera(_moved(camera, dx, dy)), aovs=("depth",))
+        image, aovs = render(ready.with_camera(_moved(camera, dx, dy)), aovs=("depth",))
         total += _in_haze(np.asarray(image, np.float64), np.asarray(aovs["depth"], np.float64), size, look.haze)
         if progress is not None:
             progress()
@@ -146,11 +148,6 @@ def _in_haze(image: np.ndarray, depth: np.ndarray, size: float, haze: float) -> 
     near = depth[met].min(initial=np.inf)
     share = (1 - haze) ** (np.where(met, depth - near, 0) / size)
     return np.where(met[..., None], image * share[..., None] + np.array(_HAZE) * (1 - share[..., None]), behind)
-
-
-def _length(field: Any) -> float:
-    ny, nx = field.heights.shape
-    return math.hypot((nx - 1) * field.dx, (ny - 1) * field.dy)
 
 
 def _moved(camera: Perspective, dx: float, dy: float) -> Perspective:

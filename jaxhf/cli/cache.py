@@ -101,10 +101,10 @@ def _remove_oldest(root: Path, most: int) -> None:
 def _mend(folder: Path) -> None:
     """Lets one warning stand for all about programs in this folder, and removes damaged ones, which JAX would not replace."""
     show, told = warnings.showwarning, set()
-    pattern = re.compile(r"Error (reading|writing) persistent compilation cache entry for '(.*?)': (.*)", re.DOTALL)
+    pattern = r"Error (reading|writing) persistent compilation cache entry for '(.*?)': (.*)"
 
     def mend(message: Warning | str, *place: Any, **more: Any) -> None:
-        found = pattern.fullmatch(str(message))
+        found = re.fullmatch(pattern, str(message), re.DOTALL)
         if found is None:
             return show(message, *place, **more)
         doing, program, why = found.groups()
@@ -116,5 +116,5 @@ def _mend(folder: Path) -> None:
             said = "damaged programs are compiled again" if doing == "reading" else "compiled programs are not kept"
             show(UserWarning(f"{folder}: {said}: {why}"), *place, **more)
 
-    warnings.filterwarnings("always", "Error (reading|writing) persistent compilation cache")
+    warnings.filterwarnings("always", pattern)
     warnings.showwarning = mend

@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from . import arguments
 
@@ -29,14 +28,3 @@ class Command:
     run: Callable[[argparse.Namespace], None]
     about: str = ""
     placed: bool = True
-
-    def add(self, commands: Any) -> None:
-        """Adds its parser to those of `parser.Commands`."""
-        examples = arguments.examples(*(f"jaxhf {self.name} {words}" for words in self.examples))
-        about = f"{self.line[0].upper()}{self.line[1:]}. {self.about}"
-        command = commands.add_parser(self.name, help=self.line, description=about.strip(), epilog=examples)
-        for title, options in self.options.items():
-            group = command.add_argument_group(title) if title else command
-            for names, keywords in options:
-                group.add_argument(*names, **keywords)
-        command.set_defaults(run=self.run, placed=self.placed)

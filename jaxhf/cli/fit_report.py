@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.extras import import_extra
 from ..fitting.fit import Fit
 from ..fitting.view import differences, sun
 from ..scene.heightfield import Heightfield
@@ -28,7 +27,7 @@ img {{ max-width: 100% }} th {{ text-align: left; padding-right: 2em; font-weigh
 
 
 def report(title: str, case: "Case", found: Fit) -> str:
-    """An HTML page that needs no other file; ValueError where matplotlib is not installed."""
+    """An HTML page that needs no other file; its plots are matplotlib's."""
     rows = [*_summary(case, found), *facts(case, found)]
     table = "".join(f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in rows)
     figures = (
@@ -85,7 +84,6 @@ def _listed(values: Any, digits: int) -> str:
 
 
 def _figure(rows: int, columns: int, height: float) -> tuple[Any, np.ndarray]:
-    import_extra("matplotlib", "a report needs", "plot")
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, height), layout="constrained")
@@ -104,12 +102,12 @@ def _heights(found: Fit, field: Heightfield) -> Any:
     )  # fmt: skip
     # Rows grow to the north, for which matplotlib takes a negative spacing.
     relief = LightSource(315, 45).hillshade(heights, dx=field.dx, dy=-field.dy)
-    span = {"vmin": heights.min(), "vmax": heights.max()}
+    span, most = {"vmin": heights.min(), "vmax": heights.max()}, float(np.abs(heights - start).max()) or 1.0
     panels: list[tuple[str, np.ndarray, dict[str, Any]]] = [
         ("found", heights, span),
         ("found, lit from the north-west", relief, {"cmap": "gray", "vmin": 0, "vmax": 1}),
         ("of the scene, before", start, span),
-        ("found - before", heights - start, {"cmap": "RdBu_r", **_symmetric(heights - start)}),
+        ("found - before", heights - start, {"cmap": "RdBu_r", "vmin": -most, "vmax": most}),
     ]
     if found.std is not None:
         panels.append(("standard deviation", np.where(np.isfinite(found.std), found.std, np.nan), {"cmap": "magma"}))
@@ -126,11 +124,6 @@ def _heights(found: Fit, field: Heightfield) -> Any:
         if style.get("cmap") != "gray":
             figure.colorbar(shown, ax=axis)
     return figure
-
-
-def _symmetric(values: np.ndarray) -> dict[str, float]:
-    top = float(np.abs(values).max()) or 1.0
-    return {"vmin": -top, "vmax": top}
 
 
 def _pictures(found: Fit, targets: Sequence[np.ndarray], names: Sequence[str]) -> Any:

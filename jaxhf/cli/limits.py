@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 # (docs/guides/devices.md). Less than that is asked for, so that what might fit is tried.
 _BYTES_A_HEIGHT = 45
 _BYTES_A_PIXEL = 40
-# A device more costs 7 ms a run, and rays take 10 (one terrain) to 300 ms (mirrors) to trace.
-_RAYS_A_DEVICE = 2**16
 
 
 def require_devices(devices: int | None) -> None:
@@ -23,11 +21,6 @@ def require_devices(devices: int | None) -> None:
         raise UserError(
             f"--devices must be a whole number from 1 to {most}, it is {devices}; {default_devices()} are best here"
         )
-
-
-def worthwhile_devices(rays: int) -> int:
-    """How many devices at most pay for so many camera rays."""
-    return max(1, rays // _RAYS_A_DEVICE)
 
 
 def require_memory(scene: "Scene", devices: int) -> None:

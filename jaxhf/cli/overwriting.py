@@ -30,7 +30,7 @@ def require_no_input(options: argparse.Namespace, *others: Path) -> None:
     for value in values.values():  # as it was written: a path would lose one of its slashes
         file_path("", value)
     outputs = [Path(values.pop(name)) for name in ("output", "report") if name in values] + list(others)
-    if getattr(options, "placed", True):
+    if options.placed:
         outputs += [beside for path in outputs if path.suffix.lower() in _PLACED for beside in _beside(path)]
     outputs = [path for path in outputs if path.is_file()]
     if not outputs:

@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core.version import __version__
-from . import arguments, tradeoff
-from .commands import convert, fit, info, maps, render, sky, view
+from .command import Command
+from .commands import convert, fit, info, maps, render, sky, tradeoff, view
 
 GROUPS = {
     "terrain maps": (*maps.COMMANDS, *sky.COMMANDS),
     "pictures": (view.COMMAND, render.COMMAND),
-    "recovery": (fit.COMMAND, tradeoff),
+    "recovery": (fit.COMMAND, tradeoff.COMMAND),
     "files": (convert.COMMAND, info.COMMAND),
 }
+COMMANDS = {command.name: command for group in GROUPS.values() for command in group}
 _EXAMPLES = """
 examples:
   jaxhf view terrain.tif -o terrain.png         a look at a terrain
@@ -40,81 +41,76 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any):
         super().__init__(formatter_class=_Formatter, exit_on_error=False, **options)
-        self.register("type", float, arguments.real_number)
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
 
-    def read(self, words: Sequence[str]) -> tuple[argparse.Namespace, list[str]]:
-        """What is known of these words, and the rest."""
+    def read(self, words: Sequence[str]) -> argparse.Namespace:
+        """What these words say; SystemExit, after one line, where there is something wrong with them."""
         try:
-            return self.parse_known_args(words)
+            options, unknown = self.parse_known_args(words)
         except argparse.ArgumentError as error:
             self.error(" ".join(filter(None, (error.argument_name, error.message))))
+        if unknown:
+            self.error(_unexpected(unknown, self))
+        return options
 
 
-class Commands:
-    """The parsers of all commands by their names, and the lines of `jaxhf --help` about them."""
-
-    def __init__(self):
-        self.parsers: dict[str, _Parser] = {}
-        self.lines = ["Renders heightfields, makes maps of them, and recovers them from pictures."]
-        for title, group in GROUPS.items():
-            self.lines += ["", f"{title}:"]
-            for command in group:
-                command.add(self)
-
-    def add_parser(self, name: str, *, help: str, **options: Any) -> argparse.ArgumentParser:
-        self.lines.append(f"  {name:<11} {help}")
-        command = self.parsers[name] = _Parser(prog=f"jaxhf {name}", **options)
-        command.add_argument("--quiet", action="store_true", help="print no report and no progress; warnings stay")
-        return command
+def parser_of(command: Command) -> _Parser:
+    """Reads the words after a command's name, and says by --help what may stand there."""
+    examples = "\n  ".join(("examples:", *(f"jaxhf {command.name} {words}" for words in command.examples)))
+    about = f"{command.line[0].upper()}{command.line[1:]}. {command.about}"
+    parser = _Parser(prog=f"jaxhf {command.name}", description=about.strip(), epilog=examples)
+    parser.add_argument("--quiet", action="store_true", help="print no report and no progress; warnings stay")
+    for title, options in command.options.items():
+        group = parser.add_argument_group(title) if title else parser
+        for names, keywords in options:
+            group.add_argument(*names, **keywords)
+    parser.set_defaults(run=command.run, placed=command.placed)
+    return parser
 
 
 def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options of the command that these words name; SystemExit, after one line, where there is something wrong with them.
+    """The options of the command that these words name, with its `run`; see `_Parser.read`.
 
     Args:
       words: None: those of this process.
     """
     words = sys.argv[1:] if words is None else words
-    commands = Commands()
-    usage, about = "jaxhf [-h] [--version] COMMAND ...", "\n".join(commands.lines)
-    overview = _Parser(prog="jaxhf", usage=usage, description=about, epilog=_EXAMPLES)
+    about = ["Renders heightfields, makes maps of them, and recovers them from pictures."]
+    for title, group in GROUPS.items():
+        about += ["", f"{title}:", *(f"  {command.name:<11} {command.line}" for command in group)]
+    usage = "jaxhf [-h] [--version] COMMAND ..."
+    overview = _Parser(prog="jaxhf", usage=usage, description="\n".join(about), epilog=_EXAMPLES)
     overview.add_argument("--version", action="version", version=f"jaxhf {__version__}")
     overview.add_argument("name", metavar="COMMAND", help=argparse.SUPPRESS)
     end = next((k for k, word in enumerate(words, 1) if not word.startswith("-")), len(words))
-    found, unknown = overview.read(words[:end])
-    if unknown:
-        _refuse(overview, unknown, commands)
-    if found.name not in commands.parsers:
-        overview.error(_unknown_command(found.name, commands))
-    options, unknown = commands.parsers[found.name].read(words[end:])
-    if unknown:
-        _refuse(commands.parsers[found.name], unknown, commands)
-    return options
+    name = overview.read(words[:end]).name
+    if name not in COMMANDS:
+        overview.error(_unknown_command(name))
+    return parser_of(COMMANDS[name]).read(words[end:])
 
 
-def _unknown_command(word: str, commands: Commands) -> str:
+def _unknown_command(word: str) -> str:
     if Path(word).suffix:
         return f"{word!r} is no command; one stands before its files, as in 'jaxhf info {word}'"
     from ..io.errors import nearest
 
-    return f"unknown command {word!r}; {nearest(word, commands.parsers)}"
+    return f"unknown command {word!r}; {nearest(word, COMMANDS)}"
 
 
-def _refuse(parser: _Parser, unknown: Sequence[str], commands: Commands) -> NoReturn:
-    """Says which option may have been meant, or which command has it."""
-    word = next((word for word in unknown if word.startswith("-")), None)
+def _unexpected(words: Sequence[str], parser: _Parser) -> str:
+    """That a parser does not know these words; which of its options may have been meant, or which command has it."""
+    word = next((word for word in words if word.startswith("-")), None)
     if word is None:
-        parser.error(f"unexpected argument {unknown[0]!r}")
+        return f"unexpected argument {words[0]!r}"
     import difflib
 
     word = word.partition("=")[0]
     close = difflib.get_close_matches(word[2:], _options(parser), n=1)
-    others = [name for name, command in commands.parsers.items() if word[2:] in _options(command)]
+    others = [name for name, command in COMMANDS.items() if word[2:] in _options(parser_of(command))]
     tail = f"; jaxhf {others[0]} has it" if others else ""
-    parser.error(f"unknown option {word}" + (f"; did you mean --{close[0]}?" if close else tail))
+    return f"unknown option {word}" + (f"; did you mean --{close[0]}?" if close else tail)
 
 
 def _options(parser: _Parser) -> list[str]:

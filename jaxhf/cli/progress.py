@@ -46,18 +46,15 @@ def bar(**options: Any) -> "tqdm[Any]":
 
 
 @contextlib.contextmanager
-def compiled_bar(compiling: Callable[[], float] | None = None, **options: Any) -> Iterator[Callable[[int, int], None]]:
-    """A bar that says "compiling" until the first report, and from then on how much of the time is left.
+def compiled_bar(**options: Any) -> Iterator[Callable[[int, int], None]]:
+    """A bar, with the options of `bar`, that says "compiling" until the first report, and from then on how much time is left.
 
-    Args:
-      compiling: the seconds that went to compilation since the bar began: what is left is estimated without them. None:
-        those that JAX reports.
-      options: of `bar`.
+    That is estimated without the seconds that JAX says went to compilation.
 
     Yields:
       What is to be called with (done, in all): the `progress` of `render`.
     """
-    spent = compiling or CompileTime().so_far
+    compiling = CompileTime()
     with bar(bar_format="{desc}", desc="compiling", smoothing=0, **options) as shown:
 
         def advance(done: int, total: int) -> None:
@@ -66,7 +63,7 @@ def compiled_bar(compiling: Callable[[], float] | None = None, **options: Any) -
             if shown.bar_format:
                 shown.bar_format = None
                 shown.set_description_str(refresh=False)
-                shown.start_t += spent()
+                shown.start_t += compiling.seconds
                 shown.last_print_t = 0  # the first report is shown, however soon it comes
             shown.total = total
             shown.update(done - shown.n)
@@ -126,9 +123,6 @@ class CompileTime:
 
         self.seconds, self.events = 0.0, ("/jax/core/compile/", LOADED)
         jax.monitoring.register_event_duration_secs_listener(self._add)
-
-    def so_far(self) -> float:
-        return self.seconds
 
     def _add(self, event: str, duration_secs: float, **_: Any) -> None:
         if event.startswith(self.events):

@@ -3,3 +3,4 @@
 ALGORITHMS = ("horn", "zevenbergen-thorne")
 VARIANTS = ("regular", "combined", "multidirectional", "igor")
 ENTRIES = ("interpolate", "nearest", "exact")
+WEIGHTINGS = ("solid-angle", "horizontal", "slope")

@@ -68,12 +68,12 @@ def hillshade(
         values = formula(light, window).astype(np.float32) + np.float32(0.5)
         return np.clip(values, 0, 255).astype(np.uint8)
 
-    result = over_windows(ground.north_first(), shade, compute_edges, 0, np.uint8)[::-1]
+    result = over_windows(ground.heights, shade, compute_edges, np.uint8(0))
     if shadows:
         relief = z_factor / ground.scale
         dark = ~lit(ground.heights, ground.dx / relief, ground.dy / relief, azimuth, altitude)
         result[dark & (result > 0)] = _SHADOW
-    return np.ascontiguousarray(result)
+    return result
 
 
 def require_light(owner: str, azimuth: float, altitude: float) -> None:

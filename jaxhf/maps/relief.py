@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 from jaxtyping import UInt8
 
+from ..core.precision import fitted
 from ..io.files import PathLike
 from .choices import ENTRIES
 from .hillshade import hillshade
@@ -31,7 +32,7 @@ def color_relief(
     """
     require_one_of("color_relief", "entries", entries, ENTRIES)
     ground = surface("color_relief", heights, 1.0, scale=1.0)
-    z = ground.north_first()[::-1]
+    z = fitted(ground.heights, np.float32)
     table = as_ramp(ramp, float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights)))
     bands = 4 if alpha else 3
     result = np.empty((*z.shape, bands), np.uint8)

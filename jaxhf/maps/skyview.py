@@ -29,6 +29,7 @@ from ..trace.normals import vertex_normals
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, on_every_device
 from ..xla.transfers import takes_numbers
+from .choices import WEIGHTINGS
 from .surface import with_spacing
 
 
@@ -101,17 +102,14 @@ def sky_view(
 
     Args:
       azimuths: how many directions, from north on at even steps.
-      terrain, dx, dy, progress, mesh: as for `horizon`.
+      terrain, dx, dy, progress, mesh: as for `horizon`, whose errors it has, too.
 
     Returns:
       Shape (ny, nx), nan where there is no height; differentiable in the heights.
-
-    Raises:
-      ValueError: an argument has a value that it cannot have.
     """
     field = _field("sky_view", terrain, dx, dy)
-    if weighting not in _WEIGHTINGS:
-        raise ArgumentError("sky_view", "weighting", f"must be among {', '.join(_WEIGHTINGS)}, it is {weighting!r}")
+    if weighting not in WEIGHTINGS:
+        raise ArgumentError("sky_view", "weighting", f"must be among {', '.join(WEIGHTINGS)}, it is {weighting!r}")
     found = _mapped("sky_view", weighting, field, even_azimuths(_count("sky_view", azimuths)), 0.0, progress, mesh)
     if weighting != "slope":
         return found
@@ -135,8 +133,9 @@ def _horizontal(slopes: jax.Array) -> jax.Array:
 
 _PARTS = 64  # of a map that reports its progress
 _ROOM = 4  # heights and horizontal distances are divided by it, so that differences of heights stay numbers
-_WEIGHTINGS: dict[str, Summary] = {"solid-angle": _solid_angle, "horizontal": _horizontal, "slope": sky_vector}
-_SUMMARIES: dict[str, Summary] = {"degrees": _degrees, **_WEIGHTINGS}
+_SUMMARIES: dict[str, Summary] = dict(
+    zip(("degrees", *WEIGHTINGS), (_degrees, _solid_angle, _horizontal, sky_vector), strict=True)
+)
 
 
 def _mapped(

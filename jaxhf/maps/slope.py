@@ -23,11 +23,8 @@ def slope(
     """The steepest slope at each vertex, in degrees (or percent): shape (ny, nx), float32, -9999 where there is no value.
 
     Args:
-      heights, dx, dy, scale, algorithm, compute_edges: see `hillshade`.
+      heights, dx, dy, scale, algorithm, compute_edges: see `hillshade`, whose errors it has, too.
       percent: rise over run, times 100.
-
-    Raises:
-      ArgumentError: as `hillshade`.
     """
     require_one_of("slope", "algorithm", algorithm, ALGORITHMS)
     ground = surface("slope", heights, dx, dy, scale)
@@ -39,7 +36,7 @@ def slope(
         rise = np.sqrt(x * x + y * y) / run
         return np.minimum(100 * rise, np.finfo(np.float32).max) if percent else np.arctan(rise) * (180 / np.pi)
 
-    return over_windows(ground.north_first(), formula, compute_edges, NODATA, np.float32)[::-1].copy()
+    return over_windows(ground.heights, formula, compute_edges, np.float32(NODATA))
 
 
 def aspect(
@@ -55,12 +52,9 @@ def aspect(
     As in GDAL cells count as square: where they are not, a diagonal slope's aspect is that of the grid, not of the ground.
 
     Args:
-      heights, algorithm, compute_edges: see `hillshade`.
+      heights, algorithm, compute_edges: see `hillshade`, whose errors it has, too.
       trigonometric: counterclockwise from east.
       zero_for_flat: 0 in place of -9999.
-
-    Raises:
-      ArgumentError: as `hillshade`.
     """
     require_one_of("aspect", "algorithm", algorithm, ALGORITHMS)
     ground = surface("aspect", heights, 1.0, scale=1.0)
@@ -77,4 +71,4 @@ def aspect(
         angle = np.where(angle == turn, np.float32(0), angle)
         return np.where((west == 0) & (south == 0), nothing, angle)
 
-    return over_windows(ground.north_first(), formula, compute_edges, nothing, np.float32)[::-1].copy()
+    return over_windows(ground.heights, formula, compute_edges, nothing)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..core.errors import ArgumentError
-from ..core.precision import fitted, numbers
+from ..core.precision import numbers
 from ..io.terrain.terrain import Terrain
 
 Heights = ArrayLike | Terrain
@@ -30,10 +30,6 @@ class Surface(NamedTuple):
     dy: float
     scale: float
 
-    def north_first(self) -> Float[np.ndarray, "ny nx"]:
-        """The heights in float32, in which GDAL reads all but short integers, and in the order of its rows."""
-        return fitted(self.heights, np.float32)[::-1]
-
 
 def surface(
     owner: str, heights: Heights, dx: float | None = None, dy: float | None = None, scale: float | None = None
@@ -42,9 +38,7 @@ def surface(
 
     Args:
       owner: that function, for messages.
-      heights: an array of shape (ny, nx), row 0 in the south, or a terrain.
-      dx, dy: the spacing; None: a terrain's own; an array must have one, which counts for both.
-      scale: vertical units in a horizontal one; None: 1, but a terrain in degrees is measured in metres at its middle latitude.
+      heights, dx, dy, scale: see `hillshade`.
 
     Raises:
       ArgumentError: heights are not a grid of numbers, none is finite, a number is not positive, or an array has no spacing.

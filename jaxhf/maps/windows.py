@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
+from ..core.precision import fitted
 from ..xla.machine import usable_cores
 
 Job = TypeVar("Job")
@@ -17,21 +18,21 @@ _AT_ONCE = 2**15  # heights: what a formula makes of them stays in a core's cach
 
 
 def over_windows(
-    z: Float32[np.ndarray, "ny nx"], formula: Callable[[Window], np.ndarray], compute_edges: bool, nodata: Any, dtype: Any
+    heights: Float[np.ndarray, "ny nx"], formula: Callable[[Window], np.ndarray], compute_edges: bool, nodata: np.generic
 ) -> np.ndarray:
-    """The formula's value at each vertex: shape (ny, nx), rows in the order of `z`.
+    """The formula's value at each vertex: shape (ny, nx), of the type of `nodata`.
 
     Where a neighbour is missing there is no value. With `compute_edges` a missing neighbour inside has the height of the
     centre; beyond the border heights go on in a straight line, and at a corner those of the border's row are repeated.
 
     Args:
-      z: heights, north first; nan where there is none.
+      heights: row 0 in the south, nan where there is none. They count in float32, in which GDAL reads all but short integers.
       formula: of a window's nine arrays; is called from several threads.
       compute_edges: see above.
       nodata: stands where there is no value.
-      dtype: of the result.
     """
-    result = np.full(z.shape, nodata, dtype)
+    z = fitted(heights, np.float32)[::-1]  # in the order of GDAL's rows
+    result = np.full(z.shape, nodata)
     holes = bool(np.isnan(z).any())
 
     def fill(job: tuple[np.ndarray, np.ndarray]) -> None:
@@ -41,16 +42,16 @@ def over_windows(
         if not holes:
             out[...] = formula(window)
             return
-        missing = [np.isnan(heights) for heights in window]
+        missing = [np.isnan(view) for view in window]
         if compute_edges:
-            window = tuple(np.where(gone, window[4], heights) for gone, heights in zip(missing, window, strict=True))
+            window = tuple(np.where(gone, window[4], view) for gone, view in zip(missing, window, strict=True))
             missing = missing[4:5]
         with np.errstate(invalid="ignore"):
             values = formula(window)
         np.copyto(out, values, where=~np.logical_or.reduce(missing))
 
     shared(fill, _with_edges(z, result) if compute_edges else _inside(z, result[1:-1, 1:-1]))
-    return result
+    return np.ascontiguousarray(result[::-1])
 
 
 def shared(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:

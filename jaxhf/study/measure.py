@@ -17,7 +17,7 @@ from ..rendering.render import render
 from ..scene.scene import Scene
 from ..scene.views import resized, shrunk
 from ..xla.compilation import compiled
-from ..xla.machine import peak_mb
+from ..xla.devices import peak_device_mb
 from .recovery import Recovery, dct_modes
 from .table import Row, Sweep, settings_of
 from .worker import Answers, timed
@@ -114,9 +114,7 @@ def prepare(job: tuple[Sweep, Row]) -> Answers:
     path = sweep.reference(one["task"])
 
     def first() -> dict[str, float]:
-        seconds, device = timed(measured.run)["seconds"], jax.local_devices()[0]
-        held = peak_mb() if device.platform == "cpu" else (device.memory_stats() or {}).get("peak_bytes_in_use", 0) / 2**20
-        return {"first_seconds": seconds, "peak_mb": held}
+        return {"first_seconds": timed(measured.run)["seconds"], "peak_mb": peak_device_mb()}
 
     def keep() -> dict[str, float]:
         with replacing(path) as temporary, temporary.open("wb") as file:

@@ -14,6 +14,10 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 
 from ..core.errors import ArgumentError, UserError, require_kind
 from .compilation import is_traced
+from .machine import peak_mb
+
+# A device more of a CPU costs 7 ms a run, and so many rays take 10 (one terrain) to 300 ms (mirrors) to trace.
+_RAYS_A_DEVICE = 2**16
 
 
 @functools.cache
@@ -21,6 +25,17 @@ def local_mesh(most: int | None = None) -> Mesh:
     """All devices of this process, in a row, or so many of them."""
     devices = jax.local_devices()[:most]
     return jax.make_mesh((len(devices),), ("devices",), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def worthwhile_mesh(rays: int) -> Mesh:
+    """All devices of this process, but of a CPU's at most as many as pay for so many camera rays."""
+    return local_mesh(max(1, rays // _RAYS_A_DEVICE) if jax.default_backend() == "cpu" else None)
+
+
+def peak_device_mb() -> float:
+    """The most memory of a device that has been held so far, MiB: on a CPU that of this process."""
+    device = jax.local_devices()[0]
+    return peak_mb() if device.platform == "cpu" else (device.memory_stats() or {}).get("peak_bytes_in_use", 0) / 2**20
 
 
 def chosen_mesh(owner: str, mesh: Mesh | None, tree: Any = ()) -> Mesh:

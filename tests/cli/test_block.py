@@ -67,6 +67,6 @@ def test_a_picture_laid_over_a_terrain_has_no_rim_of_the_opposite_border():
 def test_mountains_hide_the_sky_but_in_drafts_and_large_terrains(samples: int, side: int, occlusion: int | None):
     field = jaxhf.Heightfield(np.zeros((side, side), np.float32), 1.0)
     camera = jaxhf.Perspective.framing(field, 205.0, 35.0, width=8, height=8)
-    sky = block(field, np.full(3, 0.5), camera, Look(samples=samples), None).lights[1]
+    sky = block(field, np.full((2, 2, 3), 0.5), camera, Look(samples=samples), None).lights[1]
     assert isinstance(sky, jaxhf.Sky)
     assert sky.occlusion == occlusion

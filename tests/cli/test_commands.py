@@ -4,6 +4,7 @@ import io
 import re
 import shlex
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -232,7 +233,8 @@ def test_a_bar_says_compiling_and_then_how_long(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     now = [1000.0]
     monkeypatch.setattr("tqdm.std.time", lambda: now[0])
-    with compiled_bar(lambda: 100.0, unit=" pixels") as advance:
+    monkeypatch.setattr("jaxhf.cli.progress.CompileTime", lambda: SimpleNamespace(seconds=100.0))
+    with compiled_bar(unit=" pixels") as advance:
         assert capsys.readouterr().err.strip("\r \n") == "compiling"
         now[0] += 101
         advance(16, 64)

@@ -58,7 +58,3 @@ def test_a_terrain_counts_on_each_device(refused, monkeypatch):
     limits.require_memory(scene, 1)
     with pytest.raises(UserError, match="take more than 18 GB of memory on 2 devices, 10 GB are free"):
         limits.require_memory(scene, 2)
-
-
-def test_small_pictures_get_fewer_devices():
-    assert [limits.worthwhile_devices(rays) for rays in (1, 70_000, 140_000, 10**7)] == [1, 1, 2, 152]

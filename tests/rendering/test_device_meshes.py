@@ -1,6 +1,6 @@
 """Meshes of the caller's own: with explicit axes, set for all of JAX, and within a `shard_map` or a `pmap`.
 
-They need several devices, which can be had only before JAX is first used: all cases share a process of their own.
+They need several devices, which can be had only before JAX is first used: all their cases share a process of their own.
 """
 
 import json
@@ -8,6 +8,8 @@ import subprocess
 import sys
 
 import pytest
+
+from jaxhf.xla import devices
 
 PROGRAM = """
 import json
@@ -118,3 +120,13 @@ def test_meshes_of_the_callers_own():
     assert len(found) > 40
     wrong = [f"{name}: {what}" for name, what in found.items() if what != "as it should"]
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(("backend", "counts"), [("cpu", [1, 1, 2, 152]), ("gpu", [None] * 4)])
+def test_small_pictures_get_fewer_devices_of_a_cpu(monkeypatch, backend, counts):
+    mesh, asked = devices.local_mesh(), []
+    monkeypatch.setattr("jax.default_backend", lambda: backend)
+    monkeypatch.setattr(devices, "local_mesh", lambda most: asked.append(most) or mesh)
+    for rays in (1, 70_000, 140_000, 10**7):
+        devices.worthwhile_mesh(rays)
+    assert asked == counts

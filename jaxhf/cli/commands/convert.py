@@ -17,26 +17,26 @@ def run(options: argparse.Namespace) -> None:
     from ..describe import heightfield_line
 
     ending = Path(options.output).suffix.lower()
-    if ending not in MESHES:
+    in_metres = ending in MESHES  # alone; others are in the unit of the file
+    if in_metres:
+        require_writable_mesh(options.output)
+    else:
         require_writable_heights(options.output, HEIGHTS + MESHES)
         if options.base is not None:
             raise UserError(f"--base is for meshes ({', '.join(MESHES)}), {options.output} is none")
-    else:
-        require_writable_mesh(options.output)
     with warnings.catch_warnings():
-        if ending not in MESHES:  # which alone are in metres
+        if not in_metres:
             warnings.filterwarnings("ignore", "degrees from latitude")
         terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
-    if ending in MESHES:
+    if in_metres:
         save_mesh(options.output, terrain, base=options.base)
     else:
         save_heights(options.output, terrain)
+        dx, dy, x0, y0 = terrain.in_file
+        terrain = dataclasses.replace(terrain, dx=dx, dy=dy, x0=x0, y0=y0, georeference=None)
     alone = f" ({ending} holds the heights alone)" if ending in (".npy", ".exr") else ""
     if ending == ".png" and (terrain.heights % 1 != 0).any():
         alone = " (.png holds whole numbers: heights are rounded to steps of 1)"
-    if ending not in MESHES:  # which are in metres; others are in the unit of the file
-        dx, dy, x0, y0 = terrain.in_file
-        terrain = dataclasses.replace(terrain, dx=dx, dy=dy, x0=x0, y0=y0, georeference=None)
     print(f"{options.output}: {heightfield_line(terrain)}{alone}")
 
 

@@ -56,21 +56,21 @@ def _hillshade(options: argparse.Namespace) -> None:
     from ...maps.hillshade import hillshade
 
     _require_meaning(options)
-    _make(options, hillshade, "hillshade", nodata=0.0)
+    _make(options, hillshade, nodata=0.0)
 
 
 def _slope(options: argparse.Namespace) -> None:
     from ...maps.slope import NODATA, slope
 
     require_numbers(options.output, "slope")
-    _make(options, slope, "slope", nodata=NODATA)
+    _make(options, slope, nodata=NODATA)
 
 
 def _aspect(options: argparse.Namespace) -> None:
     from ...maps.slope import NODATA, aspect
 
     require_numbers(options.output, "aspect")
-    _make(options, aspect, "aspect", nodata=None if options.zero_for_flat else NODATA)
+    _make(options, aspect, nodata=None if options.zero_for_flat else NODATA)
 
 
 def _relief(options: argparse.Namespace) -> None:
@@ -78,10 +78,10 @@ def _relief(options: argparse.Namespace) -> None:
 
     if options.shading:
         _require_meaning(options)
-        return _make(options, relief, "relief")
+        return _make(options, relief)
     light = ("azimuth", "altitude", "z_factor", "variant", "shadows", "algorithm", "scale", "dx", "dy")
     arguments.refuse(options, *light, because="--no-shading leaves the light out")
-    _make(options, color_relief, "color relief")
+    _make(options, color_relief)
 
 
 def _require_meaning(options: argparse.Namespace) -> None:
@@ -91,13 +91,12 @@ def _require_meaning(options: argparse.Namespace) -> None:
             arguments.refuse(options, angle, because=f"--variant {variant} has lights of its own, without --shadows")
 
 
-def _make(options: argparse.Namespace, function: Callable[..., Any], kind: str, nodata: float | None = None) -> None:
+def _make(options: argparse.Namespace, function: Callable[..., Any], nodata: float | None = None) -> None:
     """Reads the terrain, draws its map and writes it.
 
     Args:
       options: of the command; those that the function has parameters for reach it.
-      function: of `jaxhf.maps`, from a terrain to its map.
-      kind: what the map is, for the report.
+      function: of `jaxhf.maps`, from a terrain to its map; the report says its name.
       nodata: the value in it that means that there is none.
     """
     from ...io.terrain.load import read_terrain
@@ -112,6 +111,7 @@ def _make(options: argparse.Namespace, function: Callable[..., Any], kind: str, 
         report_spacing(options, terrain)
     save_raster(path, values, terrain, nodata)
     ny, nx = terrain.heights.shape
+    kind = function.__name__.replace("_", " ")
     print(f"{path}: {kind}, {nx} x {ny} pixels, {time.perf_counter() - begin:.2f} s")
 
 

@@ -32,8 +32,8 @@ def run(options: argparse.Namespace) -> None:
     from ...preparation.world import resolve_settings
     from ...rendering.aovs import known_aovs
     from ...rendering.render import render
-    from ...xla.devices import local_mesh
-    from ..limits import require_memory, worthwhile_devices
+    from ...xla.devices import local_mesh, worthwhile_mesh
+    from ..limits import require_memory
     from ..progress import CompileTime, compiled_bar
 
     aovs = known_aovs("render", options.aovs)
@@ -41,11 +41,10 @@ def run(options: argparse.Namespace) -> None:
     warn([scene])
     samples = resolve_settings(settings, scene).samples or 1
     rays = scene.camera.width * scene.camera.height * samples
-    on_host = options.devices is None and jax.default_backend() == "cpu"
-    mesh = local_mesh(worthwhile_devices(rays) if on_host else None)
+    mesh = worthwhile_mesh(rays) if options.devices is None else local_mesh()
     require_memory(scene, mesh.size)
     compiling, begin = CompileTime(), time.perf_counter()
-    with compiled_bar(compiling.so_far, unit=" pixels", unit_scale=True) as advance:
+    with compiled_bar(unit=" pixels", unit_scale=True) as advance:
         image, found = render(scene, settings, aovs=tuple(dict.fromkeys(("exhausted", *aovs))), progress=advance, mesh=mesh)
     seconds = max(time.perf_counter() - begin - compiling.seconds, 1e-9)
     save_image(options.output, image, aovs={name: found[name] for name in aovs})

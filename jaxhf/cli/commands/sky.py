@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...core.errors import UserError, counted
+from ...maps.choices import WEIGHTINGS
 from .. import arguments
 from ..arguments import FINITE, choice, number, output, whole
 from ..command import Command
@@ -105,7 +106,6 @@ def _of(path: Path, azimuth: float) -> Path:
     return path.with_name(f"{path.stem}_{degrees}{path.suffix}")
 
 
-_WEIGHTINGS = "solid-angle", "horizontal", "slope"
 _SHARE = "share of the sky's solid angle, or of its light on horizontal ground or on the slope [solid-angle]"
 COMMANDS = (
     Command(
@@ -114,7 +114,7 @@ COMMANDS = (
         examples=("dem.tif -o sky.tif", "dem.tif -o sky.png --azimuths 64 --weighting slope"),
         options=_options(
             "the map: .tif or .npy (0 to 1), or .png (0 to 255)",
-            choice("--weighting", _WEIGHTINGS, _SHARE, default="solid-angle"),
+            choice("--weighting", WEIGHTINGS, _SHARE, default="solid-angle"),
         ),
         run=_skyview,
         about="It is the share of the sky that the terrain leaves to see, exact and without a search radius.",

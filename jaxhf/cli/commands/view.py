@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ...io.terrain.terrain import Terrain
+    from ...rendering.render import Prepared
     from ...scene.camera import Perspective
     from ...scene.heightfield import Heightfield
-    from ...scene.scene import Scene
     from ..block import Look
 
 _PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
@@ -53,9 +53,9 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
     times = isinstance(first, datetime.datetime)
     if times != isinstance(last, datetime.datetime):
         raise UserError("view: --sun-from and --sun-to must both be angles or both be times")
-    if not times and place != (None, None):
-        raise UserError("view: --latitude and --longitude stand with times, as in --sun-from 2026-06-21T06:00:00Z")
-    if first is None or not times:
+    if not times:
+        if place != (None, None):
+            raise UserError("view: --latitude and --longitude stand with times, as in --sun-from 2026-06-21T06:00:00Z")
         return None if first is None else np.linspace(first, last, options.frames)
     if place == (None, None):
         try:
@@ -97,7 +97,7 @@ def _output(options: argparse.Namespace) -> tuple[Path, bool]:
     if options.demo:
         options.terrain = jacksboro_file()
     output = Path(options.output or Path(options.terrain).with_suffix(".png").name)
-    ending, moves = output.suffix.lower(), not options.frames is options.sun_from is None
+    ending, moves = output.suffix.lower(), options.frames is not None or options.sun_from is not None
     film = ending in FILMS or (moves and ending not in PICTURES)
     if (options.sun_from is None) != (options.sun_to is None):
         raise UserError("view: --sun-from and --sun-to belong together, one is missing")
@@ -125,6 +125,7 @@ def run(options: argparse.Namespace) -> None:
         raise UserError(f"view: {options.terrain} holds no height")
     options.frames = options.frames or 72
     path = _sun_path(options, terrain)
+    from ...rendering.render import prepare
     from ...scene.heightfield import Heightfield
     from ...xla.devices import local_mesh
     from ..block import block, exaggeration, photograph
@@ -135,16 +136,17 @@ def run(options: argparse.Namespace) -> None:
     z, colours, base = _solid(options, terrain, factor)
     arguments.set_up_jax(options)
     field = Heightfield(z, terrain.dx, terrain.dy)
-    cameras, looks = _frames(options, field, base, path, film)
-    scene = block(field, colours, cameras[0], looks[0], base)
+    frames = _frames(options, field, base, path, film)
+    camera, look = frames[0]
+    scene = block(field, colours, camera, look, base)
     require_memory(scene, local_mesh().size)
-    said = "{} x {} pixels".format(*options.size)
+    ready, said = prepare(scene), "{} x {} pixels".format(*options.size)
     if film:
-        _film(output, scene, cameras, looks)
-        said = f"{len(cameras)} frames of {said}"
+        _film(output, ready, frames)
+        said = f"{len(frames)} frames of {said}"
     else:
-        with bar(total=looks[0].samples, unit=" samples", delay=0.5) as shown:
-            save_image(output, photograph(scene, cameras[0], looks[0], shown.update))
+        with bar(total=look.samples, unit=" samples", delay=0.5) as shown:
+            save_image(output, photograph(ready, camera, look, shown.update))
     print(f"{output}: {said}, heights x {factor:g}, {time.perf_counter() - begin:.1f} s")
 
 
@@ -152,9 +154,16 @@ def _solid(options: argparse.Namespace, terrain: "Terrain", factor: float) -> "t
     """What `block` takes: the terrain's heights times a factor, with water on them; colours; the floor's level."""
     import numpy as np
 
+    from ...io.pictures.images import linear_from_srgb
+    from ...io.terrain.drape import load_drape
+    from ...maps.relief import color_relief
     from ..block import with_water
 
-    z, colours = terrain.heights.astype(options.precision), _colours(options, terrain)
+    z = terrain.heights.astype(options.precision)
+    if options.drape is not None:
+        colours = load_drape(options.drape, terrain)
+    else:
+        colours = linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(terrain, options.ramp)]
     if options.water is not None:
         low, high = np.nanmin(z), np.nanmax(z)
         if not low < options.water < high:
@@ -170,21 +179,9 @@ def _solid(options: argparse.Namespace, terrain: "Terrain", factor: float) -> "t
     return z, colours, float(low - max(0.25 * (high - low), 0.02 * reach)) if options.skirt else None
 
 
-def _colours(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray":
-    import numpy as np
-
-    from ...io.pictures.images import linear_from_srgb
-    from ...io.terrain.drape import load_drape
-    from ...maps.relief import color_relief
-
-    if options.drape is not None:
-        return load_drape(options.drape, terrain)
-    return linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(terrain, options.ramp)]
-
-
 def _frames(
     options: argparse.Namespace, field: "Heightfield", base: float | None, path: "np.ndarray | None", film: bool
-) -> "tuple[list[Perspective], list[Look]]":
+) -> "list[tuple[Perspective, Look]]":
     """A camera and a look for each frame: round the terrain, or in a moving sun, whose `path` it is; for a picture one."""
     from ...scene.camera import Perspective
     from ..block import Look
@@ -199,23 +196,21 @@ def _frames(
         )
         for turn in ([360 * k / options.frames for k in range(options.frames)] if around else [0])
     ]
-    return cameras * len(looks), looks * len(cameras)
+    return [(camera, look) for camera in cameras for look in looks]  # of which one is alone
 
 
-def _film(output: Path, scene: "Scene", cameras: "Sequence[Perspective]", looks: "Sequence[Look]") -> None:
-    """A frame for each camera and look; the terrain is prepared once."""
+def _film(output: Path, ready: "Prepared", frames: "Sequence[tuple[Perspective, Look]]") -> None:
+    """Writes frames of a block that was prepared in the light of the first one."""
     import numpy as np
 
     from ...io.pictures.films import writing_film
     from ...io.pictures.images import srgb_from_linear
-    from ...rendering.render import prepare
     from ..block import lights, photograph
     from ..progress import bar
 
-    ready = prepare(scene)
-    with writing_film(output, 24) as add, bar(total=len(looks), unit=" frames") as shown:
-        for camera, look in zip(cameras, looks, strict=True):
-            lit = ready if look is looks[0] else ready.with_lights(lights(scene.heightfields[0], look))
+    with writing_film(output, 24) as add, bar(total=len(frames), unit=" frames") as shown:
+        for camera, look in frames:
+            lit = ready if look is frames[0][1] else ready.with_lights(lights(ready.scene.heightfields[0], look))
             image = photograph(lit, camera, look)
             add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
             shown.update()
@@ -254,7 +249,7 @@ COMMAND = Command(
             option("--sun-to", type=_sun, metavar="AZ,ALT|TIME", help="and where it ends, or when"),
             number("--latitude", _DEGREES, "for times [that of the terrain's middle]"),
             number("--longitude", _DEGREES, "for times [that of the terrain's middle]"),
-            number("--haze", "SHARE", "of light lost along the terrain [0.15]", 0.15),
+            number("--haze", "SHARE", "of light lost along the terrain [0.15]"),
         ),
         "terrain": (
             number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]", rule=POSITIVE),
