@@ -179,6 +179,7 @@ def test_cast_shadow_moves_with_a_point_light():
     np.testing.assert_allclose(np.asarray(boundary).sum(1), lit * HEIGHT / (z - HEIGHT) / PIXEL, rtol=0.05)
 
 
+@pytest.mark.deep
 def test_edges_of_facets_move():
     """With flat shading radiance jumps at every edge: here at the crest of a low ridge, seen and lit on both sides."""
     scene = small_scene(0.1 * RIDGE, from_above(0.49), (-1.0, 0.0, 1.0))

@@ -55,6 +55,7 @@ def test_a_camera_looks_past_the_centres_of_its_pixels():
             np.testing.assert_allclose(past.ray(*jnp.array([x, y])).d, camera.ray(*jnp.array([x + dx, y + dy])).d, atol=1e-6)
 
 
+@pytest.mark.deep
 def test_a_picture_laid_over_a_terrain_has_no_rim_of_the_opposite_border():
     field = jaxhf.Heightfield(np.zeros((17, 17), np.float32), 1.0)
     camera = jaxhf.Perspective.look_at((8, 8, 100), (8, 8, 0), up=(0, 1, 0), fov=9.1, width=32, height=32)

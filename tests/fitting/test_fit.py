@@ -83,6 +83,7 @@ def test_exposures_and_the_albedo_come_back_in_spite_of_outliers(targets):
     assert off_in_shape(found.heights) < 0.02
 
 
+@pytest.mark.deep
 def test_a_map_of_the_albedo_comes_back():
     """Three pictures say for each place its slopes and its albedo: no prior is needed."""
     y, x = np.mgrid[0:1:12j, 0:1:12j]

@@ -63,6 +63,7 @@ def test_rejected_steps_are_damped_until_one_is_short_enough():
     assert max(step.damping for step in found.history if step.accepted) > 160
 
 
+@pytest.mark.deep
 def test_the_loss_is_that_of_the_last_step_where_max_steps_end_a_level():
     steps = fitted(prior_std=0.2, max_steps=20).history
     level = max(k for k, step in enumerate(steps) if step.level == 8) + 1

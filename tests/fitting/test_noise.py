@@ -69,6 +69,7 @@ def test_noise_is_found_where_heights_explain_a_part_of_it(count, seed):
     assert found.warnings == ()
 
 
+@pytest.mark.deep
 @COUNTS
 def test_noise_is_found_in_spite_of_shadows_that_stand_elsewhere(count):
     """No points on edges move them, so a part of the pictures is never explained; chi2 says so."""

@@ -31,6 +31,7 @@ PRECISIONS = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.deep
 @PRECISIONS
 def test_it_is_the_square_of_the_residuals_derivative(rounding):
     """With all that can be sought beside heights; an exponent that no polynomial in the Laplacian meets."""

@@ -62,6 +62,7 @@ def test_scans_are_those_of_mujocos_rays(align, offset):
         np.testing.assert_array_equal(scan.heights[k, robot], scan.p[k, robot, :, 2])
 
 
+@pytest.mark.deep
 @pytest.mark.optimised
 def test_look_up_has_the_walks_bits():
     """The last four robots stand on vertices: a rounding settles on whose plane their places are, or if beside the border."""

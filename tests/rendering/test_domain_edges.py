@@ -193,6 +193,7 @@ def rays_beside(across: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array(o), np.array(d)
 
 
+@pytest.mark.deep
 def test_rays():
     for heights in (HEIGHTS, 0 * HEIGHTS + 0.1):
         for across in (0.0, *TINY, -1e-20, -1e-37):

@@ -49,6 +49,7 @@ def test_another_camera_compiles_nothing_and_moves_the_picture(compilations):
     assert np.abs(np.asarray(moved) - np.asarray(jaxhf.render(scene(), SETTINGS))).max() > 0.1
 
 
+@pytest.mark.deep
 def test_another_light_keeps_the_hidden_sky(monkeypatch):
     """The same bits as the scene in that light prepared anew; another occlusion is looked for."""
     looks, make = [], render._make_world_with_horizons

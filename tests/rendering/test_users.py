@@ -9,11 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import oracle
-import pytest
 
 import jaxhf
-
-pytestmark = pytest.mark.optimised
 
 UTM, ORIGIN = (5e5, 5e6), (0.0, 0.0)  # single precision has steps of 0.03 there, and of 0.5
 CELL, WIDTH, HEIGHT, FOV = 30.0, 24, 16, 35.0

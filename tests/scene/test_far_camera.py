@@ -59,6 +59,7 @@ def test_hits_are_where_the_oracle_has_them(kind, away, tall):
     np.testing.assert_allclose(found.t, expected.t, rtol=3e-7)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("kind", [KINDS[0], pytest.param(KINDS[1], marks=pytest.mark.deep)])
 def test_depth_and_its_derivative_where_heights_are_traced(kind):
     """By hand: a vertex that rises by dz lifts the plane of a triangle by w dz, its weight at the hit."""

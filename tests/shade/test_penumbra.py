@@ -60,7 +60,6 @@ def mean_of_suns(heights, count=1024):
     return total
 
 
-@pytest.mark.optimised  # as users compile it
 def test_a_sun_is_the_mean_of_1024_suns():
     found, mean = np.asarray(picture(PEAKS, TOWARDS))[*PIXELS], mean_of_suns(PEAKS)
     share = mean / mean.max()  # of the sun that is seen, as all pixels lie in the plane
@@ -80,6 +79,7 @@ def test_more_chords_make_smaller_steps():
     assert few > 4 * many
 
 
+@pytest.mark.deep
 def test_a_small_sun_casts_the_shadows_of_a_point():
     """Beside azimuths 45 and 225 a chord meets cell after cell whose diagonals lie behind the point."""
     ground = np.random.default_rng(0).uniform(0, 1.5, Y.shape)
@@ -184,6 +184,7 @@ def over(x, y, size, up=1):
     return jax.tree.map(jnp.asarray, camera), x + up * across, y - down
 
 
+@pytest.mark.deep
 def test_sheets_hide_the_sun_from_below_and_from_above():
     """Against rays to 512 points of the sun: shadows of one heightfield on another, on its own lower side, and of a skirt."""
     (rim, corner), (objects, lights) = sheet(BOX, 2), sheets()

@@ -122,6 +122,7 @@ def test_leaving_differentiates(mode):
     np.testing.assert_allclose((to_heights.sum(), np.vdot(to_heights, RAMP / 2)), (0, -0.5), rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.deep
 def test_hits_and_directions_broadcast():
     """One hit and many directions, many hits and one; what leaves no hit is not valid."""
     field = jaxhf.Heightfield(RAMP, 1.0)

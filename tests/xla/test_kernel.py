@@ -163,6 +163,7 @@ def scenes() -> dict[str, tuple[jaxhf.Scene, jaxhf.Settings]]:
 FAST = ("sun",)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("name", [name if name in FAST else pytest.param(name, marks=pytest.mark.deep) for name in scenes()])
 def test_tiles_of_every_scene_are_kernels(name):
     """In pictures, and as the value within a gradient. Else frames take twice the time, and nobody notices."""
