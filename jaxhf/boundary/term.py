@@ -123,8 +123,8 @@ def resampled_side(settings: Settings) -> int:
 
 
 def moved_light(world: World, camera: Camera, drawn: Boundaries, mesh: Mesh) -> Float[jax.Array, "points 3"]:
-    """For each boundary sample a number whose value is meaningless; its derivative is what the boundary's moving adds to the
-    sample's pixel."""
+    """For each boundary sample a number whose value is meaningless; its derivative is what the silhouette or the shadow's edge
+    that it stands for adds to the sample's pixel by moving."""
 
     def moved(world: World, camera: Camera, sample: BoundarySample, flow: jax.Array):
         x, _ = picture_point(world, camera, sample, sample.s)

@@ -1,4 +1,4 @@
-"""Many rays as chunks of one size, each of which is traced until its last ray has ended."""
+"""Rays of the caller's own as chunks of one size, each of which is traced until its last ray has ended; a picture has tiles."""
 
 import math
 from collections.abc import Callable

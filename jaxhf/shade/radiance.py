@@ -37,7 +37,10 @@ def radiance_from(world: World, ray: Ray, hit: Hit, active: Flag) -> Vector:
 
 
 def shadowed_radiance(world: World, number: Index, hit: Hit) -> Vector:
-    """By how much the shadow of the light of this number darkens the hit, if nothing else keeps that light from it."""
+    """By how much the shadow of the light of this number darkens the hit, if nothing else keeps that light from it.
+
+    Only what is matte has shadows; what it sends out is the same in all directions.
+    """
     albedo, dark = _albedo(world, hit), jnp.zeros_like(hit.n)
     if albedo is None:
         return dark

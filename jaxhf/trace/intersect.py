@@ -1,4 +1,4 @@
-"""What stands where a ray meets a surface. Every derivative starts here.
+"""What stands where a ray meets a surface. The derivative of each hit starts here; that of moving edges in `boundary/`.
 
 The walk has said which triangle; the hit is computed again from that triangle's plane in plain differentiable
 arithmetic, so the derivative costs no memory a step and works in forward and in reverse mode.

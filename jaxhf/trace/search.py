@@ -36,7 +36,7 @@ def first_triangle(
     the distance to each crossing recomputed from the integer cell, as a running sum drifts; with all levels, that of Tevs
     et al. (I3D 2008) over their maximum mipmaps. The loop has a fixed budget of steps and ends early, when all rays of the
     batch have ended; without the grid's `early_exit` it always takes all of them. The search is discrete and under
-    `stop_gradient`; derivatives begin at the hit, see `surface_hit`.
+    `stop_gradient`; derivatives begin at the hit, see `surface_hit` in `intersect.py`.
 
     Args:
       grid: the surface.
