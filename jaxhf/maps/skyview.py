@@ -21,9 +21,9 @@ from ..preparation.horizon import (
     even_azimuths,
     over_horizon,
     over_tiles,
-    sky_vector,
     tile_count,
 )
+from ..preparation.sky import sky_vector
 from ..scene.heightfield import Heightfield
 from ..trace.normals import vertex_normals
 from ..xla.compilation import compiled, is_traced

@@ -21,8 +21,7 @@ from jaxtyping import Bool, Float, Int
 
 from ..core.types import Index, Scalar
 from ..trace.edges import STEPS, present_edges, whole_cells
-from ..trace.grid import Grid
-from ..xla.devices import local_mesh, map_over
+from ..xla.devices import map_over
 
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
 _TILE = 32  # vertices along its side
@@ -71,36 +70,6 @@ def cell_directions(azimuths: Float[np.ndarray, " k"], dx: float, dy: float, dty
     unit[np.abs(unit) < 1e-12] = 0
     x, y = (unit / (dx, dy)).T
     return np.stack([x, np.where(np.abs(x - y) < 1e-12 * np.abs(x), x, y)], -1).astype(dtype)
-
-
-def sky_vector(slopes: Float[jax.Array, "k *at"]) -> Float[jax.Array, "3 *at"]:
-    """The integral of w / pi over the directions w of the visible sky, from horizons at even azimuths, at least horizontal.
-
-    Its product with a normal is the irradiance from an even sky of radiance 1 / pi, where all the visible sky lies on the upper
-    side of the surface; after Dozier and Frew (1990), equation 7b, with h = atan(slope) for the height of the horizon.
-    """
-    turns = np.deg2rad(even_azimuths(slopes.shape[0])).reshape(-1, *[1] * (slopes.ndim - 1))
-    square = 1 / (1 + slopes * slopes)
-    level = jnp.pi / 2 - jnp.arctan(slopes) - slopes * square
-    east, north = (jnp.asarray(f(turns), slopes.dtype) for f in (np.sin, np.cos))
-    return jnp.stack(
-        [
-            jnp.mean(level * jnp.broadcast_to(east, level.shape), 0),
-            jnp.mean(level * jnp.broadcast_to(north, level.shape), 0),
-            jnp.mean(square, 0),
-        ]
-    )
-
-
-def visible_sky(grid: Grid, azimuths: int) -> Float[jax.Array, "vertices 3"]:
-    """`sky_vector` at the vertices of a grid, world frame; its z axis must be upright there. Differentiable in the heights."""
-    z, linear = grid.z, grid.world_from_grid.linear
-    level = jnp.asarray(cell_directions(even_azimuths(azimuths), 1.0, 1.0, z.dtype))
-    to_grid = grid.grid_from_world.linear[None, :2]  # term by term, as `Affine` has it
-    directions = lax.stop_gradient(level[:, :1] * to_grid[..., 0] + level[:, 1:] * to_grid[..., 1])
-    flat = jnp.zeros((), z.dtype)
-    seen = over_horizon(sky_vector, local_mesh(1), z * linear[2, 2], directions, flat)
-    return jnp.moveaxis(seen, 0, -1).reshape(-1, 3)
 
 
 def _crossings(shape: tuple[int, int], direction: Float[jax.Array, "2"]) -> _Crossings:

@@ -30,7 +30,7 @@ from ..trace.status import Status
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
 from .ceiling import Ceiling, clears, make_ceiling
-from .horizon import visible_sky
+from .sky import visible_sky
 
 
 class World(eqx.Module):

@@ -17,7 +17,7 @@ import pytest
 import jaxhf
 from jaxhf.boundary import guiding, sample
 from jaxhf.core import affine, autodiff
-from jaxhf.preparation import ceiling, horizon, localise, world as worlds
+from jaxhf.preparation import ceiling, localise, sky, world as worlds
 from jaxhf.rendering import aovs as rendering_aovs, tiles
 from jaxhf.scene import texture
 from jaxhf.shade import lighting, radiance
@@ -160,7 +160,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
     "hidden sky": (
         "plain",
         case(lights=(SUN, jaxhf.Sky(0.5, occlusion=4))),
-        [everywhere(horizon.visible_sky), everywhere(lighting._seen_share)],
+        [everywhere(sky.visible_sky), everywhere(lighting._seen_share)],
     ),
     "sun with a size": (
         "plain",
