@@ -12,6 +12,7 @@ import pytest
 
 import jaxhf
 from jaxhf.rendering.render import require_key
+from jaxhf.rendering.tiles import Tiling
 
 EYE, TARGET = (-0.25, -0.75, 1.25), (0.5, 0.5, 0.125)  # exact in binary, so that an offset takes nothing from them
 WIDTH, HEIGHT, FOV = 24, 16, 24.0
@@ -192,6 +193,11 @@ def test_there_is_no_progress_within_a_transformation(transformation):
     ):
         with pytest.raises(ValueError, match=f"^{owner}: progress must be None within jit, grad, vmap and the like, where"):
             transformation(lambda z, fun=fun: fun(z, progress=lambda done, total: None))(heights)
+
+
+def test_tiles_cover_the_picture_and_no_more():
+    camera = jaxhf.Perspective.look_at(EYE, TARGET, width=33, height=17)
+    assert Tiling(camera, jaxhf.Settings(chunk=64)).count == 5 * 3  # of 8 x 8 pixels
 
 
 def test_progress_gives_the_same_bits():
