@@ -110,7 +110,7 @@ class Statement:
         found = Arguments(word, kind.name(), values, tokens)
         for declared, (holds, rule) in rules.items():
             if declared in tokens:
-                found.require(declared, holds(values[declared]), rule)
+                found.require(declared, bool(holds(values[declared])), rule)
         return found
 
 
