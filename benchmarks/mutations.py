@@ -64,7 +64,7 @@ io: io/terrain/[lrst]*.py -> io/test_terrain.py io/test_grids.py io/test_rasters
 boundary: boundary/*.py -> boundary
 fitting: fitting/[lj]*.py -> fitting/test_linearise.py fitting/test_fit_stops.py
 fitting: fitting/n*.py fitting/uncertainty.py -> fitting/test_normal_matrix.py fitting/test_noise.py
-fitting: fitting/[a-km-moq-tv-z]*.py fitting/p*.py -> fitting/test_fit.py fitting/test_fit_defaults.py
+fitting: fitting/[a-km-moq-tv-z]*.py fitting/p*.py -> fitting/test_fit_parts.py fitting/test_fit.py fitting/test_fit_defaults.py
 """
 ROOMS = defaultdict(list)
 for _room, _modules, _tests in re.findall(r"(\w+): (.*) -> (.*)", AIMS):
