@@ -69,7 +69,8 @@ def require_terrain(found: jaxhf.Fit, known: dict[str, np.ndarray], ratio: float
 def test_the_plain_call_finds_the_terrain_and_how_sure_it_is(name, ratio):
     """As measured 12 times nearer than the map; one and two deviations hold 80 and 97, 85 and 99 % of the heights.
 
-    Where rounding takes the smaller fit another way it is 9 times, with 74 and 97 %; without points on edges it is 6 times.
+    Where rounding takes the smaller fit another way it is 9 times, with 74 and 97 %, and the noise of one picture 1.36 of its
+    own (JAX 0.12 on some processors); without points on edges it is 6 times.
     Heights are right or wrong together with their neighbours, so the shares vary.
     """
     known = case(name)
@@ -81,7 +82,7 @@ def test_the_plain_call_finds_the_terrain_and_how_sure_it_is(name, ratio):
     assert 0.6 < (off < found.std).mean() < 0.92
     assert (off < 2 * found.std).mean() > 0.92
     assert rms(found.std) < 2 * rms(off)
-    np.testing.assert_allclose(found.noise, 0.01 * known["images"].max((1, 2)).mean(), rtol=0.25)
+    np.testing.assert_allclose(found.noise, 0.01 * known["images"].max((1, 2)).mean(), rtol=0.4)
     assert found.stats["chi2"] < 2  # 1.2 to 1.5
 
 
