@@ -14,7 +14,6 @@ from jaxtyping import Float
 from .errors import UserError
 from .powers import floor_to_power_of_two
 from .ray import Ray
-from .rules import require
 from .types import AnyArray, Number, Vector, VectorLeaf
 
 
@@ -85,13 +84,8 @@ def rotate(degrees: float, x: float, y: float, z: float) -> Float[np.ndarray, "4
     return matrix
 
 
-def require_invertible(owner: str, name: str, matrix: Any) -> None:
-    """Raises ArgumentError on a shape other than 4x4, a last row other than 0 0 0 1, nan, or a singular linear part."""
-    require(owner, name, matrix, invertible)
-
-
 def invertible(matrix: Any) -> str | None:
-    """The rule of `require_invertible`."""
+    """The rule of a transformation: 4x4 numbers whose last row is 0 0 0 1, with a linear part that is not singular."""
     wrong = _MATRIX(matrix)
     if wrong or not isinstance(matrix, np.ndarray):
         return wrong

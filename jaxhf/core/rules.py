@@ -39,7 +39,7 @@ def flag(value: Any) -> str | None:
 
 
 def require(owner: str, argument: str, value: Any, rule: Rule) -> None:
-    """ArgumentError where a value breaks a rule; `owner` and `argument` as there."""
+    """ArgumentError where a value breaks a rule; of the `owner` whose `argument` it is."""
     wrong = rule(value)
     if wrong is not None:
         raise ArgumentError(owner, argument, wrong)

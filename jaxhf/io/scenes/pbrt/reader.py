@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ....core.affine import require_invertible
+from ....core.affine import invertible
+from ....core.rules import require
 from ....scene.camera import Perspective
 from ....scene.cylinder import Cylinder
 from ....scene.light import Directional, Light, Point
@@ -180,10 +181,10 @@ class _Reader:
                 matrix = make(*statement.numbers(count))
             else:
                 matrix = statement.matrix()
-            require_invertible("", word.text, matrix)
+            require("", word.text, matrix, invertible)
             if word.text != "Transform":
                 matrix = self.matrix @ matrix
-                require_invertible("", "the current transformation", matrix)
+                require("", "the current transformation", matrix, invertible)
             self.matrix = matrix
 
     def _enter_frame(self, name: Token) -> None:

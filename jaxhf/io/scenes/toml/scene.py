@@ -13,9 +13,10 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import DTypeLike
 
-from ....core.affine import require_invertible
+from ....core.affine import invertible
 from ....core.errors import ArgumentError
 from ....core.precision import fitted
+from ....core.rules import require
 from ....scene import procedural
 from ....scene.camera import Camera
 from ....scene.cylinder import Cylinder
@@ -143,7 +144,7 @@ def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
     given = part.at_most_one("transform", "matrix")
     if given is None:
         return None
-    part.made(require_invertible, "", given, values[given])
+    part.made(require, "", given, values[given], invertible)
     return values[given]
 
 
