@@ -4,7 +4,6 @@ Each program is made in a process of its own, without a cache. The scene is one 
 directional light, with shadows and smooth normals, 512 x 512 pixels (for the fit 128 x 128).
 """
 
-import inspect
 import json
 import subprocess
 import sys
@@ -60,6 +59,28 @@ def arrays_only(function: Any, *arguments: Any) -> tuple[Any, tuple[Any, ...]]:
     return jax.jit(of_arrays), arrays
 
 
+class Called(Exception):
+    """Ends a fit at the call that is looked for, with the arguments of this."""
+
+
+def in_fit(module: Any, name: str, heights: np.ndarray) -> tuple[Any, tuple[Any, ...]]:
+    """As `arrays_only`, a function of a module and the arguments with which a fit of one picture first calls it."""
+    import jaxhf
+
+    function, scene = getattr(module, name), make_scene(heights, 128)
+    target = np.asarray(jaxhf.render(scene))[..., 0]
+
+    def ended(*arguments: Any) -> None:
+        raise Called(*arguments)
+
+    setattr(module, name, ended)
+    try:
+        jaxhf.fit([scene], [target], settings=jaxhf.Settings(edge_samples=8192))
+    except Called as call:
+        return arrays_only(function, *call.args)
+    raise AssertionError(f"a fit does not call {name}")
+
+
 def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
     """A function under `jax.jit`, and its arguments."""
     import jax
@@ -70,22 +91,10 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
 
     heights = fractal([size, size], seed=3, exponent=2.4, range=(0.0, 0.15)).astype(np.float32)
     if name in ("linearise", "step"):
-        from jaxhf.fitting import problem, residuals, solvers
-        from jaxhf.fitting.options import FitOptions
+        from jaxhf.fitting.model import expansion
+        from jaxhf.fitting.solve import steps
 
-        scene = make_scene(heights, 128)
-        target = np.asarray(jaxhf.render(scene))[..., 0]
-        defaults = {name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items()}
-        given: dict[str, Any] = {"settings": jaxhf.Settings(edge_samples=8192)}
-        options = FitOptions(**{name: defaults[name] for name in FitOptions.__dataclass_fields__} | given)
-        made, unknowns = problem.make_problem([scene], [target], options)
-        if name == "linearise":
-            at = residuals.heights_of(unknowns, made.basis)
-            return arrays_only(residuals._linearised, at, unknowns, made)
-        known = residuals.linearised(unknowns, made)
-        solver = solvers.make_solver(options)
-        state = solvers.init_state(solver, unknowns, known)
-        return arrays_only(solvers._advance, solver, unknowns, state, known)
+        return in_fit(expansion, "_linearised", heights) if name == "linearise" else in_fit(steps, "_advance", heights)
     if name == "frame":
         from jaxhf.preparation.localise import localise
         from jaxhf.preparation.world import make_world, resolve_settings

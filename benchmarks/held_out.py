@@ -4,7 +4,7 @@ A seed of which the default call was changed is one that was looked at: its case
 """
 
 import numpy as np
-from cases import Case, Definition, Sources, by_mitsuba, smoothed, suns, viewed
+from cases import MITSUBAS, Case, Definition, Sources, by_mitsuba, smoothed, suns, viewed
 
 import jaxhf
 from jaxhf.scene.procedural import bumps, fractal
@@ -64,7 +64,7 @@ def drawn(sources: Sources, seed: int, number: int) -> Case:
     exact = by_mitsuba(sources, f"drawn-{seed}-{number}", scenes(truth), eyes, at, samples=SAMPLES)
     noise = float(share) * float(np.mean([image.max() for image in exact]))
     targets = exact + noise * rng.standard_normal(exact.shape)
-    given = {"prior": prior, "prior_std": spread} | ({"noise": noise} if noise_known else {})
+    given = {"prior": jaxhf.Prior(prior, spread), **MITSUBAS} | ({"noise": noise} if noise_known else {})
     return Case(truth, scenes(prior), list(targets), given, prior)
 
 

@@ -1,18 +1,22 @@
 """Recovers terrains from pictures and prints how near to the truth, and in what time.
 
 `jacksboro`: the case of this name, with a prior from a survey of the land around it. `shadow`: a hill that no picture shows,
-from its shadow. `pose`: lights and cameras that are off by a degree, taken as known and sought. `cases`: what the default call
-makes of the cases of cases.py, beside docs/measurements/fit-cases.csv, or with `--held-out` of cases that held_out.py draws in
-this run; coverage is judged with `--uncertainty`. One case a process: times include compilation, as a user meets it.
+from its shadow. `pose`: lights and cameras that are off by a degree, taken as known and sought. `scale`: how time and memory
+grow with the heights. `cases`: what the default call makes of the cases of cases.py, beside docs/measurements/fit-cases.csv,
+or with `--held-out` of cases that held_out.py draws in this run; coverage is judged with `--draws`. One case a process: times
+include compilation, as a user meets it.
 """
 
 import argparse
 import csv
 import dataclasses
+import json
 import os
 import re
-import resource
 import secrets
+import subprocess
+import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -21,16 +25,20 @@ import benchmark
 import jax
 import numpy as np
 import scipy.optimize
-from cases import CASES, LIGHTS, Case, Definition, Missing, Sources, names_of, smoothed
+from cases import CASES, LIGHTS, Case, Definition, Missing, Sources, names_of, noisy, smoothed, viewed
 from held_out import held_out
+from peers import common_work
 
 import jaxhf
 from jaxhf.core.affine import rotate
-from jaxhf.fitting.view import differences
+from jaxhf.fitting.model.view import differences
 from jaxhf.scene.procedural import fractal
+from jaxhf.xla.machine import peak_mb
 
 FEWER = 1.5  # times less than the table's ratio is what a case may reach
 APART = (10, 6)  # percent by which the shares within one and two deviations may differ from the table's
+STEEPEST = 1.1  # power of the number of heights with which a fit's time may grow
+FROM = 256  # heights a side from which that is judged: of smaller terrains time is mostly compilation
 
 
 def report(run: benchmark.Run, name: str, found: jaxhf.Fit, truth: np.ndarray, seconds: float, **more: Any) -> None:
@@ -44,7 +52,7 @@ def report(run: benchmark.Run, name: str, found: jaxhf.Fit, truth: np.ndarray, s
         "seconds": seconds,
         "steps": found.stats["steps"],
         "chi2": found.stats["chi2"],
-        "peak MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak MB": peak_mb(),
         **more,
     }
     run.row(name, numbers | {"end": found.result.value})
@@ -60,34 +68,34 @@ CELLS = 8  # over which the map was smoothed: standard deviation of a Gaussian
 
 
 def jacksboro(run: benchmark.Run, options: argparse.Namespace) -> None:
-    """The case of this name with a prior of the length and exponent that maps like it miss elsewhere."""
+    """The case of this name with a prior of the deviation and the length of what maps like it miss elsewhere."""
     try:
         case = CASES["jacksboro"].make(Sources(options.targets))
     except Missing as reason:
         benchmark.refuse(f"jacksboro: {reason}")
     terrain = jaxhf.jacksboro()
     whole = terrain.heights.astype(np.float64)
-    spread, length, exponent = _missing(whole, smoothed(whole, CELLS), np.s_[100:228, 100:228])
-    given = {"prior_std": spread, "prior_length": length * np.sqrt(terrain.dx * terrain.dy), "prior_exponent": exponent}
+    spread, length = _missing(whole, smoothed(whole, CELLS), np.s_[100:228, 100:228])
+    prior = jaxhf.Prior(case.reference, spread, length * np.sqrt(terrain.dx * terrain.dy))
     found, seconds = timed(
-        case.scenes, case.targets, max_steps=options.max_steps, uncertainty=options.uncertainty, progress=options.verbose,
-        **case.given | given,
+        case.scenes, case.targets, max_steps=options.max_steps, draws=options.draws, progress=options.verbose,
+        **case.given | {"prior": prior},
     )  # fmt: skip
     error = np.asarray(found.heights, np.float64) - case.truth
     ratio, least = np.sqrt(np.mean((case.reference - case.truth) ** 2) / np.mean(error**2)), table()["jacksboro"][0] / FEWER
-    more = {"prior RMSE/RMSE": ratio, "prior_std": spread, "length in cells": length, "exponent": exponent}
+    more = {"prior RMSE/RMSE": ratio, "std of the prior": spread, "length in cells": length}
     report(run, "jacksboro with a surveyed prior", found, case.truth, seconds, **more)
     run.claim(ratio >= least, f"jacksboro with a surveyed prior: {ratio:.3g} times nearer than the map, at least {least:.3g}")
 
 
-def _missing(whole: np.ndarray, coarse: np.ndarray, part: Any) -> tuple[float, float, float]:
+def _missing(whole: np.ndarray, coarse: np.ndarray, part: Any) -> tuple[float, float]:
     """What such a map misses, from a survey of all but this part of the terrain.
 
     The Fourier amplitudes of what it misses are taken from tiles of the part's size, under a Hann window, without which the
     jump between opposite borders would pass for high frequencies.
 
     Returns:
-      `fit`'s prior_std, prior_length (in cells) and prior_exponent.
+      The std and the length (in cells) of a `jaxhf.Prior`.
     """
     error, n = coarse - whole, 64
     rest, powers = np.ones(whole.shape, bool), []
@@ -105,10 +113,10 @@ def _missing(whole: np.ndarray, coarse: np.ndarray, part: Any) -> tuple[float, f
 
     def off(x: np.ndarray) -> np.ndarray:
         # Over the frequency, as there are as many more of the short ones.
-        return (amplitude - (x[0] - x[2] / 2 * np.log1p(np.exp(2 * x[1]) * square))) / np.sqrt(square)
+        return (amplitude - (x[0] - np.log1p(np.exp(2 * x[1]) * square))) / np.sqrt(square)
 
-    _, length, exponent = scipy.optimize.least_squares(off, [amplitude[0], np.log(CELLS / 1.4), 2.0]).x
-    return float(np.sqrt(np.mean(error[rest] ** 2))), float(np.exp(length)), float(exponent)
+    _, length = scipy.optimize.least_squares(off, [amplitude[0], np.log(CELLS / 1.4)]).x
+    return float(np.sqrt(np.mean(error[rest] ** 2))), float(np.exp(length))
 
 
 def shadow(run: benchmark.Run, options: argparse.Namespace) -> None:
@@ -137,8 +145,8 @@ def shadow(run: benchmark.Run, options: argparse.Namespace) -> None:
     for points in (0, 1000 if options.edge_samples is None else options.edge_samples):
         settings = jaxhf.Settings(samples=16, edge_samples=points)
         found, seconds = timed(
-            [scene(known)], [target], settings=settings, noise=noise, prior=known, prior_std=0.0003 + known, prior_length=1.0,
-            levels=[1.0], uncertainty=options.uncertainty, max_steps=options.max_steps, progress=options.verbose,
+            [scene(known)], [target], settings=settings, noise=noise, prior=jaxhf.Prior(known, 0.0003 + known, 1.0),
+            draws=options.draws, max_steps=options.max_steps, progress=options.verbose,
         )  # fmt: skip
         highest = np.asarray(found.heights)[top]
         more = {"top at the start": known[top] / truth[top] - 1, "top": highest / truth[top] - 1}
@@ -178,10 +186,10 @@ def pose(run: benchmark.Run, options: argparse.Namespace) -> None:
     exact = [np.asarray(jaxhf.render(scene, jaxhf.Settings(shadows=False, samples=144)))[..., 0] for scene in taken]
     targets = [image + 0.002 * rng.standard_normal(image.shape) for image in exact]
     before = np.sqrt(np.mean((prior - truth) ** 2))
-    for name, sought in (("known", {}), ("sought", {"light_std": 1.0, "camera_std": (0.01, 1.0)})):
+    for name, sought in (("known", None), ("sought", jaxhf.Unknown(light_std=1.0, camera_std=(0.01, 1.0)))):
         found, seconds = timed(
-            given, targets, settings=jaxhf.Settings(shadows=False, samples=4), noise=0.002, prior=prior, prior_std=std,
-            max_steps=options.max_steps, progress=options.verbose, **sought,
+            given, targets, settings=jaxhf.Settings(shadows=False, samples=4), noise=0.002, prior=jaxhf.Prior(prior, std),
+            unknown=sought, max_steps=options.max_steps, progress=options.verbose,
         )  # fmt: skip
         off = [differences(*pair) for pair in zip(found.scenes, taken, strict=True)]
         light, distance, rotation = (float(np.mean(values)) for values in zip(*off, strict=True))
@@ -192,11 +200,60 @@ def pose(run: benchmark.Run, options: argparse.Namespace) -> None:
             "of seen heights": np.sqrt(np.mean((prior - truth)[part] ** 2) / np.mean(square[part])),
             "light off, degrees": light, "camera off": distance, "turned": rotation,
         }  # fmt: skip
-        if sought:
+        if sought is not None:
             nearer = more["of seen heights"]
             run.claim(nearer > 1.5, f"with lights and cameras sought, heights are {nearer:.3g} times nearer, at least 1.5")
             run.claim(light < 0.3, f"lights that were off by 1 degree end {light:.2g} degrees off, at most 0.3")
         report(run, f"lights and cameras off by a degree, {name}", found, truth, seconds, **more)
+
+
+def scale(run: benchmark.Run, options: argparse.Namespace) -> None:
+    """The terrain of the common work at several sizes, from three of our own pictures and a map; a process for each size.
+
+    Pictures have a pixel a height, 64 samples a pixel and 1 % noise, of which the fit is not told. The map is the terrain
+    smoothed over 8 cells, and its deviation is known.
+    """
+    if options.peers is None:
+        benchmark.refuse("scale: it needs --peers, the folder of common_work.py")
+    work, counts, times = common_work(options.peers), [], []
+    for size in options.sizes:
+        truth = work.terrain(size).astype(np.float64)
+        exact = [jaxhf.render(scene, jaxhf.Settings(samples=64)) for scene in _common_scenes(work, truth)]
+        targets, _ = noisy(np.stack([np.asarray(image)[..., 0] for image in exact]))
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "pictures.npz"
+            np.savez(path, truth=truth, targets=targets)
+            command = [sys.executable, __file__, *sys.argv[1:], "--child", str(path)]
+            made = json.loads(subprocess.check_output(command, text=True))
+        run.row(f"{size} x {size} heights", made)
+        counts, times = [*counts, size**2], [*times, made["seconds"]]
+    judged_sizes = [k for k, count in enumerate(counts) if count >= FROM**2]
+    if len(judged_sizes) > 1:
+        along, taken = (np.log([values[k] for k in judged_sizes]) for values in (counts, times))
+        power, _ = np.polyfit(along, taken, 1)
+        run.claim(power <= STEEPEST, f"time grows as heights ** {power:.3g} from {FROM}² on, at most {STEEPEST}")
+        run.row(f"from {FROM}² on", {"power of the heights with which time grows": power})
+
+
+def _common_scenes(work: Any, heights: np.ndarray) -> list[jaxhf.Scene]:
+    """The view D of the common work under three lights, with as many pixels as heights."""
+    (eye, target, fov), n, lights = work.CAMERAS["D"], len(heights), work.turned_lights("std", 4)[:3]
+    ground = jaxhf.Object(jaxhf.Heightfield(heights.astype(np.float32)), jaxhf.Matte(work.ALBEDO))
+    camera = jaxhf.Perspective.look_at(eye, target, fov=fov, width=n, height=n)
+    return viewed(ground, [camera] * len(lights), [jaxhf.Directional(towards) for towards in lights])
+
+
+def scaled(options: argparse.Namespace) -> dict[str, float | str]:
+    """One size of `scale`, whose pictures a file has."""
+    with np.load(options.child) as kept:
+        truth, targets = kept["truth"], kept["targets"]
+    coarse = smoothed(truth, CELLS)
+    before = float(np.sqrt(np.mean((coarse - truth) ** 2)))
+    prior, scenes = jaxhf.Prior(coarse, before), _common_scenes(common_work(options.peers), coarse)
+    found, seconds = timed(scenes, list(targets), prior=prior, draws=options.draws, progress=options.verbose)
+    after = float(np.sqrt(np.mean((np.asarray(found.heights, np.float64) - truth) ** 2)))
+    numbers = {"seconds": seconds, "peak MB": peak_mb(), "steps": found.stats["steps"], "ratio": before / after}
+    return numbers | {"chi2": found.stats["chi2"], "end": found.result.value, "warns of": "; ".join(names_of(found.warnings))}
 
 
 def judged(run: benchmark.Run, options: argparse.Namespace) -> None:
@@ -218,9 +275,7 @@ def judged(run: benchmark.Run, options: argparse.Namespace) -> None:
         except Missing as reason:
             run.skip(name, reason)
             continue
-        found, seconds = timed(
-            case.scenes, case.targets, uncertainty=options.uncertainty, progress=options.verbose, **case.given
-        )
+        found, seconds = timed(case.scenes, case.targets, draws=options.draws, progress=options.verbose, **case.given)
         judge(run, name, definition, case, found, seconds, bounds.get(name))
         if options.out is not None:
             kept = {"heights": found.heights, "truth": case.truth, "reference": case.reference, "seen": found.seen}
@@ -282,7 +337,7 @@ def main() -> None:
         "docs/measurements/fit-cases.csv and cases.py have them, of drawn ones a ratio of 3",
     )
     parser = run.parser
-    parser.add_argument("case", choices=("jacksboro", "shadow", "pose", "cases"))
+    parser.add_argument("case", choices=("jacksboro", "shadow", "pose", "scale", "cases"))
     parser.add_argument("--targets", type=Path, help="a folder of Mitsuba's pictures; made where they are not there")
     parser.add_argument("--names", nargs="+", help=f"of cases [all: {', '.join(CASES)}]; one a process for times")
     parser.add_argument("--held-out", action="store_true", help="cases that are drawn now, and that nobody has looked at")
@@ -296,21 +351,26 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, help="a folder for what cases find, as .npz")
     parser.add_argument(
-        "--peers", type=Path, help="folder of common_work.py and targets_D_std.npz, for cases common-4, common-1"
+        "--peers", type=Path, help="folder of common_work.py and targets_D_std.npz, for scale and cases common-4, common-1"
     )
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256], help="heights a side, for scale [64 128 256]")
     parser.add_argument("--edge-samples", type=int, help="a picture [shadow: 1000]")
     parser.add_argument("--max-steps", type=int, default=100)
-    parser.add_argument("--uncertainty", type=int)
+    parser.add_argument("--draws", type=int, default=0, help="of the standard deviations")
     parser.add_argument("--precision", default="float64", choices=("float32", "float64"))
     parser.add_argument("--devices", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--verbose", action="store_true")
+    parser.add_argument("--child", type=Path, help=benchmark.HIDDEN)
     options = run.parse()
     if options.case in ("jacksboro", "cases"):
         benchmark.need("matplotlib")
-    jax.config.update("jax_enable_x64", options.precision == "float64")
+    jax.config.update("jax_enable_x64", options.precision == "float64" and options.case != "scale")
     jax.config.update("jax_num_cpu_devices", options.devices)
     options.dtype = np.dtype(options.precision)
-    makers = {"jacksboro": jacksboro, "shadow": shadow, "pose": pose, "cases": judged}
+    if options.child is not None:
+        print(json.dumps(scaled(options)))
+        return
+    makers = {"jacksboro": jacksboro, "shadow": shadow, "pose": pose, "scale": scale, "cases": judged}
     makers[options.case](run, options)
     run.end()
 

@@ -191,7 +191,7 @@ def recovery() -> None:
         "heights\n(coarse first)",
         "render\neach picture",
         "compare\nin units of noise",
-        "linearise\nJᵀ J + prior",
+        "linearise\nsample by sample",
         "step\nor more damping",
     ]
     for k, text in enumerate(boxes):

@@ -3,6 +3,7 @@ from .core.errors import ArgumentError as ArgumentError
 from .core.settings import Settings as Settings
 from .core.version import __version__ as __version__
 from .fitting.fit import Fit as Fit, fit as fit
+from .fitting.given import Checkpoint as Checkpoint, Prior as Prior, Unknown as Unknown
 from .fitting.history import Step as Step, Stop as Stop
 from .io.errors import SceneError as SceneError
 from .io.pictures.images import load_image as load_image, save_image as save_image

@@ -24,7 +24,7 @@ import jaxhf
 terrain = jaxhf.jacksboro()
 truth = terrain.heights[256:304, 320:368].astype(np.float32)
 coarse = gaussian_filter(truth, 5, mode="nearest")
-prior_std = float((coarse - truth).std())
+prior = jaxhf.Prior(coarse, std=float((coarse - truth).std()))
 
 # Seen from above and a little from the south, under three low suns.
 middle = np.array([23.5 * terrain.dx, 23.5 * terrain.dy, truth.mean()])
@@ -45,7 +45,7 @@ noise = 0.006
 random = np.random.default_rng(0)
 measured = [image + noise * random.standard_normal(image.shape) for image in pictures(truth)]
 
-found = jaxhf.fit(scenes(coarse), measured, prior=coarse, prior_std=prior_std, uncertainty=100)
+found = jaxhf.fit(scenes(coarse), measured, prior=prior, draws=100)
 
 
 def error(heights):
@@ -64,7 +64,7 @@ for row, images in zip(axes, rows, strict=True):
     for axis, image in zip(row, images, strict=False):
         axis.imshow(image, cmap="gray", vmin=0, vmax=0.7)
 for axis, heights in ((axes[0, 3], coarse), (axes[0, 4], found.heights)):
-    shown = axis.imshow(error(heights), origin="lower", cmap="RdBu_r", vmin=-prior_std, vmax=prior_std)
+    shown = axis.imshow(error(heights), origin="lower", cmap="RdBu_r", vmin=-prior.std, vmax=prior.std)
 figure.colorbar(shown, ax=axes[0, 3:], label="m")
 for axis, heights in zip(axes[1, 3:], (coarse, found.heights), strict=True):
     axis.imshow(heights, origin="lower", cmap="viridis", vmin=truth.min(), vmax=truth.max())
@@ -82,7 +82,7 @@ print(f"error of the heights: {rmse(coarse):.1f} m before, {rmse(found.heights):
 # ## What went in
 #
 # - **Scenes and pictures**, one scene for each, with its camera and its sun. The heights in the scenes are the start.
-# - **A prior**, the coarse map, and how far it is off (`prior_std`). Without any map the pictures would still show the
+# - **A prior**, the coarse map, and how far it is off (`std`). Without any map the pictures would still show the
 #   shape, but not at what height above the sea it stands: all of them are taken from one side.
 #
 # That is all. The rest was chosen by what the pictures show: their noise, a robust loss, and points on the edges of
@@ -103,11 +103,11 @@ print("\n".join(found.warnings))
 # shows what it looks like on the way.
 
 # %%
-early = jaxhf.fit(scenes(coarse), measured, prior=coarse, prior_std=prior_std, max_steps=2)
+early = jaxhf.fit(scenes(coarse), measured, prior=prior, max_steps=2)
 print(f"error of the heights after 2 steps: {rmse(early.heights):.1f} m")
 figure, axes = plt.subplots(1, 2, figsize=(5.4, 2.4), dpi=60, layout="constrained")
 for axis, (name, heights) in zip(axes, {"2 steps": early.heights, "the end": found.heights}.items(), strict=True):
-    shown = axis.imshow(error(heights), origin="lower", cmap="RdBu_r", vmin=-prior_std, vmax=prior_std)
+    shown = axis.imshow(error(heights), origin="lower", cmap="RdBu_r", vmin=-prior.std, vmax=prior.std)
     axis.set_title(name)
     axis.set_axis_off()
 figure.colorbar(shown, ax=axes, label="error, m")
@@ -116,7 +116,7 @@ plt.show()
 # %% [markdown]
 # ## How sure it is
 #
-# `uncertainty=100` drew a hundred terrains that the pictures and the map allow; their spread is `std`. Here the truth is
+# `draws=100` drew a hundred terrains that the pictures and the map allow; their spread is `std`. Here the truth is
 # known, so the deviations can be checked: were they right and the errors normal, 68 % of the heights would lie within
 # one of them and 95 % within two.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..fitting.fit import Fit
-from ..fitting.view import differences, sun
+from ..fitting.model.view import differences, sun
 from ..scene.heightfield import Heightfield
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def facts(case: "Case", found: Fit) -> Iterator[tuple[str, str]]:
         eye = " ".join(f"{value:.9g}" for value in np.asarray(scene.camera.world_from_camera)[:3, 3])
         cameras.append(f"eye {eye} (moved by {moved:.4g}, turned by {rotated:.2f} degrees)")
     for name, texts in (("light", lights), ("camera", cameras)):
-        if f"{name}_std" in case.options:
+        if f"{name}_std" in case.unknown:
             yield name, ", ".join(texts)
 
 

@@ -1,6 +1,7 @@
 """Errors that are not jaxhf's own: what a caller, or the author of a file, got wrong."""
 
 from numbers import Integral
+from types import UnionType
 from typing import Any
 
 
@@ -28,7 +29,9 @@ class ArgumentError(UserError):
         self.rule = rule.removeprefix(": ")
 
 
-def require_kind(owner: str, argument: str, value: Any, kind: type | tuple[type, ...], wanted: str, hint: str = "") -> None:
+def require_kind(
+    owner: str, argument: str, value: Any, kind: type | UnionType | tuple[type, ...], wanted: str, hint: str = ""
+) -> None:
     """ArgumentError where a value is not of this kind.
 
     Args:

@@ -37,20 +37,20 @@ def fitted(heights: np.ndarray, dtype: DTypeLike, owner: str = "") -> np.ndarray
     return heights.astype(dtype)
 
 
-def require_fit(heights: np.ndarray, dtype: DTypeLike, owner: str = "") -> None:
+def require_fit(heights: np.ndarray, dtype: DTypeLike, owner: str = "", name: str = "heights") -> None:
     """Warns where a height moves by more than a thousandth of their relief in another precision.
 
     Args:
       heights: of any shape; what is not finite is a hole.
       dtype: float32 or float64.
-      owner: see `ArgumentError`, which is raised where a height does not fit, as an infinite one would count as a hole.
+      owner, name: see `ArgumentError`, which is raised where a height does not fit, as an infinite one would count as a hole.
     """
     moved = rounding(heights, dtype)
     if moved == math.inf:
         largest = np.abs(heights[np.isfinite(heights)]).max()
-        raise ArgumentError(owner, "heights", f"must fit into {np.dtype(dtype)}, the largest is {largest:.3g}")
+        raise ArgumentError(owner, name, f"must fit into {np.dtype(dtype)}, the largest is {largest:.3g}")
     if moved > WORTH_A_WARNING:
-        place = f"{owner}: heights" if owner else "heights"
+        place = f"{owner}: {name}" if owner else name
         warnings.warn(
             f"{place} are rounded to {np.dtype(dtype)}, which moves one by {100 * moved:.3g} % of the relief: subtract a "
             "constant from them, such as the lowest",

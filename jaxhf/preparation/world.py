@@ -72,16 +72,10 @@ def resolve_settings(settings: Settings, scene: Scene) -> Settings:
     return dataclasses.replace(settings, samples=grid_side(samples) ** 2, edge_samples=settings.edge_samples or 0)
 
 
-def make_world(scene: Scene, settings: Settings, by_angle: Flag | None = None) -> World:
-    """Prepares what does not depend on the ray; `scene` must be `localise`d.
-
-    Args:
-      scene: what is to be traced.
-      settings: the knobs.
-      by_angle: whether normals are weighted by angle, known only as the program runs; None: as `settings.normals` says.
-    """
+def make_world(scene: Scene, settings: Settings) -> World:
+    """Prepares what does not depend on the ray; `scene` must be `localise`d."""
     settings = resolve_settings(settings, scene)
-    surfaces = tuple(make_surface(obj.shape, obj.world_from_object, settings, by_angle) for obj in scene.objects)
+    surfaces = tuple(make_surface(obj.shape, obj.world_from_object, settings) for obj in scene.objects)
     return World(
         surfaces=surfaces,
         materials=tuple(obj.material for obj in scene.objects),
@@ -112,15 +106,11 @@ def _make_ceiling(surface: Surface, light: Light, wanted: bool) -> Ceiling | Non
     return make_ceiling(surface, unit(light.towards))
 
 
-def make_surface(
-    shape: Shape, world_from_object: MatrixLeaf | None, settings: Settings, by_angle: Flag | None = None
-) -> Surface:
-    """A shape made ready for tracing; the scheme of its normals (but see `make_world`) and the levels of its bounds are those
-    of the settings."""
+def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: Settings) -> Surface:
+    """A shape made ready for tracing; the scheme of its normals and the levels of its bounds are those of the settings."""
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
-        scheme = (settings.normals or "six") if by_angle is None else by_angle
-        normals = scheme if settings.shading == "smooth" else None
+        normals = (settings.normals or "six") if settings.shading == "smooth" else None
         levels = 0 if settings.traversal == "dda" else None
         return make_grid(shape, world, normals, levels, settings.early_exit)
     return make_walls(shape, world) if isinstance(shape, Skirt) else make_tube(shape, world)

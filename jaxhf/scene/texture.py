@@ -6,11 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError
 from ..core.rules import OneOf, require_fields
-from ..core.types import AnyArray, Point2, Vector, float_leaf
+from ..core.types import AnyArray, Index, Point2, Scalar, Vector, float_leaf
 from ..core.vector import within
 
 Wrap = Literal["repeat", "clamp"]
@@ -52,7 +52,20 @@ class ImageTexture(eqx.Module):
 
     def __call__(self, uv: Point2) -> Vector:
         texels = jnp.asarray(self.texels)
-        h, w, _ = texels.shape
+        (low, high, fy), (left, right, fx) = self._between(uv)
+        return (1 - fy) * ((1 - fx) * texels[low, left] + fx * texels[low, right]) + fy * (
+            (1 - fx) * texels[high, left] + fx * texels[high, right]
+        )
+
+    def corners(self, uv: Point2) -> tuple[Int[jax.Array, "4"], Int[jax.Array, "4"], Float[jax.Array, "4"]]:
+        """The rows and columns of the four texels between which a colour is looked up, and their weights."""
+        (low, high, fy), (left, right, fx) = self._between(uv)
+        rows, columns = jnp.stack([low, low, high, high]), jnp.stack([left, right, left, right])
+        return rows, columns, jnp.stack([(1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx])
+
+    def _between(self, uv: Point2) -> tuple[tuple[Index, Index, Scalar], tuple[Index, Index, Scalar]]:
+        """The two rows, and then the two columns, between which (u, v) lies, and its share of the way."""
+        h, w, _ = self.texels.shape
         if self.at_vertices:
             x, y = within(uv[0], 0.0, 1.0) * (w - 1), within(uv[1], 0.0, 1.0) * (h - 1)
         else:
@@ -62,7 +75,4 @@ class ImageTexture(eqx.Module):
         column, row = jnp.floor(x), jnp.floor(y)
         fx, fy = x - column, y - row
         ix, iy = column.astype(jnp.int32), row.astype(jnp.int32)
-        left, right, low, high = ix % w, (ix + 1) % w, iy % h, (iy + 1) % h
-        return (1 - fy) * ((1 - fx) * texels[low, left] + fx * texels[low, right]) + fy * (
-            (1 - fx) * texels[high, left] + fx * texels[high, right]
-        )
+        return (iy % h, (iy + 1) % h, fy), (ix % w, (ix + 1) % w, fx)

@@ -1,8 +1,7 @@
-"""What a sweep measures, in the process of a `Worker`: errors of pictures and of derivatives; small fits are in recovery.py."""
+"""What a sweep measures, in the process of a `Worker`: errors of pictures and of derivatives."""
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +17,6 @@ from ..scene.scene import Scene
 from ..scene.views import resized, shrunk
 from ..xla.compilation import compiled
 from ..xla.devices import peak_device_mb
-from .recovery import Recovery, dct_modes
 from .table import Row, Sweep, settings_of
 from .worker import Answers, timed
 
@@ -27,6 +25,11 @@ MODES = 8  # a side: the gradient is compared along the 8 x 8 smoothest DCT mode
 DRAWS = 4  # of the points on edges, whose errors are taken together: one draw's error is as much luck as settings
 LEAST_SECONDS = 0.25  # of a measurement: single runs of 5 ms differed by a third from sweep to sweep
 _CAST = 1 << 16  # rays that are cast together where hits are compared
+
+
+def dct_modes(n: int, count: int) -> Float[np.ndarray, "n k"]:
+    """The first modes of the DCT-II, a column each."""
+    return np.cos(np.pi * np.arange(count) * (np.arange(n)[:, None] + 0.5) / n)
 
 
 def centre_hits(scene: Scene, settings: Settings) -> Int[np.ndarray, "n 5"]:
@@ -109,8 +112,7 @@ def prepare(job: tuple[Sweep, Row]) -> Answers:
     jax.config.update("jax_num_cpu_devices", sweep.devices)
     jax.config.update("jax_enable_compilation_cache", False)  # the time of compilation is a figure
     scene = resized(load_scene(sweep.path, np.dtype(one["precision"])), sweep.width, sweep.height)
-    fit = {name: one[name] for name in ("tolerance", "levels") if name in one}
-    measured: Any = {"picture": Picture, "derivative": Derivative, "fit": Recovery}[one["task"]](scene, settings_of(one), **fit)
+    measured = {"picture": Picture, "derivative": Derivative}[one["task"]](scene, settings_of(one))
     path = sweep.reference(one["task"])
 
     def first() -> dict[str, float]:
@@ -122,8 +124,6 @@ def prepare(job: tuple[Sweep, Row]) -> Answers:
         return {}
 
     def errors() -> dict[str, float]:
-        if one["task"] == "fit":
-            return measured.errors({})
         with reading(path), np.load(path) as reference:
             return measured.errors(reference)
 

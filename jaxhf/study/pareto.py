@@ -11,7 +11,6 @@ from .table import Row, changes, in_words
 _ERRORS = {
     "picture": {"rmse": "RMSE", "p999": "99.9 %", "wrong_hits": "wrong hits"},
     "derivative": {"cosine": "cosine", "relative_error": "relative error", "spread": "spread"},
-    "fit": {"rmse": "RMSE of the heights"},
 }
 _COSTS = {
     "against_base": ("time, of the base", ".2f"), "seconds": ("seconds", ".3g"), "cpu_seconds": ("core seconds", ".3g"),
@@ -74,9 +73,8 @@ def _in_python(row: Row) -> str:
     """The settings as they are written in Python, and what they cost."""
     changed = {name: row[name] for name, value in dataclasses.asdict(Settings()).items() if row[name] != value}
     written = [f'{name}="{value}"' if isinstance(value, str) else f"{name}={value}" for name, value in changed.items()]
-    options = f", tolerance={row['tolerance']}, levels {row['levels']}" if row["task"] == "fit" else ""
     costs = f"error {row['error']:.3g}, {row['seconds']:.3g} s, {row['peak_mb']:.0f} MiB"
-    return f"Settings({', '.join(written)}), {row['precision']}{options}: {costs}"
+    return f"Settings({', '.join(written)}), {row['precision']}: {costs}"
 
 
 def markdown(measured: Sequence[Row]) -> str:

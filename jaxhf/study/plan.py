@@ -37,7 +37,6 @@ _VALUES: dict[str, dict[str, tuple[Any, ...]]] = {
     "derivative": {
         "edge_samples": (0, 1000, 100_000), "samples": (1, 16), "precision": ("float64",), "shading": ("flat",),
     },
-    "fit": {"tolerance": (1e-2, 1e-3, 1e-5), "levels": ("1.0",)},
 }  # fmt: skip
 _QUICK: dict[str, tuple[Any, ...]] = {
     "max_steps": (16, 64), "samples": (1, 4, 16), "normals": ("central",), "chunk": (4096,), "edge_samples": (0, 100_000),
@@ -46,12 +45,12 @@ _QUICK: dict[str, tuple[Any, ...]] = {
 
 def plan(
     path: PathLike, folder: PathLike | None = None, *, width: int | None = None, devices: int | None = None,
-    knobs: Sequence[str] = (), quick: bool = False, fits: bool = False,
+    knobs: Sequence[str] = (), quick: bool = False,
 ) -> Sweep:  # fmt: skip
     """What is to be measured of a scene file; the keywords are the options of `jaxhf tradeoff`, whose --help tells of them.
 
     Raises:
-      ValueError: an unknown knob, fits of a terrain with holes, or anything about the scene.
+      ValueError: an unknown knob, or anything about the scene.
     """
     for knob in knobs:
         if knob not in KNOBS:
@@ -63,15 +62,12 @@ def plan(
     for knob, absent in _unused(scene).items():
         if knob in knobs:
             raise ArgumentError("tradeoff", "knobs", f"{knob!r} changes nothing here: the scene has no {absent}")
-    fits = fits or not _VALUES["fit"].keys().isdisjoint(knobs)
-    if fits and not np.isfinite(scene.heights).all():
-        raise FileError(f"{path}: a fit's terrain must be without holes, this one has {np.sum(~np.isfinite(scene.heights))}")
     if width:
         scene = resized(scene, width, max(1, round(width / scene.camera.width * scene.camera.height)))
     else:
         scene = shrunk(scene, PIXELS // 2 if quick else PIXELS)
     rows: list[Row] = []
-    for row in _configurations(scene, knobs or KNOBS, quick, fits):
+    for row in _configurations(scene, knobs or KNOBS, quick):
         if row not in rows:
             rows.append(row)
     # Four times the base's samples at least, else the reference's error would be that of rounding.
@@ -83,7 +79,7 @@ def plan(
     return Sweep(path, folder, scene.camera.width, scene.camera.height, devices, identity, rows, references)
 
 
-def _configurations(scene: Scene, knobs: Collection[str], quick: bool, fits: bool) -> Iterator[Row]:
+def _configurations(scene: Scene, knobs: Collection[str], quick: bool) -> Iterator[Row]:
     """One knob at a time from each task's base; for pictures then samples together with what makes each of them cheaper."""
     knobs = set(knobs) - _unused(scene).keys()
 
@@ -93,8 +89,8 @@ def _configurations(scene: Scene, knobs: Collection[str], quick: bool, fits: boo
             for value in (_QUICK.get(knob, values) if quick else values) if knob in swept else ():
                 yield row | {knob: value}
 
-    def base(task: str, settings: Settings, **fit: Any) -> Row:
-        return {"task": task, "precision": "float32", **dataclasses.asdict(settings), **fit}
+    def base(task: str, settings: Settings) -> Row:
+        return {"task": task, "precision": "float32", **dataclasses.asdict(settings)}
 
     picture = base("picture", resolve_settings(Settings(), scene))
     yield from one_at_a_time(picture, knobs)
@@ -106,9 +102,6 @@ def _configurations(scene: Scene, knobs: Collection[str], quick: bool, fits: boo
                 yield picture | {"samples": samples, **changes}
     if "edge_samples" in knobs:
         yield from one_at_a_time(base("derivative", Settings(samples=4, edge_samples=10_000)), knobs)
-    if fits:
-        fit = base("fit", Settings(samples=4), tolerance=1e-4, levels="coarse to fine")
-        yield from one_at_a_time(fit, _VALUES["fit"] if knobs.isdisjoint(_VALUES["fit"]) else knobs)
 
 
 def _unused(scene: Scene) -> dict[str, str]:

@@ -12,7 +12,6 @@ from .table import ERRORS, Row, Sweep
 _LABELS = {
     "picture": "RMSE of the picture, of its mean radiance",
     "derivative": "relative error of the gradient",
-    "fit": "RMSE of the heights, of their range",
 }
 _COLUMNS = 4
 

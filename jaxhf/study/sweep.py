@@ -12,7 +12,7 @@ from .table import Row, Sweep, in_words
 from .worker import MeasurementError, Worker
 
 _SWOLLEN = 3  # the peak of a derivative's process, of a picture's
-_STARTS = {"picture": 1.5, "derivative": 8, "fit": 12}  # what a process takes to compile, in starts of the base
+_STARTS = {"picture": 1.5, "derivative": 8}  # what a process takes to compile, in starts of the base
 
 
 def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Callable[[int, int, str], None]) -> list[str]:
@@ -94,8 +94,7 @@ def _measure(sweep: Sweep, one: Row, yardstick: Worker, repeats: int) -> Generat
         yield
         runs: list[dict[str, float]] = []
         for turn in range(repeats):
-            enough = one["task"] == "fit" or (turn >= 3 and sum(run["seconds"] for run in runs) >= 15)
-            if not turn or not enough:
+            if turn < 3 or sum(run["seconds"] for run in runs) < 15:
                 runs.append({"base": yardstick.ask("frame")["seconds"], **worker.ask("frame")})
             yield
         worker.send("errors")

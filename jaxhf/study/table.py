@@ -11,19 +11,19 @@ from ..core.settings import Settings
 from ..io.files import reading, save_text
 
 SETTINGS = tuple(field.name for field in dataclasses.fields(Settings))
-KNOBS = ("precision", *SETTINGS, "tolerance", "levels")
+KNOBS = ("precision", *SETTINGS)
 FIGURES = (
     "seconds", "fastest", "cpu_seconds", "against_base", "compile_seconds", "peak_mb",
     "rmse", "p999", "wrong_hits", "cosine", "relative_error", "spread",
 )  # fmt: skip
 COLUMNS = ("identity", "task", *KNOBS, *FIGURES)
-ERRORS = {"picture": "rmse", "derivative": "relative_error", "fit": "rmse"}
+ERRORS = {"picture": "rmse", "derivative": "relative_error"}
 """What a task's "error" is, where one number must do."""
 
 Row = dict[str, Any]
 """A configuration, which one process measures: its "task" and its knobs; once measured, its "error" and figures besides.
 
-The task is a "picture", a "derivative" (value and gradient of a loss) or a "fit", which alone has "tolerance" and "levels".
+The task is a "picture" or a "derivative": value and gradient of a loss.
 """
 
 
@@ -33,7 +33,7 @@ def settings_of(row: Row) -> Settings:
 
 def changes(row: Row, base: Row) -> dict[str, Any]:
     """The knobs in which a configuration differs from the base."""
-    return {knob: row[knob] for knob in KNOBS if knob in row and row[knob] != base.get(knob)}
+    return {knob: row[knob] for knob in KNOBS if row[knob] != base[knob]}
 
 
 def in_words(row: Row, base: Row) -> str:
@@ -92,8 +92,8 @@ class Sweep:
 
 
 def _key(row: Mapping[str, Any]) -> tuple[str, ...]:
-    """Task and knobs as they stand in the table, whose cells are empty where a task has no such knob."""
-    return tuple(str(row.get(name, "")) for name in ("task", *KNOBS))
+    """Task and knobs as they stand in the table."""
+    return tuple(str(row[name]) for name in ("task", *KNOBS))
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:

@@ -69,7 +69,7 @@ class Grid(eqx.Module):
 def make_grid(
     field: Heightfield,
     world_from_object: Affine | None,
-    normals: NormalScheme | Flag | None,
+    normals: NormalScheme | None,
     levels: int | None = None,
     early_exit: bool = True,
 ) -> Grid:

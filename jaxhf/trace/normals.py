@@ -1,7 +1,5 @@
 """Normals at the vertices of a heightfield."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +8,7 @@ from jaxtyping import Float
 
 from ..core.powers import floor_to_power_of_two
 from ..core.settings import NormalScheme
-from ..core.types import AnyArray, Flag
+from ..core.types import AnyArray
 from ..core.vector import quotient
 from ..xla.materialise import materialise
 
@@ -22,7 +20,7 @@ _FANS = {
 
 
 def vertex_normals(
-    heights: Float[AnyArray, "ny nx"], dx: float, dy: float, scheme: NormalScheme | Flag
+    heights: Float[AnyArray, "ny nx"], dx: float, dy: float, scheme: NormalScheme
 ) -> Float[jax.Array, "ny nx 3"]:
     """Normals at the vertices, on the +z side, object frame; their lengths are the weights of the interpolation.
 
@@ -31,12 +29,8 @@ def vertex_normals(
     that it commutes with affine maps (the sum that the seed's pbrt shape takes). "six-equal": the six unit normals with
     equal weights (Gouraud 1971). "six-angle": weighted by the angle at the vertex (Thürmer and Wüthrich 1998), and of
     length 1, as Mitsuba does. What lies beyond the border or touches a hole takes no part, so that but for "six-angle" a
-    vertex there weighs less in the interpolation; one with no triangle at all gets (0, 0, 1). A flag: "six-angle" where it is
-    true, else "six", from one program.
+    vertex there weighs less in the interpolation; one with no triangle at all gets (0, 0, 1).
     """
-    if not isinstance(scheme, str):
-        branches = [functools.partial(vertex_normals, dx=dx, dy=dy, scheme=name) for name in ("six-angle", "six")]
-        return lax.cond(scheme, *branches, heights)
     # Products of two huge heights, or of two tiny cells, are no numbers in single precision. Any unit will do, and a power of
     # two changes no bit.
     largest = jnp.max(jnp.abs(jnp.where(jnp.isfinite(heights), heights, 0))) * 2.0**-61

@@ -162,7 +162,9 @@ def test_options_that_change_something_are_taken(folder, command):
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.toml").write_text(SCENE)
-    (tmp_path / "case.toml").write_text('scene = "scene.toml"\n[[pictures]]\nimage = "seen.png"\n[fit]\nprior = "prior.npz"\n')
+    (tmp_path / "case.toml").write_text(
+        'scene = "scene.toml"\n[[pictures]]\nimage = "seen.png"\n[fit.prior]\nheights = "prior.npz"\n'
+    )
     np.save("hills.npy", np.eye(4))
     for name in ("rock.png", "seen.png"):
         jaxhf.save_image(name, np.ones((4, 4)))
@@ -203,7 +205,7 @@ def test_nor_is_what_lies_beside_it(folder, command):
     assert command("convert", "hills.asc", "hills.npy")[0] == 0  # which writes no .prj
     np.testing.assert_array_equal(np.load("hills.npy"), [[3, 4], [1, 2]])
     assert (folder / "hills.prj").read_text() == 'LOCAL_CS["here"]'
-    (folder / "case.toml").write_text((folder / "case.toml").read_text() + 'prior_std = "found_std.npz"\n')
+    (folder / "case.toml").write_text((folder / "case.toml").read_text() + 'std = "found_std.npz"\n')
     code, _, text = command("fit", "case.toml", "-o", "found.npz")
     assert (code, "found_std.npz: the output cannot replace an input" in text) == (2, True)
 

@@ -21,6 +21,7 @@ from PIL import Image
 
 import jaxhf
 from jaxhf.core.affine import rotate
+from jaxhf.io.checkpoint import save_checkpoint
 from jaxhf.io.scenes.toml.fit import load_case
 
 if sys.platform != "win32":
@@ -34,16 +35,10 @@ objects = [{ shape = "heightfield", file = "flat.tif" }]
 pictures = [{ image = "seen.npy" }]
 settings = { shadows = false, samples = 1, chunk = 256 }
 [fit]
-albedo = "constant"
-albedo_smoothness = 1
-prior = 0
-prior_std = 30
-tolerance = 1e-9
 max_steps = 9
-light_std = 1
-camera_std = [5, 1]
-uncertainty = 2
-checkpoint_every = 2
+draws = 2
+prior = { heights = 0, std = 30 }
+unknown = { albedo = "constant", light_std = 1, camera_std = [5, 1] }
 """
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
 TRUTH = np.float32(20) * np.sin(4 * np.linspace(0, 1, 9)[None, :] + np.linspace(0, 1, 9)[:, None]).astype(np.float32)
@@ -75,16 +70,17 @@ def pretended(options: dict, ends: bool = True):
         return scene.with_camera(camera).with_lights([jaxhf.Directional((1, 2, 10**0.5))])
 
     def fit(scenes, targets, *, checkpoint, progress, **more) -> jaxhf.Fit:
-        options.update(more, scenes=scenes, targets=targets)
+        options.update(more, scenes=scenes, targets=targets, resume=checkpoint.resume)
         steps = tuple(jaxhf.Step(k, 9, 10.0**-k, k != 2, 0.1, 0.2, 0.5 * k) for k in (1, 2, 3))
         for step in steps:
             progress(step)
-        checkpoint.write_text("state")
+        save_checkpoint(checkpoint.path, {}, ())
         if not ends:
             raise KeyboardInterrupt
         image = np.asarray(targets[0])
         return jaxhf.Fit(
-            heights=jnp.asarray(TRUTH), result=jaxhf.Stop.CONVERGED, std=np.where(TRUTH > 15, np.inf, 1.5), seen=TRUTH <= 15,
+            heights=jnp.asarray(TRUTH), result=jaxhf.Stop.CONVERGED, std=np.where(TRUTH > 15, np.inf, 1.5), samples=None,
+            seen=TRUTH <= 15,
             albedo=jnp.linspace(0, 1, 6).reshape(3, 2, 1), exposures=jnp.array([1.25]), offsets=None,
             scenes=tuple(map(elsewhere, scenes)), images=(image,), residuals=(0 * image,), history=steps,
             stats={"steps": 3, "accepted": 2, "seconds": 1.5, "loss": 0.001, "chi2": 0.99}, noise=np.array([0.0123]),
@@ -112,7 +108,8 @@ def test_what_the_file_says_reaches_fit_and_results_lie_where_the_terrain_lies(f
     assert (scene.heights.dtype, target.shape) == (np.float32, (12, 12, 3))
     assert options["settings"] == SETTINGS
     assert (options["noise"], options["weights"], options["resume"]) == (None, (None,), False)
-    assert (options["prior_std"], options["max_steps"], options["uncertainty"]) == (30, 9, 2)
+    assert (options["prior"].heights, options["prior"].std, options["max_steps"], options["draws"]) == (0, 30, 9, 2)
+    assert (options["unknown"].albedo, options["unknown"].camera_std) == ("constant", [5, 1])
     with rasterio.open(folder / "flat.tif") as flat:
         for name, values in (("out.tif", TRUTH), ("out_std.tif", np.where(TRUTH > 15, np.nan, 1.5))):
             np.testing.assert_array_equal(jaxhf.load_heights(folder / name).heights, values)
@@ -152,7 +149,7 @@ def test_after_ctrl_c_it_says_how_to_go_on(folder, monkeypatch, run):
 @pytest.mark.deep  # one that runs through is in docs/tutorials/photographs.md
 def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch, run):
     """A real fit; what a kill leaves of one is tested with `fit` itself."""
-    plain = re.sub(r"(albedo|uncertainty).*\n", "", CASE)
+    plain = CASE.replace('albedo = "constant", ', "").replace("draws = 2\n", "")
     (folder / "plain.toml").write_text(plain.replace("seen.npy", "plain.npy"))
     np.save(folder / "plain.npy", np.ones((12, 12)))
     (scene,) = load_case(folder / "plain.toml").scenes
@@ -164,7 +161,7 @@ def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch,
             steps.append(step.step)
             to_come.append(step.to_come)
             progress(step)
-            if step.step == 6 and not options["resume"]:
+            if step.step == 6 and not options["checkpoint"].resume:
                 raise KeyboardInterrupt
 
         return real(*arguments, progress=watch, **options)

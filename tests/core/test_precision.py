@@ -10,7 +10,7 @@ import pytest
 import jaxhf
 import jaxhf.mujoco
 from jaxhf.core.precision import rounding
-from jaxhf.fitting.basis import make_heights
+from jaxhf.fitting.model.surface import make_heights
 from jaxhf.io.terrain.terrain import Terrain, heights_of
 
 RELIEF = np.random.default_rng(0).uniform(size=(5, 6))  # of about 1 m
@@ -35,7 +35,7 @@ ENTRANCES = {
     "slope": lambda z, _: jaxhf.slope(z, 1.0),
     "horizon": lambda z, _: jaxhf.horizon(z, 4, dx=1.0),
     "file": by_toml,
-    "start of a fit": lambda z, _: make_heights("start", z, FLAT),
+    "start of a fit": lambda z, _: make_heights("fit", "start", z, FLAT),
 }
 
 

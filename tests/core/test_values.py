@@ -11,8 +11,8 @@ import pytest
 import jaxhf
 import jaxhf.mujoco
 from jaxhf.core.types import array_leaf
-from jaxhf.fitting.basis import make_heights
-from jaxhf.fitting.groups import masked_targets
+from jaxhf.fitting.model.pictures import masked_targets
+from jaxhf.fitting.model.surface import make_heights
 
 RNG = np.random.default_rng(0)
 HEIGHTS = RNG.uniform(0.1, 0.5, (5, 6)).astype(np.float32)
@@ -60,7 +60,7 @@ MADE = {
     "rays of cast": (lambda rays: array_leaf(rays, np.float32), HEIGHTS),
     "horizon": (lambda z: jaxhf.horizon(z, 2, dx=1.0), HEIGHTS),
     "hillshade": (lambda z: jaxhf.hillshade(z, 1.0), HEIGHTS),
-    "start of a fit": (lambda z: make_heights("start", z, FIELD), HEIGHTS.astype(np.float64)),
+    "start of a fit": (lambda z: make_heights("fit", "start", z, FIELD), HEIGHTS.astype(np.float64)),
     "targets and weights of a fit": (lambda image, weight: masked_targets([SCENE], [image], [weight]),
                                      HEIGHTS.astype(np.float64), HEIGHTS.astype(np.float64)),
 }  # fmt: skip
@@ -137,9 +137,7 @@ REFUSED = {
     "fit: targets[0] must be finite where it has a weight; row 0 column 0": lambda: jaxhf.fit([SCENE], [IMAGE]),
     "fit: weights[0] must be finite": lambda: jaxhf.fit([SCENE], [np.ones((5, 6))], weights=[IMAGE]),
     "fit: start must be finite, row 0 column 0 is nan": lambda: jaxhf.fit([SCENE], [np.ones((5, 6))], start=IMAGE, noise=1.0),
-    "fit: prior_std must be positive, it is nan": lambda: jaxhf.fit(
-        [SCENE], [IMAGE.data], noise=1.0, prior=0.0, prior_std=IMAGE
-    ),
+    "Prior: std must be finite, from 0 on, not all 0; it is nan": lambda: jaxhf.Prior(0.0, IMAGE),
 }
 
 

@@ -1,12 +1,17 @@
 """A small terrain in three lights, which the tests of fits share: the same sizes, and so the same programs."""
 
+import dataclasses
 import inspect
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 import jaxhf
-from jaxhf.fitting.options import FitOptions
+from jaxhf.fitting.given import Given
+from jaxhf.fitting.model.expansion import Expansion, expand
+from jaxhf.fitting.model.problem import make_problem
+from jaxhf.fitting.model.units import balanced
 from jaxhf.scene.procedural import fractal
 
 # No shadows, and a frame that ends inside the terrain: so the interior derivative is that of the picture.
@@ -15,27 +20,34 @@ LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6))
 SIZE = 24
 CAMERA = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.6, width=SIZE, height=SIZE)
 HALF = jaxhf.Perspective.look_at((0.25, 0.5, 3), (0.25, 0.5, 0), up=(0, 1, 0), fov=7.6, width=SIZE, height=SIZE)
-# One tolerance, as a number that stands in the compiled step of some solvers.
-OPTIONS: dict[str, Any] = {"settings": SETTINGS, "tolerance": 1e-6, "noise": 0.01, "loss": "squares"}
 TRUTH = fractal([12, 12], seed=3, exponent=3.0, range=(0.0, 0.1))
 
 
-def scenes(heights=None, albedo: Any = 0.7, camera: jaxhf.Perspective | jaxhf.Orthographic = CAMERA) -> list[jaxhf.Scene]:
+def scenes(
+    heights=None, albedo: Any = 0.7, camera: jaxhf.Perspective | jaxhf.Orthographic = CAMERA, others: Any = ()
+) -> list[jaxhf.Scene]:
     heights = np.full_like(TRUTH, 0.05) if heights is None else heights
     field = jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(albedo))
-    return [jaxhf.Scene([field], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]
+    return [jaxhf.Scene([field, *others], camera, [jaxhf.Directional(towards)]) for towards in LIGHTS]
 
 
 def pictures(**options) -> list[np.ndarray]:
     return [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in scenes(TRUTH, **options)]
 
 
-def fit_options(**given) -> FitOptions:
+def given(**options) -> Given:
     """With `fit`'s defaults."""
-    known = {
-        name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items() if item.default is not item.empty
-    }
-    return FitOptions(**{**known, "settings": jaxhf.Settings(), **given})
+    known = {name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items()}
+    defaults = {"settings": jaxhf.Settings(), "unknown": jaxhf.Unknown()}
+    return Given(**{**{field.name: known[field.name] for field in dataclasses.fields(Given)}, **defaults, **options})
+
+
+def expanded(scenes: list[jaxhf.Scene], targets: list[np.ndarray], **options) -> Expansion:
+    """About where a fit starts, in units of one curvature as at its end, but for the errors of samples."""
+    problem, unknowns = make_problem(scenes, targets, given(**options))
+    here = expand(unknowns, problem)
+    scale = jnp.asarray(balanced(here)[0], problem.basis.scale.dtype)
+    return here.of(dataclasses.replace(problem, basis=dataclasses.replace(problem.basis, scale=scale)))
 
 
 def rms(values: Any) -> float:

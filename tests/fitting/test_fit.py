@@ -8,14 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_fits import HALF, LIGHTS, OPTIONS, SETTINGS, SIZE, TRUTH, off_in_shape, pictures, rms, scenes
+from small_fits import HALF, LIGHTS, SETTINGS, SIZE, TRUTH, off_in_shape, pictures, rms, scenes
 
 import jaxhf
 from jaxhf.core.affine import rotate
-from jaxhf.fitting import loop as _loop, normal_equations as _normal_equations
-from jaxhf.fitting.basis import make_basis
-from jaxhf.fitting.solvers import Outcome
-from jaxhf.fitting.view import differences
+from jaxhf.fitting.model.view import differences
+
+OPTIONS: dict[str, Any] = {"settings": SETTINGS, "noise": 0.01}
 
 
 @pytest.fixture(scope="module")
@@ -31,16 +30,16 @@ def test_heights_come_back_from_a_flat_start(targets):
     lines = []
     found = jaxhf.fit(scenes(), spoilt, **OPTIONS, weights=weights, progress=lines.append)
     assert found.result is jaxhf.Stop.CONVERGED
-    assert rms(np.asarray(found.heights) - TRUTH) < 1e-4 * np.ptp(TRUTH)
+    assert rms(np.asarray(found.heights) - TRUTH) < 2e-3 * np.ptp(TRUTH)  # what a step of no use leaves
     assert found.heights.dtype == np.float32
     assert found.seen.all()
     assert found.std is None
     assert [line._replace(to_come=None) for line in lines] == list(found.history)
     assert found.stats["steps"] == len(lines) == lines[-1].step
-    assert lines[-1].loss == found.stats["loss"] < 1e-6 * lines[0].loss
+    assert lines[-1].loss == found.stats["loss"] < 1e-4 * lines[0].loss
     for image, residual, target in zip(found.images, found.residuals, targets, strict=True):
         assert image.shape == residual.shape == (SIZE, SIZE)
-        np.testing.assert_allclose(image, target, atol=1e-5)
+        np.testing.assert_allclose(image, target, atol=3e-4)  # a thirtieth of the noise
     assert np.all(found.residuals[0][4:7, 5:9] == 0)
 
 
@@ -48,24 +47,19 @@ def test_heights_come_back_from_a_flat_start(targets):
 @pytest.mark.deep
 def test_heights_come_back_to_double_precision():
     """What stops a fit in single precision is rounding alone."""
-    found = jaxhf.fit(scenes(), pictures(), **{**OPTIONS, "tolerance": 1e-8})
+    found = jaxhf.fit(scenes(), pictures(), settings=SETTINGS, noise=1e-5)
     assert found.result is jaxhf.Stop.CONVERGED
     assert found.heights.dtype == np.float64
-    assert rms(np.asarray(found.heights) - TRUTH) < 1e-6 * np.ptp(TRUTH)
+    assert rms(np.asarray(found.heights) - TRUTH) < 1e-5 * np.ptp(TRUTH)
 
 
-@pytest.mark.parametrize("losses", [("geman",), pytest.param(("huber", "cauchy"), marks=pytest.mark.deep)])
-def test_robust_losses_let_wild_pixels_go(targets, losses):
-    """A twentieth of them, brighter than all others, and 0.2 % noise: heights off by at most 0.9 %, by least squares 28 %."""
+def test_wild_pixels_are_let_go(targets):
+    """A twentieth of them, brighter than all others, and 0.2 % noise: heights are off by at most 1 %."""
     rng, wild = np.random.default_rng(1), []
     for target in targets:
         noisy = target + 0.002 * rng.standard_normal(target.shape)
         wild.append(np.where(rng.uniform(size=target.shape) < 0.05, 1.0, noisy))
-    off = {
-        loss: off_in_shape(jaxhf.fit(scenes(), wild, settings=SETTINGS, noise=0.002, loss=loss).heights)
-        for loss in ("squares", *losses)
-    }
-    assert 10 * max(off[loss] for loss in losses) < off["squares"], off
+    assert off_in_shape(jaxhf.fit(scenes(), wild, settings=SETTINGS, noise=0.002).heights) < 0.02
 
 
 @pytest.mark.deep  # each alone, and wild pixels, are in other tests
@@ -76,37 +70,39 @@ def test_exposures_and_the_albedo_come_back_in_spite_of_outliers(targets):
     for picture in measured:
         picture += 0.001 * rng.standard_normal(picture.shape)
         picture[rng.uniform(size=picture.shape) < 0.05] = 1.0
-    found = jaxhf.fit(scenes(), measured, settings=SETTINGS, noise=0.001, albedo="constant", exposures=True, max_steps=60)
+    found = jaxhf.fit(
+        scenes(), measured, settings=SETTINGS, noise=0.001, unknown=jaxhf.Unknown(albedo="constant", exposures=True)
+    )
     assert found.albedo is not None
     assert found.albedo.shape == (1, 1, 1)
     np.testing.assert_allclose(np.asarray(found.exposures) * float(found.albedo[0, 0, 0]), 0.8 * truth, rtol=0.01)
     assert off_in_shape(found.heights) < 0.02
 
 
-@pytest.mark.deep
 def test_a_map_of_the_albedo_comes_back():
-    """Three pictures say for each place its slopes and its albedo: no prior is needed."""
+    """Three pictures say for each place its slopes and its albedo, so priors pull by 1e-5; at the border they show little."""
     y, x = np.mgrid[0:1:12j, 0:1:12j]
     factor = 1 + 0.3 * np.sin(5 * x + 3 * y)
     painted = pictures(albedo=jaxhf.ImageTexture(0.7 * factor[..., None].repeat(3, axis=-1)))
-    found = jaxhf.fit(scenes(), painted, **OPTIONS, albedo="map", max_steps=40)
+    found = jaxhf.fit(scenes(), painted, settings=SETTINGS, noise=0.001, unknown=jaxhf.Unknown(albedo="map"))
     assert found.albedo is not None
     assert found.albedo.shape == (12, 12, 1)
-    inner = np.s_[1:-1, 1:-1]  # of the border the pictures show little
-    np.testing.assert_allclose(np.asarray(found.albedo)[..., 0][inner], factor[inner], rtol=0.02)
-    assert off_in_shape(found.heights) < 0.02
+    np.testing.assert_allclose(np.asarray(found.albedo)[..., 0], factor, rtol=1e-3)
+    assert off_in_shape(found.heights) < 1e-3
+    for scene, image in zip(found.scenes, found.images, strict=True):
+        np.testing.assert_allclose(jaxhf.render(scene, SETTINGS)[..., 0], image, atol=1e-5)
 
 
 def test_exposures_and_offsets_come_back_apart(targets):
+    """They trade against each other where slopes are small: a step that is solved to a tenth leaves 0.2 % of that."""
     exposures, offsets = np.array([1.0, 1.2, 0.9]), np.array([0.02, -0.01, 0.05])
     measured = [e * picture + o for picture, e, o in zip(targets, exposures, offsets, strict=True)]
-    found = jaxhf.fit(scenes(), measured, exposures=True, offsets=True, max_steps=40, **OPTIONS)
+    found = jaxhf.fit(scenes(), measured, settings=SETTINGS, noise=0.001, unknown=jaxhf.Unknown(exposures=True, offsets=True))
     assert found.exposures is not None
     assert found.offsets is not None
-    # They trade against each other where slopes are small: after 40 steps they are off by 0.8 % and 0.0046.
-    np.testing.assert_allclose(found.exposures, exposures, rtol=0.015)
-    np.testing.assert_allclose(found.offsets, offsets, atol=0.008)
-    assert off_in_shape(found.heights) < 0.05
+    np.testing.assert_allclose(found.exposures, exposures, rtol=0.006)
+    np.testing.assert_allclose(found.offsets, offsets, atol=0.004)
+    assert off_in_shape(found.heights) < 0.01
 
 
 EYES = ((0.5, -0.6, 2.2), (1.5, 1.0, 2.2), (-0.5, 1.0, 2.2))
@@ -141,9 +137,9 @@ def test_lights_and_cameras_that_are_off_by_a_degree_are_found():
     taken = [off_by_a_degree(scene, k).with_heights(TRUTH) for k, scene in enumerate(given)]
     measured = [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in taken]
     measured = [picture + 0.001 * rng.standard_normal(picture.shape) for picture in measured]
-    options: dict[str, Any] = {"settings": SETTINGS, "noise": 0.001, "prior": prior, "prior_std": std}
+    options: dict[str, Any] = {"settings": SETTINGS, "noise": 0.001, "prior": jaxhf.Prior(prior, std)}
     known = jaxhf.fit(given, measured, **options)
-    found = jaxhf.fit(given, measured, light_std=1, camera_std=(0.01, 1), uncertainty="exact", **options)
+    found = jaxhf.fit(given, measured, unknown=jaxhf.Unknown(light_std=1, camera_std=(0.01, 1)), draws=50, **options)
     error = np.asarray(found.heights) - TRUTH
     assert rms(np.asarray(known.heights) - TRUTH) > 1.5 * rms(prior - TRUTH)
     assert rms(error) < 0.5 * rms(prior - TRUTH)
@@ -174,12 +170,11 @@ def dense_posterior(settings: jaxhf.Settings = SETTINGS) -> np.ndarray:
     return np.linalg.inv(jacobian.T @ jacobian + np.eye(TRUTH.size) / PRIOR_STD**2)
 
 
-def noisy_fit(rng: np.random.Generator, targets: list[np.ndarray], uncertainty: int | str) -> jaxhf.Fit:
+def noisy_fit(rng: np.random.Generator, targets: list[np.ndarray], draws: int) -> jaxhf.Fit:
     """Of a draw of the truth from the prior, as well as of the noise."""
     noisy = [target + NOISE * rng.standard_normal(target.shape) for target in targets]
     prior = TRUTH + PRIOR_STD * rng.standard_normal(TRUTH.shape)
-    known = {"prior": prior, "prior_std": PRIOR_STD, "levels": [1.0], "uncertainty": uncertainty}
-    return jaxhf.fit(scenes(prior), noisy, **OPTIONS, **known)
+    return jaxhf.fit(scenes(prior), noisy, settings=SETTINGS, noise=NOISE, prior=jaxhf.Prior(prior, PRIOR_STD), draws=draws)
 
 
 def test_draws_hold_the_truth_as_often_as_they_say(targets):
@@ -202,15 +197,14 @@ def test_draws_hold_the_truth_as_often_as_they_say(targets):
     ratio = np.mean(deviations, axis=0) / expected
     np.testing.assert_allclose(np.mean(ratio), 1, atol=0.04)
     assert 0.6 < np.std(ratio) * np.sqrt(2 * 50) < 1.4
-    # xᵀ C⁻¹ x is chi squared: 1728 degrees of freedom to 3.4 %.
+    # xᵀ C⁻¹ x is chi squared, 1728 degrees of freedom to 3.4 %, times 1.10: what Geman and McClure's loss loses by letting far
+    # pixels go, E ψ² / (E ψ')² of normal residuals.
     squares = [np.ravel(error) @ np.linalg.solve(covariance, np.ravel(error)) for error in errors]
-    np.testing.assert_allclose(np.mean(squares), TRUTH.size, rtol=0.1)
-    # Exact ones lie apart by the place of the linearisation, and by what noise the residuals bear out.
-    np.testing.assert_allclose(np.asarray(noisy_fit(rng, targets, "exact").std), expected, rtol=0.07)
+    np.testing.assert_allclose(np.mean(squares), 1.10 * TRUTH.size, rtol=0.1)
 
 
 def test_what_no_picture_shows_is_marked():
-    found = jaxhf.fit(scenes(camera=HALF), pictures(camera=HALF), **OPTIONS, max_steps=5, uncertainty="exact")
+    found = jaxhf.fit(scenes(camera=HALF), pictures(camera=HALF), **OPTIONS, max_steps=5, draws=20)
     assert found.result is jaxhf.Stop.MAX_STEPS
     unseen = ~found.seen
     assert found.std is not None
@@ -218,60 +212,6 @@ def test_what_no_picture_shows_is_marked():
     assert found.seen[4:8, 1:5].all()
     assert np.isinf(found.std[unseen]).all()
     assert np.isfinite(found.std[found.seen]).all()
-
-
-@pytest.mark.deep  # no fit takes them by itself
-@pytest.mark.parametrize("solver", ["bfgs", "lbfgs", "adam"])
-def test_other_solvers_come_near(targets, solver):
-    found = jaxhf.fit(scenes(), targets, settings=SETTINGS, noise=0.01, loss="squares", solver=solver, max_steps=80)
-    assert found.stats["loss"] < 0.02 * found.history[0].loss
-    assert off_in_shape(found.heights) < 0.3 * TRUTH.std() / np.ptp(TRUTH)
-
-
-def test_rejections_in_a_row_damp_ever_faster_also_after_an_interruption(targets, tmp_path, monkeypatch):
-    """Twice as much as the one before. No step gains twice what was predicted."""
-    monkeypatch.setattr(_normal_equations, "LEAST_GAIN", 2.0)
-    whole = jaxhf.fit(scenes(), targets, **OPTIONS)
-    assert whole.result is jaxhf.Stop.STALLED
-    last = max(k for k, step in enumerate(whole.history) if step.accepted)
-    damping = np.array([step.damping for step in whole.history[last:]])
-    assert len(damping) > 5
-    np.testing.assert_allclose(damping[1:] / damping[:-1], 10 * 2.0 ** np.arange(len(damping) - 1), rtol=1e-6)
-
-    def interrupt(step: Any) -> None:
-        if step.step == len(whole.history) - 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        jaxhf.fit(scenes(), targets, checkpoint=tmp_path / "kept", progress=interrupt, **OPTIONS)
-    resumed = jaxhf.fit(scenes(), targets, checkpoint=tmp_path / "kept", resume=True, **OPTIONS)
-    assert [step[:-2] for step in resumed.history] == [step[:-2] for step in whole.history]  # but for their time
-    np.testing.assert_array_equal(resumed.heights, whole.heights)
-
-
-def test_a_fit_that_stalls_says_so_and_keeps_the_best(targets, monkeypatch):
-    """Steps as a solver may make them: to a better place, to a worse one, then nowhere any more."""
-    losses = iter([7.0, 5.0, 6.0])
-    predicted = iter([0.3, 0.2, 0.1, 0.03, 1e-2, 1e-3, 1e-5, 1e-9])  # the tolerance is 1e-6
-
-    def advance(solver, unknowns, state, problem):
-        loss = next(losses, None)
-        if loss is not None:
-            unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, unknowns.coefficients.at[1, 2].add(0.01))
-        number = jnp.asarray(loss or 6.0)
-        share, no = jnp.asarray(next(predicted, 0.0)), jnp.asarray(False)
-        return unknowns, state, Outcome(number, jnp.asarray(loss is not None), no, share, number, number, unknowns)
-
-    monkeypatch.setattr(_loop, "advance", advance)
-    found = jaxhf.fit(scenes(), targets, **OPTIONS)
-    assert found.result is jaxhf.Stop.STALLED
-    assert found.stats["steps"] == 3 + 5
-    assert found.stats["loss"] == 5
-    best = np.asarray(found.heights) - np.float32(0.05)
-    assert np.ptp(best) > 1e-3
-    basis = make_basis(scenes()[0].heightfields[0], np.zeros((12, 12), np.float32))
-    expected = np.asarray(basis.heights(jnp.zeros((12, 12)).at[1, 2].set(1.0)))
-    np.testing.assert_allclose(best / np.abs(best).max(), expected / np.abs(expected).max(), atol=1e-5)  # two steps of it
 
 
 def test_a_loss_that_is_not_finite_stops_the_fit(targets):
@@ -289,3 +229,28 @@ def test_terrain_with_a_hole_is_found_from_a_start_without(targets):
     found = jaxhf.fit(scenes(holed), targets, start=filled, **OPTIONS, max_steps=3)
     np.testing.assert_array_equal(found.heights, jaxhf.fit(scenes(filled), targets, **OPTIONS, max_steps=3).heights)
     assert np.ptp(found.heights) > 0.01
+
+
+def test_heights_that_are_held_stay_as_they_are(targets):
+    """A window in terrain that goes on around it: known there, found here, to the deviation that the noise leaves."""
+    std = np.zeros((12, 12))
+    std[3:9, 3:9] = 0.02
+    known = np.where(std > 0, 0.05, TRUTH)
+    found = jaxhf.fit(scenes(), targets, **OPTIONS, prior=jaxhf.Prior(known, std), draws=10)  # from a start elsewhere
+    heights = np.asarray(found.heights)
+    np.testing.assert_array_equal(heights[std == 0], known.astype(np.float32)[std == 0])
+    assert rms((heights - TRUTH)[std > 0]) < 0.2 * rms((known - TRUTH)[std > 0])
+    assert found.std is not None
+    assert found.samples is not None
+    assert (found.std[std == 0] == 0).all()
+    assert (found.std[std > 0] > 0).all()
+    np.testing.assert_allclose(np.sqrt(np.mean((found.samples - heights) ** 2, axis=0)), found.std, atol=1e-7)
+
+
+@pytest.mark.deep  # of test_expansion, too
+def test_a_mirror_beside_the_terrain_goes_the_same_way(targets):
+    """Whose samples depend on more than one triangle: then pictures are rendered again for each product."""
+    mirror = jaxhf.Object(jaxhf.Heightfield(np.full((2, 2), 0.5), dx=0.1, x0=0.2, y0=0.4), jaxhf.Mirror(0.9))
+    measured = [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in scenes(TRUTH, others=[mirror])]
+    found = jaxhf.fit(scenes(others=[mirror]), measured, **OPTIONS, max_steps=8)
+    assert off_in_shape(found.heights) < 0.1

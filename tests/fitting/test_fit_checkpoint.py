@@ -4,69 +4,114 @@ import contextlib
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_fits import fit_options
+from small_fits import given
 
 import jaxhf
-from jaxhf.fitting import fit as _fit, known as _known, loop as _loop
-from jaxhf.fitting.fingerprint import fingerprint as fit_fingerprint
-from jaxhf.fitting.problem import make_problem
-from jaxhf.fitting.solvers import Outcome
+from jaxhf.fitting import coarser as _coarser, fit as _fit
+from jaxhf.fitting.model.expansion import Expansion
+from jaxhf.fitting.model.problem import make_problem
+from jaxhf.fitting.model.units import Units
+from jaxhf.fitting.solve import run as _run, steps as _steps
+from jaxhf.fitting.solve.state import fingerprint as state_fingerprint
+from jaxhf.fitting.solve.steps import Outcome
+from jaxhf.fitting.trust import judge as _judge
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256, edge_samples=0)
-# Two levels, steps 1 to 9 and 10 to 18; then the loss becomes as sharp as it is to be.
-OPTIONS = {
-    "settings": SETTINGS, "checkpoint_every": 2, "max_steps": 24, "tolerance": 1e-9,
-    "levels": [0.5, 1.0], "loss": "geman", "noise": 0.001,
-}  # fmt: skip
+OPTIONS: dict[str, Any] = {"settings": SETTINGS, "max_steps": 24, "unknown": jaxhf.Unknown(light_std=1.0)}
 
 
-def problem() -> tuple[list[jaxhf.Scene], list[np.ndarray]]:
+def problem(count: int = 17) -> tuple[list[jaxhf.Scene], list[np.ndarray]]:
     camera = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.0, width=12, height=12)
 
     def scene(heights):
         return jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera, [jaxhf.Directional((1, 2, 3))])
 
-    y, x = np.mgrid[0:1:9j, 0:1:9j]
-    return [scene(np.zeros((9, 9)))], [np.asarray(jaxhf.render(scene(0.1 * np.sin(4 * x + y)), SETTINGS))]
+    y, x = np.mgrid[0 : 1 : count * 1j, 0 : 1 : count * 1j]
+    return [scene(np.zeros((count, count)))], [np.asarray(jaxhf.render(scene(0.1 * np.sin(4 * x + y)), SETTINGS))]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def soon_judged() -> Iterator[None]:
+    """The noise is estimated on the way, and not once more at the end, which takes longer than all steps."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(_judge, "_restricted", lambda expansion, *_: (expansion, None))
+        yield
 
 
 @pytest.fixture(scope="module")
 def whole() -> jaxhf.Fit:
-    return jaxhf.fit(*problem(), **OPTIONS)
+    """8 modes a side, then 16, and all once more."""
+    found = jaxhf.fit(*problem(), **OPTIONS)
+    assert {step.level for step in found.history} == {9, 17}
+    return found
 
 
 def agree(found: jaxhf.Fit, whole: jaxhf.Fit) -> None:
     np.testing.assert_array_equal(found.heights, whole.heights)
     assert found.result is whole.result
     assert [step._replace(seconds=0.0) for step in found.history] == [step._replace(seconds=0.0) for step in whole.history]
+    for scene, other in zip(found.scenes, whole.scenes, strict=True):
+        (light,), (same,) = scene.lights, other.lights
+        assert isinstance(light, jaxhf.Directional)
+        assert isinstance(same, jaxhf.Directional)
+        np.testing.assert_array_equal(light.towards, same.towards)
+
+
+def begun(path: Path, every: int = 2, **options) -> jaxhf.Fit:
+    return jaxhf.fit(*problem(), **{**OPTIONS, **options}, checkpoint=jaxhf.Checkpoint(path, every))
 
 
 def resumed(path: Path, whole: jaxhf.Fit, **options) -> list[jaxhf.Step]:
     """The steps that are taken once more, after which all is as if nothing had happened."""
-    again = []
-    agree(jaxhf.fit(*problem(), **{**OPTIONS, **options}, checkpoint=path, resume=True, progress=again.append), whole)
+    again, checkpoint = [], jaxhf.Checkpoint(path, 2, resume=True)
+    agree(jaxhf.fit(*problem(), **{**OPTIONS, **options}, checkpoint=checkpoint, progress=again.append), whole)
     return again
 
 
-@pytest.mark.parametrize("last", [4, *(pytest.param(step, marks=pytest.mark.deep) for step in (1, 7))])
+@pytest.mark.parametrize("last", [2, "level", *(pytest.param(step, marks=pytest.mark.deep) for step in (1, 3, 5, "end"))])
 def test_after_ctrl_c_it_goes_on_to_the_same_bits(tmp_path, whole, last):
+    """In a stage, and after the last step of one."""
+    first_of_all = next(step.step for step in whole.history if step.level == 17)
+    last = {"level": first_of_all - 1, "end": len(whole.history) - 1}.get(last, last)
+
     def interrupt(step: Any) -> None:
         if step.step == last:
             raise KeyboardInterrupt
 
     path = tmp_path / "fit.checkpoint"
     with pytest.raises(KeyboardInterrupt):
-        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, progress=interrupt)
+        begun(path, progress=interrupt)
     assert resumed(path, whole)[0].step == last + 1
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_it_goes_on_among_rejected_steps(tmp_path, monkeypatch):
+    """After one, and after two in a row, where λ grows faster: where hardly a step gains twice what was predicted."""
+    monkeypatch.setattr(_steps, "_LEAST_GAIN", 2.0)
+    monkeypatch.setattr(_steps, "_GOOD", 3.0)
+    whole = jaxhf.fit(*problem(), **OPTIONS)
+    accepted = [step.accepted for step in whole.history]
+    once, twice = accepted.index(False) + 1, accepted.index(False) + 2
+    assert not accepted[twice - 1]
+    for last in (once, twice):
+
+        def interrupt(step: Any, last: int = last) -> None:
+            if step.step == last:
+                raise KeyboardInterrupt
+
+        path = tmp_path / f"{last}.checkpoint"
+        with pytest.raises(KeyboardInterrupt):
+            begun(path, progress=interrupt)
+        assert resumed(path, whole)[0].step == last + 1
 
 
 class Slow:
@@ -78,8 +123,8 @@ class Slow:
 
 @contextlib.contextmanager
 def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
-    """Ctrl-C as `_loop` has called the function of this name for so many times: in it, or where its loss is waited for."""
-    original, calls = getattr(_loop, name), []
+    """Ctrl-C as `_run` has called the function of this name for so many times: in it, or where its loss is waited for."""
+    original, calls = getattr(_run, name), []
 
     def interrupted(*arguments):
         calls.append(arguments)
@@ -88,28 +133,19 @@ def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
             return found
         if not waiting:
             raise KeyboardInterrupt
-        unknowns, state, outcome = found
-        return unknowns, state, outcome._replace(loss=Slow())
+        unknowns, position, outcome = found
+        return unknowns, position, outcome._replace(loss=Slow())
 
     with monkeypatch.context() as patched:
-        patched.setattr(_loop, name, interrupted)
+        patched.setattr(_run, name, interrupted)
         with pytest.raises(KeyboardInterrupt):
             yield
 
 
-# Which function is interrupted in which of its calls, whether its result is being waited for, and the step that comes next.
-CTRL_C = [
-    ("pictures_and_influence", 1, False, 1),  # before the first level
-    ("advance", 1, True, 1),
-    ("save_checkpoint", 1, False, 3),
-    ("advance", 5, True, 5),
-    ("pictures_and_influence", 11, False, 10),  # the first of those that measure the loss's curvature, as the level changes
-    ("reset_state", 3, False, 19),
-]
-MORE = [
-    ("init_state", 1, False, 1), ("advance", 1, False, 1), ("advance", 2, True, 2), ("pictures_and_influence", 10, False, 10),
-    ("reset_state", 2, False, 10), ("pictures_and_influence", 19, False, 19),
-]  # fmt: skip
+# Which function is interrupted in which of its calls, whether its result is being waited for, and the step that comes next:
+# None is the first one of the second stage.
+CTRL_C = [("spreads", 1, False, 1), ("advance", 1, True, 1), ("advance", 3, True, 3), ("balanced", 2, False, None)]
+MORE = [("expand", 1, False, 1), ("advance", 1, False, 1), ("first_position", 1, False, 1), ("expand", 2, False, 2)]
 
 
 @pytest.mark.parametrize(
@@ -118,67 +154,101 @@ MORE = [
 def test_ctrl_c_leaves_nothing_half_made(tmp_path, monkeypatch, whole, name, call, waiting, step):
     path = tmp_path / "fit.checkpoint"
     with ctrl_c(monkeypatch, name, call, waiting):
-        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path)
-    began = (name, call) not in (("init_state", 1), ("pictures_and_influence", 1))
+        begun(path)
+    step = step or next(done.step for done in whole.history if done.level == 17)
+    began = name == "advance" or step > 1  # else there is nothing to be kept
     assert [file.name for file in tmp_path.iterdir()] == ([path.name] if began else [])
     assert resumed(path, whole)[0].step == step
-
-
-# The first accepted step of a line search is the 16th.
-@pytest.mark.deep
-@pytest.mark.parametrize(("solver", "step"), [("bfgs", 21), ("lbfgs", 21), ("adam", 5)])
-def test_ctrl_c_keeps_the_step_before_of_other_solvers(tmp_path, monkeypatch, solver, step):
-    path, options = tmp_path / "fit.checkpoint", {**OPTIONS, "solver": solver, "levels": [1.0], "noise": 0.01}
-    whole = jaxhf.fit(*problem(), **options)
-    assert whole.history[step - 1].accepted
-    with ctrl_c(monkeypatch, "advance", step, waiting=True):
-        jaxhf.fit(*problem(), **options, checkpoint=path)
-    assert resumed(path, whole, **options)[0].step == step
 
 
 def test_ctrl_c_after_the_last_step_keeps_them_all(tmp_path, monkeypatch, whole):
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    path, options = tmp_path / "fit.checkpoint", {**OPTIONS, "checkpoint_every": 100}
+    path = tmp_path / "fit.checkpoint"
     with monkeypatch.context() as patched:
-        patched.setattr(_fit, "standard_deviations", interrupt)
+        patched.setattr(_judge, "standard_deviations", interrupt)
         with pytest.raises(KeyboardInterrupt):
-            jaxhf.fit(*problem(), **options, uncertainty="exact", checkpoint=path)
-    assert resumed(path, whole, **options) == []
+            begun(path, every=100, draws=2)
+    assert resumed(path, whole) == []
 
 
-def test_a_checkpoint_that_cannot_be_kept_is_refused_first(tmp_path, monkeypatch):
-    monkeypatch.setattr(_fit, "FitLoop", None)  # nothing begins
+def test_a_checkpoint_that_cannot_be_kept_is_refused_first(tmp_path):
+    """As it is named, so before anything begins."""
     path = tmp_path / "fit.checkpoint"
     with pytest.raises(FileNotFoundError, match=r"none/fit\.checkpoint: there is no folder"):
-        jaxhf.fit(*problem(), **OPTIONS, checkpoint=tmp_path / "none" / "fit.checkpoint", resume=True)
+        jaxhf.Checkpoint(tmp_path / "none" / "fit.checkpoint", resume=True)
     with pytest.raises(ValueError, match=r"a checkpoint cannot be written here, it is a folder"):
-        jaxhf.fit(*problem(), **OPTIONS, checkpoint=tmp_path, resume=True)
+        jaxhf.Checkpoint(tmp_path, resume=True)
     path.write_bytes(b"hours of work")
     with pytest.raises(ValueError, match=r"fit\.checkpoint: this checkpoint is there already; resume=True goes on from it"):
-        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path)
+        jaxhf.Checkpoint(path)
     with pytest.raises(ValueError, match=r"fit\.checkpoint: this is not a checkpoint of jaxhf's"):
-        jaxhf.fit(*problem(), **OPTIONS, checkpoint=path, resume=True)
+        jaxhf.Checkpoint(path, resume=True)
     assert path.read_bytes() == b"hours of work"
+    with pytest.raises(ValueError, match="Checkpoint: every must be a whole number from 1 on, it is 0"):
+        jaxhf.Checkpoint(tmp_path / "other", every=0)
 
 
 def without_pictures(setattr: Callable[..., None]) -> None:
-    """Replaces all that renders in a fit: steps add to the coefficients what a counter, the solver's state, says."""
+    """Replaces all that renders, where the noise is given: steps add to the coefficients what a counter says."""
 
-    def pictures(unknowns, problem, *_):
-        return [jnp.zeros_like(group.targets) for group in problem.groups], np.zeros((9, 9))
+    class Position(NamedTuple):
+        y_eval: Any
+        step_size: jnp.ndarray
+        fresh: bool = False
 
-    def advance(solver, unknowns, state, problem):
-        unknowns = eqx.tree_at(lambda u: u.coefficients, unknowns, unknowns.coefficients + jnp.sin(state))
-        loss, yes = 1 / (1 + state), jnp.asarray(True)
-        return unknowns, state + 1, Outcome(loss, yes, ~yes, loss, loss, loss, unknowns)
+    def advance(unknowns, position, *_):
+        if position.fresh:  # only evaluates
+            new, size = unknowns, position.step_size
+        else:
+            new, size = position.y_eval, position.step_size + 1
+        there = eqx.tree_at(lambda u: u.coefficients, new, new.coefficients + jnp.sin(size))
+        loss = 1e6 * jnp.exp(-size / 10)
+        return new, Position(there, size), Outcome(loss, jnp.asarray(True), loss, size, 1 / size)
 
-    setattr(_loop, "init_state", lambda solver, unknowns, problem: jnp.zeros(()))
-    setattr(_loop, "reset_state", lambda initial, unknowns, step_size: initial)
-    setattr(_known, "linearised", lambda unknowns, problem: problem)
-    setattr(_loop, "advance", advance)
-    setattr(_loop, "pictures_and_influence", pictures)
+    setattr(_run, "expand", lambda unknowns, problem: Expansion(problem, unknowns, (None,) * len(problem.groups)))
+    setattr(_run, "advance", advance)
+    setattr(_run, "first_position", lambda expansion: None)
+    setattr(_run, "position_at", lambda first, unknowns, step_size: Position(unknowns, step_size, True))
+    setattr(_run, "spreads", lambda expansion: np.ones(1))
+    setattr(_run, "balanced", units_of_one)
+    setattr(_fit, "judged", judged_as_it_is)
+
+
+def units_of_one(expansion: Expansion) -> Units:
+    others = jax.tree.map(np.ones_like, expansion.unknowns.without_modes())
+    return Units(np.ones(expansion.problem.basis.base.shape), 1.0, others)
+
+
+def judged_as_it_is(ended, problems, given, report) -> _judge.Judgement:
+    """Without a look at its pictures."""
+    none = np.zeros((12, 12, 1))
+    expansion = _run.with_all_modes(ended, problems, given)
+    return _judge.Judgement(expansion, [none], [none], (), np.ones(expansion.heights.shape, bool), None, None, 1.0, ())
+
+
+def test_it_goes_on_with_coarse_and_with_fine_heights(tmp_path, monkeypatch):
+    """A checkpoint holds as many numbers as its level has: of the heights with their padding, and of the albedo."""
+    without_pictures(monkeypatch.setattr)
+    monkeypatch.setattr(_coarser, "_MOST_SAMPLES", 100)
+    monkeypatch.setattr(_coarser, "_FACTOR", 2)
+    scenes, targets = problem(33)
+    unknown = jaxhf.Unknown(albedo="map", light_std=1.0)
+    options = OPTIONS | {"noise": 1.0, "prior": jaxhf.Prior(0.1, 1.0, 0.1), "unknown": unknown}
+    whole = jaxhf.fit(scenes, targets, **options)
+    coarse = sum(step.level < 33 for step in whole.history)  # 17 heights a side, with 2 beyond each border
+    assert 2 < coarse < len(whole.history) - 2
+    for last in (1, coarse - 1, coarse, coarse + 1, len(whole.history) - 1):
+
+        def interrupt(step: Any, last: int = last) -> None:
+            if step.step == last:
+                raise KeyboardInterrupt
+
+        path = tmp_path / f"{last}.checkpoint"
+        with pytest.raises(KeyboardInterrupt):
+            jaxhf.fit(scenes, targets, **options, checkpoint=jaxhf.Checkpoint(path), progress=interrupt)
+        agree(jaxhf.fit(scenes, targets, **options, checkpoint=jaxhf.Checkpoint(path, resume=True)), whole)
 
 
 def run_python(program: str, *arguments: str) -> subprocess.Popen:
@@ -189,11 +259,11 @@ def run_python(program: str, *arguments: str) -> subprocess.Popen:
 
 
 def test_a_killed_process_loses_at_most_one_interval(tmp_path, monkeypatch):
-    path, options = tmp_path / "fit.checkpoint", {**OPTIONS, "max_steps": 12}
+    path, options = tmp_path / "fit.checkpoint", {"max_steps": 12, "noise": 1.0}
     program = (
         "import time; from test_fit_checkpoint import *; without_pictures(setattr)\n"
         "def progress(step):\n    print(step.step, flush=True)\n    time.sleep(0.2)\n"
-        "jaxhf.fit(*problem(), **{**OPTIONS, 'max_steps': 12}, checkpoint=sys.argv[1], progress=progress)"
+        "begun(sys.argv[1], max_steps=12, noise=1.0, progress=progress)"
     )
     with run_python(program, str(path)) as process:
         assert process.stdout is not None
@@ -203,7 +273,7 @@ def test_a_killed_process_loses_at_most_one_interval(tmp_path, monkeypatch):
                 break
     assert process.returncode == -signal.SIGKILL
     without_pictures(monkeypatch.setattr)
-    whole = jaxhf.fit(*problem(), **options)
+    whole = jaxhf.fit(*problem(), **{**OPTIONS, **options})
     assert len(whole.history) == 12
     assert 4 <= resumed(path, whole, **options)[0].step - 1 <= 5  # kept after 4, or a step later than it was told
 
@@ -233,45 +303,43 @@ def fingerprint(size=(4, 6), material: jaxhf.Matte | jaxhf.Mirror | None = None,
     camera = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.0, width=width, height=height)
     terrain = jaxhf.Object(jaxhf.Heightfield(np.zeros((3, 3))), material or jaxhf.Matte(0.5))
     scene = jaxhf.Scene([terrain], camera, [jaxhf.Directional((1, 2, 3))], samples=samples)
-    chosen = fit_options(**options)
-    return fit_fingerprint(*make_problem([scene], [np.zeros(size)], chosen), chosen)
+    chosen = given(**options)
+    return state_fingerprint(*make_problem([scene], [np.zeros(size)], chosen), chosen)
 
 
 def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():
     """Pictures of 4 x 6 and 6 x 4 zeros, a reflected share of 0.5, ...: the bytes of all arrays are the same."""
     options: list[dict[str, Any]] = [
         {}, {"samples": 4}, {"material": jaxhf.Mirror(0.5)}, {"size": (6, 4)}, {"settings": jaxhf.Settings(samples=9)},
-        {"solver": "adam"}, {"levels": [0.5, 1.0]}, {"inner_steps": 50}, {"tolerance": 1e-5}, {"exposures": True},
-        {"offsets": True}, {"albedo": "constant"}, {"loss": "cauchy"}, {"loss": "huber"},
+        {"unknown": jaxhf.Unknown(exposures=True)}, {"unknown": jaxhf.Unknown(offsets=True)},
+        {"unknown": jaxhf.Unknown(albedo="constant")}, {"unknown": jaxhf.Unknown(albedo="constant", albedo_std=2)},
+        {"unknown": jaxhf.Unknown(light_std=1)}, {"prior": jaxhf.Prior(0.0, 1.0)}, {"prior": jaxhf.Prior(0.0, 1.0, 0.5)},
     ]  # fmt: skip
     found = [fingerprint(**given) for given in options]
     assert len(set(found)) == len(found)
     # What is chosen at first may be what another fit is given: 1 % of the brightness, 2048 points.
     assert fingerprint(noise=0.01) != found[0]
     assert fingerprint(settings=jaxhf.Settings(edge_samples=2048)) != found[0]
-    assert fingerprint(max_steps=7, checkpoint_every=3, uncertainty=5) == found[0]  # what does not decide on the steps
+    assert fingerprint(max_steps=7, draws=5) == found[0]  # what does not decide on the steps
 
 
 @pytest.mark.deep  # a killed process has left one, too
 def test_another_process_finds_the_same_fingerprint():
-    program = "from test_fit_checkpoint import *; print(fingerprint(albedo='map', loss='geman', levels=[0.5, 1.0]))"
+    program = "from test_fit_checkpoint import *; print(fingerprint(unknown=jaxhf.Unknown(albedo='map')))"
     found, _ = run_python(program).communicate(timeout=120)
-    assert found.strip() == fingerprint(albedo="map", loss="geman", levels=[0.5, 1.0])
+    assert found.strip() == fingerprint(unknown=jaxhf.Unknown(albedo="map"))
 
 
 def test_a_damaged_checkpoint_and_that_of_another_fit_are_refused(tmp_path, monkeypatch):
     """Before anything is rendered."""
     path = tmp_path / "fit.checkpoint"
     scenes, targets = problem()
-    jaxhf.fit(scenes, targets, **{**OPTIONS, "max_steps": 2}, checkpoint=path)
-    monkeypatch.setattr(_loop.FitLoop, "_initial_state", None)
+    begun(path, max_steps=2)
+    monkeypatch.setattr(_run, "expand", None)
     with pytest.raises(ValueError, match=r"fit\.checkpoint: this is the checkpoint of another fit"):
-        jaxhf.fit(scenes, [targets[0] + 1], **OPTIONS, checkpoint=path, resume=True)
+        jaxhf.fit(scenes, [targets[0] + 1], **OPTIONS, checkpoint=jaxhf.Checkpoint(path, resume=True))
     content = bytearray(path.read_bytes())
     content[-100] ^= 1
     path.write_bytes(content)
     with pytest.raises(ValueError, match=r"fit\.checkpoint: the checkpoint is damaged"):
-        jaxhf.fit(scenes, targets, **OPTIONS, checkpoint=path, resume=True)
-    path.write_bytes(b"heights")
-    with pytest.raises(ValueError, match=r"fit\.checkpoint: this is not a checkpoint"):
-        jaxhf.fit(scenes, targets, **OPTIONS, checkpoint=path, resume=True)
+        jaxhf.Checkpoint(path, resume=True)

@@ -1,30 +1,33 @@
 """What a fit chooses by itself, and what it says of its result."""
 
 import dataclasses
-import inspect
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_fits import CAMERA, OPTIONS, SETTINGS, TRUTH, fit_options, off_in_shape, pictures, rms, scenes
+from small_fits import CAMERA, SETTINGS, TRUTH, expanded, given, off_in_shape, pictures, scenes
 
 import jaxhf
-from jaxhf.fitting import defaults as _defaults, residuals as _residuals, uncertainty as _uncertainty
-from jaxhf.fitting.defaults import choose_edge_samples, choose_samples
-from jaxhf.fitting.diagnosis import Findings, Places, warnings, where_residuals_are, worst_regions
-from jaxhf.fitting.findings import Left, dependent_channels, neighbour_correlation, shows_mean, unlike_noise, what_may_help
 from jaxhf.fitting.history import Draws
-from jaxhf.fitting.jacobian import in_rows
-from jaxhf.fitting.known import Known, pictures_and_influence
-from jaxhf.fitting.linearise import linearise_each
-from jaxhf.fitting.noise import spreads_of
-from jaxhf.fitting.normal_matrix import NormalMatrix
-from jaxhf.fitting.normals import deviations_above_zero, evidence_for_angles, share_of_normals
-from jaxhf.fitting.problem import make_problem
-from jaxhf.fitting.residuals import linearised, picture_residuals
-from jaxhf.fitting.uncertainty import with_unexplained
+from jaxhf.fitting.model import defaults as _defaults
+from jaxhf.fitting.model.defaults import choose_edge_samples, choose_samples
+from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
+from jaxhf.fitting.model.problem import make_problem
+from jaxhf.fitting.solve.noise import spreads
+from jaxhf.fitting.trust.deviations import standard_deviations, with_unexplained
+from jaxhf.fitting.trust.facts import (
+    Left,
+    _share_of_normals,
+    dependent_channels,
+    neighbour_correlation,
+    shows_mean,
+    unlike_noise,
+    what_may_help,
+)
+from jaxhf.fitting.trust.words import Findings, Places, warnings, where_residuals_are, worst_regions
 from jaxhf.preparation.localise import localise
+
+STEPS = np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0)
 
 
 def test_noise_that_is_not_given_is_estimated():
@@ -45,77 +48,20 @@ def test_noise_that_is_not_given_is_estimated():
 def test_the_noise_of_rounded_pictures_is_their_root_mean_square():
     """Rounding leaves errors that are evenly spread: their median would be a quarter too large for a deviation."""
     step = 0.05
-    problem, _ = make_problem(scenes(), [step * np.round(picture / step) for picture in pictures()], fit_options())
-    exact = [
-        jnp.stack([jnp.asarray(pictures()[k]).reshape(group.targets.shape[1:]) for k in group.indices])
-        for group in problem.groups
-    ]
-    np.testing.assert_allclose(spreads_of(exact, problem), step / np.sqrt(12), rtol=0.1)
+    here = expanded(scenes(TRUTH), [step * np.round(picture / step) for picture in pictures()], settings=SETTINGS)
+    np.testing.assert_allclose(spreads(here), step / np.sqrt(12), rtol=0.1)
 
 
 def test_normals_of_another_renderer_are_named_where_they_matter():
     """By how much they turn: hardly any on the smooth terrain, by 20 degrees on steps of a cell's width."""
-    steps = np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0)
     found = [
-        share_of_normals(
-            make_problem(scenes(), pictures(), fit_options(settings=settings, noise=0.02))[0], jnp.asarray(heights)
+        _share_of_normals(expanded(scenes(heights), pictures(), settings=settings, noise=0.02))
+        for settings, heights in (
+            (SETTINGS, TRUTH), (SETTINGS, STEPS), (dataclasses.replace(SETTINGS, normals="six-angle"), STEPS)
         )
-        for settings, heights in ((SETTINGS, TRUTH), (SETTINGS, steps), (jaxhf.Settings(normals="six-angle"), steps))
-    ]
+    ]  # fmt: skip
     assert found[0] < 0.5 < 2 < found[1]
     assert found[2] == 0
-
-
-def rough_pictures(normals: str) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Terrain with slopes between neighbours, and its pictures with normals weighted so, of 0.2 % noise."""
-    rng = np.random.default_rng(2)
-    rough = TRUTH + 0.02 * rng.standard_normal(TRUTH.shape)
-    settings = dataclasses.replace(SETTINGS, normals=normals)
-    measured = [np.asarray(jaxhf.render(scene, settings))[..., 0] for scene in scenes(rough)]
-    return rough, [picture + 0.002 * rng.standard_normal(picture.shape) for picture in measured]
-
-
-@pytest.mark.deep
-def test_a_fit_takes_the_normals_that_explain_rough_terrain(tmp_path, monkeypatch):
-    """Where they are left open, by one program for both, also when it is resumed; those that are given stay."""
-    rough, measured = rough_pictures("six-angle")
-    known = {"noise": 0.002, "levels": [1.0], "prior": TRUTH, "prior_std": 0.02}
-    traced = []
-    monkeypatch.setattr(_residuals, "linearise_each", lambda *args: (traced.append(0), linearise_each(*args))[1])
-    chosen = jaxhf.fit(scenes(TRUTH), measured, settings=SETTINGS, checkpoint=tmp_path / "fit.npz", **known)
-    assert len(traced) <= 1  # or a test before has compiled it
-    assert chosen.settings.normals == "six-angle"
-    resumed = jaxhf.fit(scenes(TRUTH), measured, settings=SETTINGS, checkpoint=tmp_path / "fit.npz", resume=True, **known)
-    assert resumed.settings == chosen.settings
-    np.testing.assert_array_equal(resumed.heights, chosen.heights)
-    assert any("Settings(normals='six-angle') says" in warning for warning in chosen.warnings)
-    given = jaxhf.fit(scenes(TRUTH), measured, settings=dataclasses.replace(SETTINGS, normals="six"), **known)
-    assert given.settings.normals == "six"
-    assert rms(chosen.heights - rough) < 0.5 * rms(given.heights - rough)
-
-
-@pytest.mark.deep
-def test_evidence_for_other_normals_is_in_the_pictures():
-    """Many deviations where they are by angle, none where they are by area."""
-    found = {}
-    for scheme in ("six", "six-angle"):
-        rough, measured = rough_pictures(scheme)
-        problem, unknowns = make_problem(scenes(rough), measured, fit_options(noise=0.002, start=rough))
-        known = linearised(unknowns, problem)
-        left = in_rows(eqx.filter_jit(picture_residuals)(unknowns, known))
-        found[scheme] = evidence_for_angles(known, jnp.asarray(rough), left)
-    assert found["six"] < 3 < found["six-angle"]
-
-
-def test_what_is_alike_nearby_is_one_piece_of_evidence():
-    """Where the noise is one number a block, deviations are those of as few numbers."""
-    problem, _ = make_problem(scenes(), pictures(), fit_options())
-    rng, found = np.random.default_rng(5), []
-    for _ in range(200):
-        shapes = [group.targets.shape for group in problem.groups]
-        alike = [np.repeat(np.repeat(rng.standard_normal((n, h // 8, w // 8, c)), 8, 1), 8, 2) for n, h, w, c in shapes]
-        found.append(deviations_above_zero(in_rows(alike), problem))
-    np.testing.assert_allclose(np.std(found), 1, rtol=0.15)
 
 
 def test_a_grey_picture_with_three_channels_is_one_measurement():
@@ -123,7 +69,7 @@ def test_a_grey_picture_with_three_channels_is_one_measurement():
     colour = np.stack([grey[0], 0.5 * grey[0], grey[0]], axis=-1)
     holed = np.where(np.arange(24)[:, None, None] > 2, np.stack(3 * [grey[2]], axis=-1), [0.1, 0.2, np.nan])
     weights = [None, None, np.repeat((np.arange(24) > 2)[:, None], 24, axis=1)]
-    problem, _ = make_problem(scenes(), [colour, np.stack(3 * [grey[1]], axis=-1), holed], fit_options(weights=weights))
+    problem, _ = make_problem(scenes(), [colour, np.stack(3 * [grey[1]], axis=-1), holed], given(weights=weights))
     channels = {k: group.targets.shape[-1] for group in problem.groups for k in group.indices}
     assert channels == {0: 3, 1: 1, 2: 1}
 
@@ -157,8 +103,8 @@ def test_edges_take_part_where_the_measured_pictures_show_shadows():
     dark = [picture.copy() for picture in pictures()]
     dark[1][:3, :3] = 0.0
     lit, shown, sky = (
-        make_problem(given, measured, fit_options())[0].settings.edge_samples
-        for given, measured in (
+        make_problem(views, measured, given())[0].settings.edge_samples
+        for views, measured in (
             (scenes(), pictures()), (scenes(), dark),
             ([scene.with_lights([*scene.lights, jaxhf.Sky(0.1)]) for scene in scenes()], dark),
         )
@@ -167,64 +113,67 @@ def test_edges_take_part_where_the_measured_pictures_show_shadows():
 
 
 def test_the_users_choice_is_kept():
-    problem, _ = make_problem(scenes(), pictures(), fit_options(settings=jaxhf.Settings(samples=9, edge_samples=77)))
+    problem, _ = make_problem(scenes(), pictures(), given(settings=jaxhf.Settings(samples=9, edge_samples=77)))
     assert (problem.settings.samples, problem.settings.edge_samples) == (9, 77)
-    assert inspect.signature(jaxhf.fit).parameters["loss"].default == "geman"
 
 
 def test_what_is_left_unexplained_counts_as_noise():
-    """With squares the factor is Birge's ratio: residuals of three times the noise make deviations three times as large."""
+    """Residuals of three times the noise make deviations three times as large, or a little less where some are let go."""
     rng = np.random.default_rng(0)
     measured = [picture + 0.03 * rng.standard_normal(picture.shape) for picture in pictures()]
-    problem, unknowns = make_problem(scenes(TRUTH), measured, fit_options(**OPTIONS))
-    residuals = np.ravel(eqx.filter_jit(picture_residuals)(unknowns, problem)[0])
-    scaled, factor = with_unexplained(problem, residuals)
+    here = expanded(scenes(TRUTH), measured, settings=SETTINGS, noise=0.01)
+    here = here.of(dataclasses.replace(here.problem, loss_scale=jnp.asarray(1e3)))  # squares: it is Birge's ratio
+    residuals = in_row(here.left())
+    scaled, factor = with_unexplained(here, residuals)
     assert factor == pytest.approx(3 / np.sqrt(1 - 144 / (3 * 24 * 24)), rel=0.05)
-    np.testing.assert_allclose(scaled.groups[0].weights, problem.groups[0].weights / factor, rtol=1e-6)
-    assert with_unexplained(problem.with_noise(10 * problem.noise), residuals / 10)[1] == 1
+    new, old = (each.problem.groups[0].weights for each in (scaled, here))
+    np.testing.assert_allclose(new, old / factor, rtol=1e-6)
+    assert float(scaled.problem.loss_scale) == pytest.approx(1e3 / factor)
+    assert with_unexplained(here, residuals / 10)[1] == 1
 
 
-def test_samples_can_be_stopped_with_what_is_there(monkeypatch):
+def test_draws_can_be_stopped_with_what_is_there(monkeypatch):
     """After two; before, nothing is known."""
-    problem, unknowns = make_problem(scenes(TRUTH), pictures(), fit_options(**OPTIONS))
+    here = expanded(scenes(TRUTH), pictures(), settings=SETTINGS, noise=0.01)
     reports: list[Draws] = []
+    solved = NormalMatrix.solved
 
-    def draw(*_):
+    def interrupted(*arguments):
         if len(reports) == stop:
             raise KeyboardInterrupt
-        return np.full((12, 12), 2.0), np.zeros(0)
+        return solved(*arguments)
 
-    monkeypatch.setattr(NormalMatrix, "draw", draw)
+    monkeypatch.setattr(NormalMatrix, "solved", interrupted)
     stop = 3
-    std, drawn, *_ = _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
-    assert drawn == 3
-    np.testing.assert_array_equal(std, 2.0)
+    found = standard_deviations(here, 20, reports.append)
+    assert found.samples.shape == (3, 12, 12)
+    np.testing.assert_allclose(found.std, np.sqrt(np.mean(found.samples**2, axis=0)))
+    mean, shape = found.parts
+    np.testing.assert_allclose(mean**2 + shape**2, np.mean(found.std**2))
     assert [(report.drawn, report.wanted) for report in reports] == [(1, 20), (2, 20), (3, 20)]
     stop = 1
     reports.clear()
     with pytest.raises(KeyboardInterrupt):
-        _uncertainty.standard_deviations(unknowns, problem, 20, 60, reports.append)
+        standard_deviations(here, 20, reports.append)
 
 
 def test_a_noise_that_is_given_too_small_is_told_from_what_the_scene_lacks():
-    problem, _ = make_problem(scenes(), pictures(), fit_options(noise=0.01))
+    here = expanded(scenes(TRUTH), pictures(), settings=SETTINGS, noise=0.01)
     noise = np.random.default_rng(0).standard_normal((24, 24, 1))
-    given = fit_options(noise=0.01)
-    assert "leave noise out" in what_may_help(problem, jnp.asarray(TRUTH), [left(10 * noise)] * 3, given)
+    known = given(noise=0.01)
+    assert "leave noise out" in what_may_help(here, [left(10 * noise)] * 3, known)
     noise[:5] = 30.0
-    assert "leave noise out" not in what_may_help(problem, jnp.asarray(TRUTH), [left(noise)] * 3, given)
-    assert "leave noise out" not in what_may_help(problem, jnp.asarray(TRUTH), [left(10 * noise)] * 3, fit_options())
+    assert "leave noise out" not in what_may_help(here, [left(noise)] * 3, known)
+    assert "leave noise out" not in what_may_help(here, [left(10 * noise)] * 3, given())
 
 
-def test_normals_that_the_fit_has_tried_are_not_advised():
-    """Where they are left open it has asked its pictures, and found those by area to be better."""
-    steps = jnp.asarray(np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0))
-    for normals, advised in ((None, False), ("six", True)):
-        options = fit_options(
-            settings=dataclasses.replace(SETTINGS, shadows=True, edge_samples=64, normals=normals), noise=0.02
-        )
-        problem, _ = make_problem(scenes(), pictures(), options)
-        assert ("six-angle" in what_may_help(problem, steps, [left(np.zeros((24, 24, 1)))], options)) == advised
+def test_other_normals_are_advised_where_they_matter():
+    settings = dataclasses.replace(SETTINGS, shadows=True, edge_samples=None)
+    for heights, advised in ((STEPS, True), (TRUTH, False)):
+        here = expanded(scenes(heights), pictures(), settings=SETTINGS, noise=0.02)
+        here = here.of(dataclasses.replace(here.problem, settings=settings))
+        said = what_may_help(here, [left(np.zeros((24, 24, 1)))], given(settings=settings, noise=0.02))
+        assert ("six-angle" in said) == advised
 
 
 def test_the_worst_regions_are_named():
@@ -265,28 +214,29 @@ def test_what_is_left_of_pictures_is_noise_or_is_not():
     assert abs(correlation) < 0.1
     np.testing.assert_allclose(spread, 1, rtol=0.1)
     for multiple in (0.1, 1, 10):
-        assert unlike_noise([left(multiple * noise)], fit_options()) is None
-    said = unlike_noise([left(noise), left(smooth)], fit_options(prior=0.0, prior_std=1.0))
+        assert unlike_noise([left(multiple * noise)], given()) is None
+    said = unlike_noise([left(noise), left(smooth)], given(prior=jaxhf.Prior(0.0, 1.0)))
     assert said is not None
     assert said.startswith("what is left of picture 1 is no noise: neighbouring pixels are off alike (correlation 0.")
-    assert "prior_std may be too small" in said
-    assert unlike_noise([left(smooth)._replace(noise=1e-3)], fit_options()) is None  # as rounding is
-    assert unlike_noise([left(smooth, informing=np.zeros((24, 24, 1), bool))], fit_options()) is None
+    assert "the prior's std may be too small" in said
+    assert unlike_noise([left(smooth)._replace(noise=1e-3)], given()) is None  # as rounding is
+    assert unlike_noise([left(smooth, informing=np.zeros((24, 24, 1), bool))], given()) is None
 
 
 def test_a_picture_of_another_brightness_is_said_to_be_one():
     """Such as one of values up to 255, or of an albedo that is off: its noise is estimated to be as large, and chi2 is 1."""
     image = np.linspace(0.2, 0.5, 576).reshape(24, 24, 1)
 
-    def said(target: np.ndarray, **options) -> str:
-        return str(unlike_noise([left((image - target) / 0.05, image=image, target=target)], fit_options(**options)))
+    def said(target: np.ndarray, **unknown) -> str:
+        known = given(unknown=jaxhf.Unknown(**unknown))
+        return str(unlike_noise([left((image - target) / 0.05, image=image, target=target)], known))
 
-    assert "it is 1.5 times as bright as the scene: exposures=True" in said(1.5 * image)
+    assert "it is 1.5 times as bright as the scene: Unknown(exposures=True)" in said(1.5 * image)
     assert "exposures=True" not in said(1.5 * image, exposures=True)
-    assert "it is brighter than the scene by 0.1: offsets=True" in said(image + 0.1)
+    assert "it is brighter than the scene by 0.1: Unknown(offsets=True)" in said(image + 0.1)
     assert "offsets=True" not in said(image + 0.1, offsets=True)
-    assert "light_std, camera_std" in said(1.05 * image)
-    assert "light_std, camera_std" in said(image[::-1])
+    assert "light_std=, camera_std=" in said(1.05 * image)
+    assert "light_std=, camera_std=" in said(image[::-1])
 
 
 def test_channels_that_are_off_alike_are_said_to_be_one_measurement():
@@ -301,7 +251,7 @@ def test_channels_that_are_off_alike_are_said_to_be_one_measurement():
 GOOD = Findings(
     result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, channels=None,
     help="try this", strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, lights=3, scaled=1.0,
-    displaced=(0.5, 1.01), draws=(20, 20), unsure_noise=None, length=None, normals=None,
+    displaced=(0.5, 1.01), draws=(20, 20), parts=(0.1, 0.2), unsure_noise=None, length=None,
 )  # fmt: skip
 
 
@@ -315,7 +265,7 @@ GOOD = Findings(
         ({"channels": "they are off alike"}, "they are off alike"),
         ({"chi2": 0.25}, "the noise that was given is 2 times what is left"),
         ({"result": jaxhf.Stop.MAX_STEPS}, "stopped by max_steps"),
-        ({"strayed": 2.5}, "2.5 times prior_std"),
+        ({"strayed": 2.5}, "2.5 times its std"),
         ({"seen": np.arange(20).reshape(4, 5) > 4}, "no picture shows 5 of 20 heights (25%): they are what the prior makes"),
         ({"seen": np.arange(20).reshape(4, 5) > 4, "strayed": None}, "they are a smooth continuation of their neighbours"),
         ({"seen": np.zeros((4, 5), bool), "strayed": None}, "they are the start"),
@@ -326,9 +276,9 @@ GOOD = Findings(
         ({"displaced": (0.5, 1.2)}, "were off by 0.5, and are 1.2 times as large for it"),
         ({"draws": (20, 7)}, "interrupted after 7 of 20"),
         ({"unsure_noise": "heights explain 95%"}, "heights explain 95%: noise= tells the fit"),
-        ({"length": "prior_length is too short"}, "prior_length is too short"),
+        ({"length": "its length is too short"}, "its length is too short"),
         ({"strayed": 2.5}, "does not reflect as Matte does"),
-        ({"normals": "six-angle"}, "weighted as Settings(normals='six-angle') says"),
+        ({"parts": (2.0, 0.3)}, "their mean ± 2, their shape ± 0.3"),
     ],
 )
 def test_warnings_say_what_speaks_against_the_heights(change, said):
@@ -340,11 +290,9 @@ def test_an_orthophoto_does_not_show_the_mean_height():
     """In either precision, at any noise; a picture by a camera at a finite distance does."""
     above = jaxhf.Orthographic.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), up=(0, 1, 0), extent=0.9, width=24, height=24)
     for camera, shown in ((above, False), (CAMERA, True)):
-        problem, unknowns = make_problem(scenes(TRUTH, camera=camera), pictures(), fit_options(**OPTIONS))
-        known = linearised(unknowns, problem)
-        _, influence = pictures_and_influence(unknowns, known, 0, Known([], known.linearised))
-        assert shows_mean(influence) == shown
-        assert shows_mean(influence.astype(np.float32)) == shown
+        gradients = expanded(scenes(TRUTH, camera=camera), pictures(), settings=SETTINGS, noise=0.01).random_gradients()[0]
+        assert shows_mean(gradients) == shown
+        assert shows_mean(1e3 * gradients) == shown
 
 
 def test_what_has_a_cause_needs_no_other_warning():

@@ -1,5 +1,6 @@
 """What a fit is made of, piece by piece: priors, losses, modes and stages; and what is refused before anything is traced."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -10,56 +11,62 @@ import numpy as np
 import pytest
 import scipy.fft
 import scipy.special
-from small_fits import SETTINGS, SIZE, TRUTH, fit_options, pictures, scenes
+from small_fits import SETTINGS, SIZE, TRUTH, given as given_with, pictures, scenes
 
 import jaxhf
 from jaxhf.core.errors import ArgumentError
-from jaxhf.fitting import fit as _fit, loop as _loop
-from jaxhf.fitting.basis import Unknowns, balanced_units, make_basis, resample
-from jaxhf.fitting.loop import FitLoop
-from jaxhf.fitting.options import make_stages
-from jaxhf.fitting.prior import Prior, make_prior
-from jaxhf.fitting.problem import Problem, make_problem
-from jaxhf.fitting.residuals import _with_albedo, prior_residuals
-from jaxhf.fitting.robust import influence_function, soften
+from jaxhf.fitting import fit as _fit
+from jaxhf.fitting.coarser import coarser, factors
+from jaxhf.fitting.model.expansion import _with_albedo, prior_residuals
+from jaxhf.fitting.model.problem import Problem, make_problem
+from jaxhf.fitting.model.robust import influence_function, soften
+from jaxhf.fitting.model.surface import make_basis, resample, slope_units
+from jaxhf.fitting.model.terms import make_terms
+from jaxhf.fitting.model.units import _balanced_units
+from jaxhf.fitting.model.view import View
+from jaxhf.fitting.solve.stages import stages
 from jaxhf.preparation.localise import localise
-from jaxhf.xla.devices import local_mesh
 
 
-def without_pictures(field: jaxhf.Heightfield, **values: Any) -> Problem:
-    """The problem of a fit to no pictures."""
-    none = np.zeros(0)
-    base = np.zeros(field.heights.shape) if "prior" not in values else np.asarray(values["prior"].heights)
-    known: dict[str, Any] = {
-        "groups": (), "basis": make_basis(field, base), "prior": None, "smoothness": None, "albedo_smoothness": None,
-        "loss_scale": None, "noise": none, "brightness": none, "loss": "squares", "settings": SETTINGS, "mesh": local_mesh(),
-    }  # fmt: skip
-    return Problem(**{**known, **values})
+def basis_of(field: jaxhf.Heightfield, base: np.ndarray, cutoff: float = 1.0):
+    return make_basis(field, base, slope_units(base.shape, field.dx, field.dy)[0], cutoff)
 
 
 def test_what_is_known_beforehand_counts_in_standard_deviations():
-    """The prior at each height, and smoothness as the sum of differences to the neighbours: none on a slope but at its ends."""
-    x = np.arange(6.0)[None, :] + np.zeros((5, 1))
-    prior = Prior(jnp.asarray(x - 1), jnp.asarray(np.full((5, 6), 1 / 4)))
-    field = jaxhf.Heightfield(x)
-    smooth = {"smoothness": jnp.asarray(1 / 2), "albedo_smoothness": jnp.asarray(1 / 8)}
-    problem = without_pictures(field, prior=prior, basis=make_basis(field, x), **smooth)
-    factors = jnp.asarray(np.stack([x * x, x], axis=-1))
-    off, rough, rough_paint, _ = prior_residuals(Unknowns(jnp.zeros((5, 6)), factors), problem)
-    np.testing.assert_allclose(off, 1 / 4)
-    np.testing.assert_allclose(rough, [[1 / 2, 0, 0, 0, 0, -1 / 2]] * 5)
-    np.testing.assert_allclose(rough_paint[:, 1:-1], 2 / 8)
+    """The prior at each height in modes of length 1, factors about 1, offsets about 0, and angles in degrees."""
+    unknown = jaxhf.Unknown(albedo="constant", albedo_std=0.5, exposures=True, offsets=True, light_std=2.0)
+    problem, unknowns = make_problem(scenes(TRUTH), pictures(), given_with(prior=jaxhf.Prior(TRUTH - 1, 4.0), unknown=unknown))
+    light = jnp.full((3, 2), np.float32(np.radians(1.0)))
+    moved = dataclasses.replace(
+        unknowns, albedo=jnp.full((1, 1, 1), 1.5), exposures=jnp.full(3, 1.1), offsets=jnp.full(3, 0.2), view=View(light)
+    )
+    surface, albedo, exposures, offsets, lights = prior_residuals(moved, problem)
+    np.testing.assert_allclose(problem.basis.synthesis(surface), 1 / 4, rtol=1e-5)
+    for residual, expected in ((albedo, 1), (exposures, 0.1), (offsets, 0.2), (lights, 0.5)):
+        np.testing.assert_allclose(residual, expected, rtol=1e-5)
+
+
+def test_without_a_prior_long_waves_may_be_high():
+    """All heights together by a quarter of the longer side, and waves by less, as 1 / (1 + frequency)²."""
+    field, start = jaxhf.Heightfield(np.zeros((9, 13)), dx=0.5, dy=0.5), np.full((9, 13), 2.0)
+    term = make_terms(field, None, jaxhf.Unknown(), start, None, View()).surface
+    wave = np.sqrt(2) * np.cos(np.pi * 3 * (np.arange(13) + 0.5) / 13) * np.ones((9, 1))  # of mean square 1
+    for heights, place in ((start + 6 / 4, (0, 0)), (start + 6 / 4 / (1 + 3) ** 2 * wave, (0, 3))):
+        residuals = np.array(term.of_surface(jnp.zeros((9, 13)), basis_of(field, heights)))
+        assert residuals[place] == pytest.approx(1, rel=1e-5)
+        residuals[place] = 0
+        np.testing.assert_allclose(residuals, 0, atol=1e-3)  # rounding, in units of a hundredth for the shortest
 
 
 def test_errors_of_a_prior_are_correlated_as_whittle_said():
     """Its covariance as a matrix: prior_std at every vertex, and between two of them by the distance in world units."""
     ny, nx, std = 25, 31, np.linspace(1, 3, 25 * 31).reshape(25, 31)
     field = jaxhf.Heightfield(np.zeros((ny, nx)), dx=0.5, dy=1.0)
-    prior = make_prior(field, 0.0, std, 3.0, 2.0)
-    assert prior is not None
-    still, problem = jnp.zeros(prior.heights.shape), without_pictures(field, prior=prior)
-    rows = jax.jacfwd(lambda modes: prior_residuals(Unknowns(modes), problem)[0])(still).reshape(still.size, -1)
-    heights = jax.jacfwd(problem.basis.heights)(still).reshape(ny * nx, -1)
+    term = make_terms(field, jaxhf.Prior(0.0, std, 3.0), jaxhf.Unknown(), np.zeros((ny, nx)), None, View()).surface
+    basis = basis_of(field, np.asarray(term.mean, np.float64))
+    still = jnp.zeros(term.mean.shape)
+    rows = jax.jacfwd(lambda modes: term.of_surface(modes, basis))(still).reshape(still.size, -1)
+    heights = jax.jacfwd(basis.heights)(still).reshape(ny * nx, -1)
     root = np.asarray(heights, np.float64) @ np.linalg.inv(np.asarray(rows, np.float64))
     covariance = root @ root.T
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std.ravel(), rtol=1e-4)
@@ -88,7 +95,7 @@ def test_pictures_share_what_is_the_same(factors):
     """And no more: each picture's scene comes out as it was given; the sought heights take no room."""
     texels = np.random.default_rng(0).uniform(0.2, 0.9, (4, 5, 3))
     given = [scenes(albedo=jaxhf.ImageTexture(factor * texels))[k] for k, factor in enumerate(factors)]
-    problem, _ = make_problem(given, [np.zeros((SIZE, SIZE))] * 3, fit_options(start=0.0))
+    problem, _ = make_problem(given, [np.zeros((SIZE, SIZE))] * 3, given_with(start=0.0))
     (group,) = problem.groups
     alike = len(set(factors)) == 1
     stacked, shared = ([leaf.shape for leaf in jax.tree.leaves(part)] for part in (group.scenes, group.shared))
@@ -107,63 +114,54 @@ def test_masked_pixels_do_not_count_as_brightness(monkeypatch):
     given, weight = pictures(), np.ones((SIZE, SIZE))
     weight[:9, :9] = 0
     problems = []
-    monkeypatch.setattr(_fit, "FitLoop", lambda problem, *_: problems.append(problem))
+
+    def not_run(all_levels, *_):
+        problems.append(all_levels[-1])
+        raise StopIteration
+
+    monkeypatch.setattr(_fit, "run", not_run)
     for value in (np.nan, 1e6, np.inf):
         measured = [np.where(weight > 0, picture, value) for picture in given]
-        with pytest.raises(AttributeError):  # there is no loop to run
+        with pytest.raises(StopIteration):
             jaxhf.fit(scenes(), measured, weights=[weight] * 3)
     np.testing.assert_allclose([problem.noise for problem in problems[1:]], [problems[0].noise] * 2)
     assert problems[0].noise.max() < 0.01
 
 
-# ρ, ρ' and ρ'' of a residual over the scale, x, for the scale 1.
-LOSSES = {
-    "squares": (lambda x: x**2 / 2, lambda x: x, lambda x: 1 + 0 * x),
-    "huber": (
-        lambda x: np.where(abs(x) < 1, x**2 / 2, abs(x) - 1 / 2),
-        lambda x: np.clip(x, -1, 1),
-        lambda x: np.where(abs(x) < 1, 1.0, 0.0),
-    ),
-    "cauchy": (lambda x: np.log1p(x**2) / 2, lambda x: x / (1 + x**2), lambda x: (1 - x**2) / (1 + x**2) ** 2),
-    "geman": (lambda x: x**2 / (1 + x**2) / 2, lambda x: x / (1 + x**2) ** 2, lambda x: (1 - 3 * x**2) / (1 + x**2) ** 3),
-}
-
-
-@pytest.mark.parametrize("loss", LOSSES)
-def test_robust_losses_are_those_of_the_literature(loss):
+def test_the_robust_loss_is_geman_and_mcclures():
     """As the half square of what a solver squares, and its derivatives by `influence_function`."""
     k, r = 2.0, np.array([-30.0, -2.5, -1.3, 1e-5, 0.7, 2.001, 9.0], np.float32)
-    rho, slope, curvature = (f(r.astype(np.float64) / k) for f in LOSSES[loss])
-    softened = soften(jnp.asarray(r), loss, jnp.asarray(k))
+    x = r.astype(np.float64) / k
+    rho, slope, curvature = x**2 / (1 + x**2) / 2, x / (1 + x**2) ** 2, (1 - 3 * x**2) / (1 + x**2) ** 3
+    softened = soften(jnp.asarray(r), jnp.asarray(k))
     np.testing.assert_allclose(np.square(softened, dtype=np.float64) / 2, k**2 * rho, rtol=1e-5)
     np.testing.assert_array_equal(np.sign(softened), np.sign(r))
-    psi, psi_slope, weight = influence_function(r, loss, jnp.asarray(k))
+    psi, psi_slope, weight = influence_function(r, jnp.asarray(k))
     np.testing.assert_allclose(psi, k * slope, rtol=1e-5)
     np.testing.assert_allclose(psi_slope, curvature, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(weight * r, psi, rtol=1e-5)
-    derived = jax.vmap(jax.grad(lambda r: soften(r, loss, jnp.asarray(k)) ** 2 / 2))(jnp.asarray(r))
+    derived = jax.vmap(jax.grad(lambda r: soften(r, jnp.asarray(k)) ** 2 / 2))(jnp.asarray(r))
     np.testing.assert_allclose(derived, psi, rtol=1e-5)
 
 
 def test_the_basis_is_the_cosine_transform():
     field = jaxhf.Heightfield(np.zeros((5, 8)), dx=2.0, dy=1.0)
-    basis = make_basis(field, np.ones((5, 8)))
+    basis = basis_of(field, np.ones((5, 8)))
     coefficients = np.random.default_rng(0).standard_normal((5, 8))
     expected = 1 + np.asarray(scipy.fft.idctn(np.asarray(basis.scale) * coefficients, norm="ortho"))
     np.testing.assert_allclose(basis.heights(jnp.asarray(coefficients)), expected, rtol=1e-5, atol=1e-5)
-    half = make_basis(field, np.ones((5, 8)), 0.5)
+    half = basis_of(field, np.ones((5, 8)), 0.5)
     assert np.count_nonzero(half.scale) == 3 * 4 - 1  # not the constant one, before all others are there
 
 
 def test_balanced_units_give_all_modes_one_curvature():
-    """But those along which the loss is flat; and the mean alone, where a solver's steps are in units of one slope."""
+    """But those along which the loss is flat."""
     curvature = np.array([[1e-4, 4.0], [9.0, 0.0]])
     slopes = np.array([[2.0, 1.0], [1.0, 1.0]])
-    units, typical = balanced_units(slopes, curvature)
+    units, typical = _balanced_units(slopes, curvature)
     assert typical == 4  # of 4e-4, 4 and 9
     np.testing.assert_allclose((units**2 * curvature).ravel()[:3], typical)
     assert units[1, 1] == 1
-    np.testing.assert_allclose(balanced_units(slopes, curvature, mean_only=True)[0], [[200.0, 1], [1, 1]])
 
 
 def test_resampling_keeps_a_plane():
@@ -172,35 +170,66 @@ def test_resampling_keeps_a_plane():
     np.testing.assert_allclose(resample(2 * x - y, (9, 5)), 2 * fine_x - fine_y, atol=1e-12)
 
 
-@pytest.mark.parametrize(("spread", "scale", "goes_on"), [(2.0, 6.0, True), (1.05, 3.0, False), (0.5, 3.0, False)])
-def test_a_robust_loss_at_its_final_scale_needs_no_other_stage(monkeypatch, spread, scale, goes_on):
-    monkeypatch.setattr(_loop, "pictures_and_influence", lambda *_: ([], np.zeros((5, 6))))
-    monkeypatch.setattr(_loop, "spreads_of", lambda pictures, problem: np.array([spread]))
-    monkeypatch.setattr(FitLoop, "known", lambda loop, unknowns: loop.problem)
-    field, one = jaxhf.Heightfield(np.zeros((5, 6))), np.ones(1)
-    problem = without_pictures(field, loss_scale=jnp.asarray(3.0), noise=one, brightness=one, loss="geman")
-    options = fit_options(noise=1.0, levels=[0.5, 1.0], settings=SETTINGS)
-    loop = FitLoop(problem, Unknowns(jnp.zeros((5, 6))), field, options)
-    loop.initial_state = None
-    loop._next_stage()
-    assert loop.stage == 0
-    assert loop._next_stage()  # there are still modes to come
-    assert loop.stage == 1
-    assert loop.problem.loss_scale == scale
-    monkeypatch.setattr(_loop, "spreads_of", lambda pictures, problem: np.array([1.0]))
-    assert loop._next_stage() == goes_on
-    assert loop.problem.loss_scale == 3
+def problems_of(*shapes: tuple[int, int]) -> list[Problem]:
+    return [make_problem(scenes(np.zeros(shape)), BLACK, given_with(settings=SETTINGS))[0] for shape in shapes]
 
 
-def test_levels_double_from_eight_modes():
-    assert make_stages((64, 40), fit_options(loss="squares", noise=1.0)) == [0.125, 0.25, 0.5, 1.0]
-    assert make_stages((12, 12), fit_options(loss="huber")) == [1.0, 1.0, 1.0, 1.0]
-    assert make_stages((64, 64), fit_options(solver="adam", loss="squares", noise=1.0)) == [1.0]
-    assert make_stages((12, 12), fit_options(loss="squares")) == [1.0, 1.0, 1.0, 1.0]  # the noise has to settle
+def test_stages_double_from_eight_modes():
+    """Through the heights of each level, and all modes of the finest once more."""
+    assert stages(problems_of((64, 40))) == [(0, 0.125), (0, 0.25), (0, 0.5), (0, 1.0), *[(0, 1.0)] * 3]
+    assert stages(problems_of((12, 12))) == [(0, 1.0)] * 4
+    assert stages(problems_of((16, 16), (64, 64))) == [(0, 0.5), (0, 1.0), (1, 0.5), (1, 1.0), *[(1, 1.0)] * 3]
+
+
+def test_coarser_pictures_are_means_of_the_pixels_that_count():
+    """Of 24 x 26 pixels, the longer side of which a coarse pixel overlaps; cameras see the same through as many fewer."""
+    rng = np.random.default_rng(0)
+    camera = jaxhf.Perspective.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), up=(0, 1, 0), fov=18.6, width=26, height=24)
+    picture, weight = rng.uniform(size=(24, 26)), np.ones((24, 26))
+    weight[:4, 1:5] = 0.0
+    weight[0, 1] = 2.0
+    known = given_with(weights=[weight], prior=jaxhf.Prior(TRUTH, 0.1, 0.4))
+    (scene,), (target,), arguments = coarser([scenes(TRUTH)[0].with_camera(camera)], [picture], known, 4)
+    assert (scene.camera.height, scene.camera.width) == target.shape == (6, 7)
+    np.testing.assert_allclose(target[2, 3], picture[8:12, 11:15].mean())
+    counted = picture[:4, 0].sum(), picture[:4, 1] * weight[:4, 1] ** 2, picture[:4, 2] * 0
+    np.testing.assert_allclose(target[0, 0] * (4 + 4), counted[0] + counted[1].sum())
+    assert arguments.weights is not None
+    np.testing.assert_allclose(arguments.weights[0][2, 3], 4.0)  # sixteen pixels tell as much as one of a fourth of the noise
+    np.testing.assert_allclose(arguments.weights[0] ** 2 @ np.ones(7) @ np.ones(6), np.sum(weight**2))
+    for x, y in ((0.0, 0.0), (3.5, 2.0), (7.0, 6.0)):
+        fine, coarse = camera.ray(jnp.asarray(4 * x - 1), jnp.asarray(4 * y)), scene.camera.ray(jnp.asarray(x), jnp.asarray(y))
+        np.testing.assert_allclose(coarse.d, fine.d, atol=1e-6)
+    field = scene.heightfields[0]
+    assert field.heights.shape == (4, 4)
+    np.testing.assert_allclose(field.dx * 3, 1)
+    assert arguments.prior is not None
+    np.testing.assert_allclose(arguments.prior.heights, field.heights, atol=1e-6)
+    assert arguments.prior.length == 0.4
+
+
+def test_many_samples_ask_for_coarser_levels():
+    def asked(side: int, count: int) -> list[int]:
+        camera = jaxhf.Orthographic.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), up=(0, 1, 0), width=side, height=side)
+        return factors([scenes(np.zeros((count, count)))[0].with_camera(camera)] * 3, 4)
+
+    assert asked(256, 256) == [1]
+    assert asked(512, 512) == [4, 1]
+    assert asked(2048, 2048) == [16, 4, 1]
+    assert asked(2048, 64) == [1]  # heights are few
 
 
 BLACK = [np.zeros((SIZE, SIZE))] * 3
-WITH_PRIOR = {"prior": 0.0, "prior_std": 1.0}
+
+
+def prior(**changes: Any) -> dict[str, Any]:
+    return {"prior": lambda: jaxhf.Prior(**{"heights": 0.0, "std": 1.0, **changes})}
+
+
+def unknown(**values: Any) -> dict[str, Any]:
+    return {"unknown": lambda: jaxhf.Unknown(**values)}
+
+
 REFUSED: dict[str, list[dict[str, Any]]] = {  # the argument that is to be named, and what is wrong
     "targets": [{"targets": BLACK[:1]}, {"targets": None}],
     "targets[0]": [{"targets": ["a.png"] * 3}, {"targets": [None] * 3}],
@@ -209,28 +238,26 @@ REFUSED: dict[str, list[dict[str, Any]]] = {  # the argument that is to be named
     "weights": [{"weights": [None]}, {"weights": 1.0}],
     "weights[0]": [{"weights": [w, None, None]} for w in (np.ones(3), np.zeros((SIZE, SIZE)), "mask.png")],
     "noise": [{"noise": noise} for noise in (0, "low", np.ones((24, 24)))],
-    "prior": [{"prior": 0.0}, {"prior": "map.tif"}, {"prior": jaxhf.jacksboro(), "prior_std": 1.0}],
-    "prior_std": [{"prior_std": 1.0}, *({**WITH_PRIOR, "prior_std": std} for std in (np.ones((5, 5)), -21, np.eye(12)))],
-    "prior_length": [{"prior_length": 1.0}, *({**WITH_PRIOR, "prior_length": length} for length in (0, 8.0, "3"))],
-    "prior_exponent": [{**WITH_PRIOR, "prior_exponent": 3}, {"prior_length": 0.3, "prior_exponent": 99}],
+    "prior": [{"prior": TRUTH}],
+    "heights": [prior(heights="map.tif"), prior(heights=lambda: 3), prior(heights=np.array([[0.0, np.nan], [0.0, 0.0]]))],
+    "std": [prior(std=std) for std in (np.ones((5, 5)), -21, 0, "low", np.inf)],
+    "length": [prior(length=length) for length in (0, 8.0, "3")],
     "start": [{"start": [[0.0, np.inf], [0.0, 0.0]]}],
-    "solver": [{"solver": "sgd"}],
-    "levels": [{"levels": [0.5]}, {"levels": 3}],
-    "resume": [{"resume": True}],
-    "uncertainty": [{"uncertainty": "some"}, {"scenes": lambda: scenes(np.zeros((65, 65))), "uncertainty": "exact"}],
+    "draws": [{"draws": "some"}, {"draws": 1}, {"draws": -3}],
     "max_steps": [{"max_steps": 0}],
-    "smoothness": [{"smoothness": -1}],
-    "albedo_smoothness": [{"albedo_smoothness": 1.0}],
-    "light_std": [{"light_std": 0}, {"light_std": 60}, {"scenes": lambda: lamps(), "light_std": 1}],
-    "camera_std": [{"camera_std": std} for std in (3, (1, 0), (3, 1), (0.1, 60))],
-    "loss_scale": [{"loss": "squares", "loss_scale": 5}, {"loss_scale": None}],
+    "unknown": [{"unknown": "albedo"}],
+    "albedo": [unknown(albedo="known")],
+    "albedo_std": [unknown(albedo_std=2), unknown(albedo="map", albedo_std=0)],
+    "light_std": [unknown(light_std=0), unknown(light_std=60), {"scenes": lambda: lamps(), **unknown(light_std=1)}],
+    "camera_std": [unknown(camera_std=std) for std in (3, (1, 0), (3, 1), (0.1, 60))],
+    "exposures": [unknown(exposures="yes")],
     "scenes": [{"scenes": list}],
     "scenes[0]": [{"scenes": lambda: scenes(np.where(np.eye(12) > 0, np.nan, 0.05))}],
     "scenes[1]": [{"scenes": lambda: [scenes()[0], scenes(np.zeros((5, 5)))[1], scenes()[2]]}],
     "settings": [{"settings": {}}],
-    "exposures": [{"exposures": "yes"}],
     "progress": [{"progress": "yes"}],
-    "checkpoint": [{"checkpoint": 3}],
+    "checkpoint": [{"checkpoint": 3}, {"checkpoint": "fit.checkpoint"}],
+    "path": [{"checkpoint": lambda: jaxhf.Checkpoint(3)}],  # pyright: ignore
     "mesh": [{"mesh": 2}],
 }
 
@@ -249,12 +276,17 @@ def as_users_call_it():
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
+def usual_but(wrong: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of `fit`; those that are refused as they are made are made here."""
+    usual: dict[str, Any] = {"scenes": scenes, "targets": BLACK}
+    return {name: value() if callable(value) else value for name, value in (usual | wrong).items()}
+
+
 @pytest.mark.parametrize("argument", REFUSED)
 def test_bad_input_is_refused_by_name(argument, as_users_call_it):
     for wrong in REFUSED[argument]:
-        options = {"targets": BLACK, **wrong, "scenes": wrong.get("scenes", scenes)()}
         with pytest.raises(ArgumentError) as refused:
-            jaxhf.fit(**options)
+            jaxhf.fit(**usual_but(wrong))
         assert refused.value.argument == argument, refused.value
 
 
@@ -263,11 +295,11 @@ def test_what_is_wrong_is_told_with_its_place_and_value():
     spoilt = [*BLACK[:2], np.where(np.arange(SIZE) == 2, np.nan, BLACK[0])]
     for wrong, message in (
         ({"targets": spoilt}, r"^fit: targets\[2\] must be finite.*row 0 column 2 channel 0 is nan"),
-        ({"camera_std": (3, 1)}, r"^fit: camera_std must .* the terrain's longer side, 1; it is 3, or 33 cells"),
-        ({"prior": "map.tif"}, r"it is a name: jaxhf.load_heights\('map\.tif'\)\.heights"),
+        (unknown(camera_std=(3, 1)), r"^Unknown: camera_std must .* the terrain's longer side, 1; it is 3, or 33 cells"),
+        (prior(heights="map.tif"), r"^Prior: heights must be .*, it is a name: jaxhf.load_heights\('map\.tif'\)\.heights"),
     ):
         with pytest.raises(ValueError, match=message):
-            jaxhf.fit(scenes(), **{"targets": BLACK, **wrong})
+            jaxhf.fit(**usual_but(wrong))
 
 
 @pytest.mark.x64

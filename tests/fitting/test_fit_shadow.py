@@ -37,8 +37,7 @@ def target() -> np.ndarray:
 def hill_from(target: np.ndarray, edge_samples: int, **options) -> jaxhf.Fit:
     settings = jaxhf.Settings(samples=16, edge_samples=edge_samples)
     return jaxhf.fit(
-        [scene(MAP)], [target], settings=settings, noise=NOISE, prior=MAP, prior_std=0.0003 + MAP, prior_length=1.0,
-        levels=[1.0], **options,
+        [scene(MAP)], [target], settings=settings, noise=NOISE, prior=jaxhf.Prior(MAP, 0.0003 + MAP, 1.0), **options,
     )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Why a fit stops, and what it then says of itself: rough terrain, which the derivative describes only nearby."""
 
+import dataclasses
 import math
 from typing import Any
 
@@ -9,10 +10,15 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
+from small_fits import SETTINGS as SMALL, SIZE, given as given_with, scenes
 
 import jaxhf
 from jaxhf.fitting.history import Pace, printed_progress
-from jaxhf.fitting.solvers import LevenbergMarquardt
+from jaxhf.fitting.model.problem import make_problem
+from jaxhf.fitting.model.surface import Unknowns
+from jaxhf.fitting.solve.stages import why_ended
+from jaxhf.fitting.solve.state import first_state
+from jaxhf.fitting.solve.steps import ConjugateGradients, LevenbergMarquardt
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
 # Slopes up to 3, seen from above in one picture of one light; the prior is the terrain smoothed, and says little.
@@ -29,7 +35,7 @@ def scene(heights: np.ndarray) -> jaxhf.Scene:
 
 def fitted(**options: Any) -> jaxhf.Fit:
     target = np.asarray(jaxhf.render(scene(TRUTH), SETTINGS))
-    return jaxhf.fit([scene(PRIOR)], [target], settings=SETTINGS, prior=PRIOR, **options)
+    return jaxhf.fit([scene(PRIOR)], [target], settings=SETTINGS, prior=jaxhf.Prior(PRIOR, 0.2), **options)
 
 
 def test_what_is_to_come_is_told_by_the_last_steps():
@@ -56,7 +62,7 @@ def test_lines_tell_what_is_to_come(capsys):
 @pytest.mark.deep
 def test_rejected_steps_are_damped_until_one_is_short_enough():
     """Where the loss is 1e5 standard deviations squared, a damping of 160 still lets steps through that are too long."""
-    found = fitted(prior_std=0.2, levels=[1.0])
+    found = fitted()
     assert found.result is not jaxhf.Stop.MAX_STEPS
     assert sum(step.accepted for step in found.history[1:]) > 3
     assert found.stats["loss"] < 0.3 * found.history[0].loss
@@ -65,24 +71,59 @@ def test_rejected_steps_are_damped_until_one_is_short_enough():
 
 @pytest.mark.deep
 def test_the_loss_is_that_of_the_last_step_where_max_steps_end_a_level():
-    steps = fitted(prior_std=0.2, max_steps=20).history
+    steps = fitted(max_steps=20).history
     level = max(k for k, step in enumerate(steps) if step.level == 8) + 1
     assert level < len(steps)
-    found = fitted(prior_std=0.2, max_steps=level)
+    found = fitted(max_steps=level)
     assert found.result is jaxhf.Stop.MAX_STEPS
     assert len(found.history) == level
     assert math.isfinite(found.stats["loss"])
     assert found.stats["loss"] == min(step.loss for step in found.history)
 
 
+@pytest.mark.parametrize(
+    ("steps", "predicted", "stop"),
+    [
+        ([7.0], 1.0, None),  # which only evaluates
+        ([7.0, 5.0], 1.0, None),
+        ([7.0, 5.0], 0.1, jaxhf.Stop.CONVERGED),  # a step counts that gains 0.001 for each of 144 heights
+        ([7.0, 6.9], 1.0, jaxhf.Stop.CONVERGED),
+        ([7.0, 5.0, None], 0.2, None),
+        ([7.0, 5.0, None], 0.1, jaxhf.Stop.CONVERGED),
+        ([7.0, 5.0, None, None, None], 0.2, None),
+        ([7.0, 5.0, None, None], 0.1, jaxhf.Stop.STALLED),  # λ grew until no step counts
+        ([math.nan], math.nan, jaxhf.Stop.NON_FINITE),
+        ([7.0 - 0.5 * k for k in range(10)], 1.0, jaxhf.Stop.MAX_STEPS),
+    ],
+    ids=str,
+)
+def test_a_fit_ends_where_no_step_counts_any_more(steps, predicted, stop):
+    """Losses of accepted steps, None for those that were rejected, in the last stage."""
+    problem, unknowns = make_problem(scenes(), [np.zeros((SIZE, SIZE))] * 3, given_with(settings=SMALL))
+    history, loss = [], 0.0
+    for number, given in enumerate(steps, 1):
+        loss = loss if given is None else given
+        history.append(jaxhf.Step(number, 12, loss, given is not None, 1.0, 0.1, 1.0))
+    state = dataclasses.replace(first_state(problem, unknowns), stage=3, predicted=predicted, history=tuple(history))
+    assert why_ended(state, [problem], 10) is stop
+
+
+def test_rejections_in_a_row_damp_ever_faster():
+    """Twice as much as the one before; and the step that is accepted after them leaves λ as it is."""
+    searches = [LevenbergMarquardt(rejections, 0.1, 9, None).search for rejections in range(4)]
+    np.testing.assert_allclose([search.low_constant for search in searches], 0.1 / 2.0 ** np.arange(4))
+    np.testing.assert_allclose([search.high_constant for search in searches], [4, 1, 1, 1])
+
+
 def test_a_step_is_taken_at_any_damping():
     """Also where 1 / λ is below the precision's epsilon, as it is for many pixels with little noise in single precision."""
     matrix, right = 1e9 * np.random.default_rng(0).standard_normal((6, 3)), np.ones(6)
-    value, linear = jax.linearize(lambda x: jnp.asarray(matrix) @ x - right, jnp.zeros(3))
-    descent = LevenbergMarquardt(1e-4, 60, False).descent
-    state = descent.query(
-        None, optx.FunctionInfo.ResidualJac(value, lx.FunctionLinearOperator(linear, jax.eval_shape(lambda: value[:3]))), None
-    )
+    start = Unknowns(jnp.zeros((1, 3)))
+    value, linear = jax.linearize(lambda u: jnp.asarray(matrix, jnp.float32) @ u.coefficients[0] - jnp.ones(6), start)
+    jacobian = lx.FunctionLinearOperator(linear, jax.eval_shape(lambda: start))
+    descent = ConjugateGradients(1e-4, 60, start.without_modes())
+    state = descent.query(start, optx.FunctionInfo.ResidualJac(value, jacobian), None)
     for damping in (1e3, 1e17):
         expected = np.linalg.solve(matrix.T @ matrix + damping * np.eye(3), matrix.T @ right)
-        np.testing.assert_allclose(descent.step(jnp.asarray(1 / damping), state)[0], expected, rtol=0.01)
+        found, _ = descent.step(jnp.asarray(1 / damping), state)
+        np.testing.assert_allclose(found.coefficients[0], expected, rtol=0.01)

@@ -43,9 +43,9 @@ def measured(known: dict[str, np.ndarray]) -> list[np.ndarray]:
     return list((known["images"] + noise * drawn).astype(np.float32))
 
 
-def error(known: dict[str, np.ndarray]) -> float:
-    """What a map's legend says: the root mean square of its errors."""
-    return rms(known["truth"] - known["prior"])
+def prior(known: dict[str, np.ndarray]) -> jaxhf.Prior:
+    """With what a map's legend says: the root mean square of its errors."""
+    return jaxhf.Prior(known["prior"], rms(known["truth"] - known["prior"]))
 
 
 def require_terrain(found: jaxhf.Fit, known: dict[str, np.ndarray], ratio: float) -> None:
@@ -74,7 +74,7 @@ def test_the_plain_call_finds_the_terrain_and_how_sure_it_is(name, ratio):
     Heights are right or wrong together with their neighbours, so the shares vary.
     """
     known = case(name)
-    found = jaxhf.fit(scenes(known), measured(known), prior=known["prior"], prior_std=error(known), uncertainty=20)
+    found = jaxhf.fit(scenes(known), measured(known), prior=prior(known), draws=20)
     require_terrain(found, known, ratio)
     off = np.abs(np.asarray(found.heights) - known["truth"])
     assert found.seen.all()
@@ -93,7 +93,7 @@ def test_exposures_and_offsets_come_back_with_the_terrain():
     pictures = [
         exposure * picture + offset for exposure, picture, offset in zip(exposures, measured(known), offsets, strict=True)
     ]
-    found = jaxhf.fit(scenes(known), pictures, prior=known["prior"], prior_std=error(known), exposures=True, offsets=True)
+    found = jaxhf.fit(scenes(known), pictures, prior=prior(known), unknown=jaxhf.Unknown(exposures=True, offsets=True))
     require_terrain(found, known, 7.0)
     np.testing.assert_allclose(np.asarray(found.exposures), exposures, rtol=0.01)
     np.testing.assert_allclose(np.asarray(found.offsets), offsets, atol=5e-4)
@@ -117,7 +117,7 @@ def test_suns_and_cameras_come_back_with_the_terrain():
         ]
     )
     found = jaxhf.fit(
-        scenes(said), measured(known), prior=known["prior"], prior_std=error(known), light_std=1.5, camera_std=(35.0, 0.1)
+        scenes(said), measured(known), prior=prior(known), unknown=jaxhf.Unknown(light_std=1.5, camera_std=(35.0, 0.1))
     )
     require_terrain(found, known, 3.5)
     for scene, towards, eye in zip(found.scenes, known["towards"], known["eyes"], strict=True):

@@ -12,13 +12,11 @@ from small_fits import rms
 
 import jaxhf
 from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
-from jaxhf.fitting import linearise as _linearise
-from jaxhf.fitting.jacobian import picture_by_vertices, vertex_slopes, vertices_by_heights
-from jaxhf.fitting.linearise import can_be_linearised, linearise_each, picture_each, vertex_values
-from jaxhf.fitting.view import View, moved
+from jaxhf.fitting.model import linearise as _linearise
+from jaxhf.fitting.model.linearise import can_be_linearised, linearise_each, picture_each
+from jaxhf.fitting.model.view import View, moved
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import make_world
-from jaxhf.rendering.samples import PictureSamples
 from jaxhf.trace.grid import Grid
 from jaxhf.xla.devices import local_mesh
 
@@ -130,35 +128,14 @@ def test_matrix_is_the_derivative_of_render(which, lights, view, settings, chann
         assert np.nanmax(np.abs(theirs)) > 1e-3
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=rounding * np.nanmax(np.abs(theirs)))
 
-    still = jax.tree.unflatten(tree, [drawn[0], *(jnp.zeros_like(other) for other in drawn[1:])])
-
     @jax.jit
     def products(linear):
         picture = functools.partial(by_matrix, linear)
-        forward, first = (jax.jvp(picture, (unknowns,), (change,))[1] for change in (tangent, still))
-        return forward, first, jax.vjp(picture, unknowns)[1](cotangent)[0]
+        return jax.jvp(picture, (unknowns,), (tangent,))[1], jax.vjp(picture, unknowns)[1](cotangent)[0]
 
-    forward, first, reverse = products(linear)
+    forward, reverse = products(linear)
     backwards = sum(np.nansum(np.asarray(a) * np.asarray(b)) for a, b in zip(jax.tree.leaves(reverse), drawn, strict=True))
     np.testing.assert_allclose(backwards, np.vdot(cotangent, forward), rtol=10 * rounding)
-
-    @jax.jit
-    def vertices(heights):
-        def values(new):
-            known = jax.tree.map(jnp.asarray, localise(scene))
-            changed = eqx.tree_at(lambda scene: scene.heightfields[0].heights, known, new)
-            return vertex_values(make_world(changed, settings))
-
-        return vertex_slopes(values, heights)
-
-    of_heights = vertices_by_heights(np.nan_to_num(vertices(heights[0])), scene)
-    one = jax.tree.map(lambda leaf: leaf[0], linear)
-    samples = PictureSamples(CAMERA, settings, None if one.edges is None else one.edges.resampled)
-    rows = picture_by_vertices(one, samples, channels - 1, of_heights.shape[0]) @ of_heights
-    expected = np.ravel(first[..., -1])
-    np.testing.assert_allclose(
-        rows @ np.nan_to_num(np.ravel(drawn[0])), expected, rtol=0, atol=rounding * np.abs(expected).max()
-    )
 
 
 @pytest.fixture(scope="module")
@@ -199,13 +176,6 @@ def test_a_point_on_an_edge_depends_on_its_deciding_vertices_alone(derivatives, 
     expected, found = derivatives(point)
     assert np.count_nonzero(expected) == 10
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
-
-
-def test_normals_that_are_known_as_the_program_runs_are_those_of_the_settings():
-    scene = terrains("one")
-    for by_angle, settings in ((True, jaxhf.Settings(normals="six-angle")), (False, jaxhf.Settings(normals="six"))):
-        found = vertex_values(make_world(scene, jaxhf.Settings(), jnp.asarray(by_angle)))
-        np.testing.assert_allclose(found, vertex_values(make_world(scene, settings)), rtol=1e-6, atol=1e-6)
 
 
 def test_what_a_mirror_shows_has_no_such_matrix():

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from small_fits import fit_options
+from small_fits import given
 
 import jaxhf
-from jaxhf.fitting.findings import misfit_of_length
-from jaxhf.fitting.problem import make_problem
+from jaxhf.fitting.model.problem import make_problem
+from jaxhf.fitting.trust.facts import misfit_of_length
 
 SUNS = ((315, 20), (60, 30), (180, 40))
 SETTINGS = jaxhf.Settings(normals="six", edge_samples=0)
@@ -41,7 +41,7 @@ def fitted(seed: int, relief: float, count: int, matte: bool = True, **options) 
         image, aovs = jaxhf.render(scene, jaxhf.Settings(samples=16), aovs=("normal",))
         exact = np.asarray(image)[..., 0] if matte else moonlit(scene, np.asarray(aovs["normal"]))
         targets.append(exact + NOISE * rng.standard_normal(exact.shape))
-    known = {"settings": SETTINGS, "prior": 0.0, "prior_std": relief, "prior_length": 4.0}
+    known = {"settings": SETTINGS, "prior": jaxhf.Prior(0.0, relief, 4.0)}
     return jaxhf.fit(scenes(0 * heights, count), targets, **known | options)
 
 
@@ -78,9 +78,8 @@ def test_noise_is_found_in_spite_of_shadows_that_stand_elsewhere(count):
     assert found.stats["chi2"] > 1.2
 
 
-@pytest.mark.parametrize("loss", [pytest.param("geman", marks=pytest.mark.deep), "squares"])
-def test_chi2_is_by_degree_of_freedom_where_the_noise_is_given(loss):
-    found = fitted(1, 0.6, 1, noise=NOISE, loss=loss)
+def test_chi2_is_by_degree_of_freedom_where_the_noise_is_given():
+    found = fitted(1, 0.6, 1, noise=NOISE)
     assert 0.8 < found.stats["chi2"] < 1.2  # of some 340 degrees of freedom: to 8 %
     assert found.warnings == ()
 
@@ -89,16 +88,16 @@ def test_chi2_is_by_degree_of_freedom_where_the_noise_is_given(loss):
 def test_a_prior_length_that_does_not_fit_is_named(length, fits):
     """Such as one in cells where it is in metres: too short for what the prior is off by, which is smooth."""
     smooth = 0.6 * np.sin(np.arange(N) / 5)[:, None] * np.cos(np.arange(N) / 6)
-    options = fit_options(prior=0.0, prior_std=float(smooth.std()), prior_length=length)
+    options = given(prior=jaxhf.Prior(0.0, float(smooth.std()), length))
     problem, _ = make_problem(scenes(smooth, 1), [np.zeros((N - 1, N - 1))], options)
     said = misfit_of_length(problem, options)
-    assert said is None if fits else "prior_length, 1 or 1 cells, may be too short" in str(said)
+    assert said is None if fits else "its length, 1 or 1 cells, may be too short" in str(said)
 
 
 @pytest.mark.deep
 def test_a_noise_that_pictures_cannot_tell_is_asked_for():
     """One sun and no prior: the heights explain nearly all of the picture, noise included."""
-    found = fitted(1, 0.6, 1, prior=None, prior_std=None, prior_length=None, max_steps=30)
+    found = fitted(1, 0.6, 1, prior=None, max_steps=30)
     assert any("noise= tells the fit" in warning for warning in found.warnings)
 
 

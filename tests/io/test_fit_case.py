@@ -1,6 +1,6 @@
 """What a fit file says is what `fit` gets; what is wrong in it is named with its line. Nothing here is traced."""
 
-import json
+import dataclasses
 import re
 from typing import Any
 
@@ -31,12 +31,6 @@ PICTURE = """
 [[pictures]]
 image = "grey.npy"
 """
-OPTIONS = {
-    "start": 3, "prior_std": 0.5, "prior_length": 4, "prior_exponent": 3, "smoothness": 2, "albedo": "map",
-    "albedo_smoothness": 1, "exposures": True, "offsets": False, "light_std": 1, "camera_std": [2, 0.5], "loss": "huber",
-    "loss_scale": 2, "solver": "bfgs", "levels": [0.5, 1], "max_steps": 7, "inner_steps": 8, "tolerance": 1e-3,
-    "uncertainty": "exact", "checkpoint_every": 3,
-}  # fmt: skip
 FROM_ABOVE = '{ type = "orthographic", eye = [0.5, 0.5, 3.0], target = [0.5, 0.5, 0], up = [0, 1, 0], extent = 2 }'
 ALL = f"""samples = 4
 settings = {{ shadows = false, samples = 9 }}
@@ -53,9 +47,13 @@ lights = [{{ type = "sky", radiance = 1 }}]
 camera = {FROM_ABOVE}
 
 [fit]
+start = 3
 noise = 0.02
-prior = "prior.npy"
-""" + "\n".join(f"{name} = {json.dumps(value)}" for name, value in OPTIONS.items())
+draws = 9
+max_steps = 7
+prior = {{ heights = "prior.npy", std = 0.5, length = 4 }}
+unknown = {{ albedo = "map", albedo_std = 0.5, exposures = true, offsets = false, light_std = 1, camera_std = [2, 0.5] }}
+"""
 WHOLE = SCENE + PICTURE
 
 
@@ -83,8 +81,10 @@ def test_every_key_arrives(folder):
     np.testing.assert_array_equal(found.weights[0], np.arange(12).reshape(3, 4) > 5)
     np.testing.assert_array_equal(found.weights[1], np.arange(12).reshape(3, 4) / 4)
     assert found.settings == jaxhf.Settings(shadows=False, samples=9)
-    np.testing.assert_array_equal(found.options.pop("prior"), np.arange(9).reshape(3, 3))
-    assert found.options == OPTIONS
+    np.testing.assert_array_equal(found.prior.pop("heights"), np.arange(9).reshape(3, 3))
+    assert (found.options, found.prior) == ({"start": 3, "draws": 9, "max_steps": 7}, {"std": 0.5, "length": 4})
+    assert tuple(found.unknown.values()) == ("map", 0.5, 1, True, False, [2, 0.5])
+    assert found.unknown.keys() == {field.name for field in dataclasses.fields(jaxhf.Unknown)}
     first, second = found.scenes
     assert first.heights is second.heights
     assert first.heights.dtype == np.float32
@@ -158,8 +158,8 @@ def test_the_map_of_a_geotiff_is_kept_unless_the_scene_puts_it_elsewhere(folder)
     scene = SCENE[: SCENE.index("shape")]
     assert case(folder, scene + field + PICTURE).like == folder / "dem.tif"
     found = case(folder, scene + field + "x0 = 3\n" + PICTURE)
-    kept = found.like, found.options, found.weights, found.noise, found.settings
-    assert kept == (None, {}, (None,), None, jaxhf.Settings())
+    kept = found.like, found.options, found.prior, found.unknown, found.weights, found.noise, found.settings
+    assert kept == (None, {}, {}, {}, (None,), None, jaxhf.Settings())
 
 
 def terrain_file(path, place, shape, holes=()):
@@ -177,7 +177,7 @@ def terrain_file(path, place, shape, holes=()):
 
 def with_prior(tile, prior, more=""):
     field = SCENE[: SCENE.index("heights =")] + f'file = "{tile}"\n{more}'
-    return field + PICTURE + f'\n[fit]\nprior = "{prior}"\nstart = "{prior}"\nprior_std = "{prior}"\n'
+    return field + PICTURE + f'\n[fit]\nstart = "{prior}"\n[fit.prior]\nheights = "{prior}"\nstd = "{prior}"\n'
 
 
 TILE = (30.0, 20.0, 500000.0, 4100000.0)  # of 4 x 5 vertices: 120 by 60
@@ -198,36 +198,36 @@ def test_a_prior_lies_where_its_file_says(folder, name):
     expected = terrain_file(folder / ending, tile, (4, 5))
     prior = ending.replace(".", "_prior.")
     held = terrain_file(folder / prior, region, shape)
-    found = case(folder, with_prior(ending, prior)).options
+    given = case(folder, with_prior(ending, prior))
+    found = given.prior["heights"]
     if name == "coarse":
-        inside = found["prior"][1:3, 1:4]
-        np.testing.assert_allclose(inside, expected[1:3, 1:4], rtol=1e-12)
-        np.testing.assert_array_equal(found["prior"][[0, 0, -1, -1], [0, -1, 0, -1]], held.ravel())
+        np.testing.assert_allclose(found[1:3, 1:4], expected[1:3, 1:4], rtol=1e-12)
+        np.testing.assert_array_equal(found[[0, 0, -1, -1], [0, -1, 0, -1]], held.ravel())
     else:
         shift = 360 * (name == "degrees from 0 on")
-        np.testing.assert_allclose(found["prior"], expected + shift, rtol=1e-12)
-    for option in ("start", "prior_std"):
-        np.testing.assert_array_equal(found[option], found["prior"])
+        np.testing.assert_allclose(found, expected + shift, rtol=1e-12)
+    for other in (given.options["start"], given.prior["std"]):
+        np.testing.assert_array_equal(other, found)
     # A terrain that is moved and scaled in the scene is still its own.
-    own = case(folder, with_prior(ending, ending, "dx = 9.0\ndy = 6.0\nx0 = 0\ny0 = 0\n")).options["prior"]
+    own = case(folder, with_prior(ending, ending, "dx = 9.0\ndy = 6.0\nx0 = 0\ny0 = 0\n")).prior["heights"]
     np.testing.assert_array_equal(own, expected)
     # Without a place, or over a terrain without one, it is left to `fit`.
     np.save(folder / "bare.npy", held)
-    assert case(folder, with_prior(ending, "bare.npy")).options["prior"].shape == shape
+    assert case(folder, with_prior(ending, "bare.npy")).prior["heights"].shape == shape
     np.save(folder / "tile.npy", expected)
-    assert case(folder, with_prior("tile.npy", prior)).options["prior"].shape == shape
+    assert case(folder, with_prior("tile.npy", prior)).prior["heights"].shape == shape
     placed = "dx = {}\ndy = {}\nx0 = {}\ny0 = {}\n".format(*tile)
     if "degrees" in name:
-        said = r":23: fit\.start: it must lie in the coordinates of the terrain, .* degrees"
+        said = r":22: fit\.start: it must lie in the coordinates of the terrain, .* degrees"
         with pytest.raises(jaxhf.SceneError, match=said):
             case(folder, with_prior("tile.npy", prior, placed))
     else:
-        np.testing.assert_array_equal(case(folder, with_prior("tile.npy", prior, placed)).options["prior"], found["prior"])
+        np.testing.assert_array_equal(case(folder, with_prior("tile.npy", prior, placed)).prior["heights"], found)
 
 
 def refused(folder, text, *messages):
-    """What is wrong with a prior is said of the start, which stands in line 19."""
-    with pytest.raises(jaxhf.SceneError, match=r":19: fit\.start: it must ") as error:
+    """What is wrong with a prior is said of the start, which stands in line 18."""
+    with pytest.raises(jaxhf.SceneError, match=r":18: fit\.start: it must ") as error:
         case(folder, text)
     assert all(message in str(error.value) for message in messages)
 
@@ -252,14 +252,14 @@ def test_a_hole_in_a_prior_is_an_error_where_the_terrain_is(folder):
     region = (30.0, 20.0, 499970.0, 4099980.0)
     border = [(0, k) for k in range(7)] + [(k, 6) for k in range(6)]
     whole = terrain_file(folder / "region.npz", region, (6, 7), holes=border)
-    np.testing.assert_allclose(case(folder, with_prior("tile.npz", "region.npz")).options["prior"], whole[1:5, 1:6])
+    np.testing.assert_allclose(case(folder, with_prior("tile.npz", "region.npz")).prior["heights"], whole[1:5, 1:6])
     terrain_file(folder / "region.npz", region, (6, 7), holes=[*border, (2, 3)])
     refused(folder, with_prior("tile.npz", "region.npz"), "1 of 20 are holes; the first is row 1 column 2")
     bare = np.array([[1.0, 2], [3, 4]], np.float32)
     np.save(folder / "bare.npy", bare)
-    found = case(folder, with_prior("tile.npz", "bare.npy", "z_scale = -2\n")).options
-    np.testing.assert_array_equal(found["prior"], -2 * bare)
-    np.testing.assert_array_equal(found["prior_std"], 2 * bare)
+    found = case(folder, with_prior("tile.npz", "bare.npy", "z_scale = -2\n")).prior
+    np.testing.assert_array_equal(found["heights"], -2 * bare)
+    np.testing.assert_array_equal(found["std"], 2 * bare)
     with pytest.raises(jaxhf.SceneError, match="1 of 4 are holes; the first is row 1 column 0"):
         case(folder, with_prior("tile.npz", "bare.npy", "nodata = 3\n"))
     tifffile.imwrite(folder / "own.tif", bare, photometric="minisblack", extratags=[(42113, "s", 0, "1", True)])
@@ -285,7 +285,9 @@ BAD = [
     (of_picture('mask = "prior.npy"'), 16, "pictures[0].mask must have the size of the image, 4 x 3 pixels; it is 3 x 3"),
     (SIZED, 17, "pictures[0].image must have the proportions of its camera, 50 x 30 pixels; it is 4 x 3 pixels"),
     (of_picture("noise = 0"), 16, "pictures[0].noise must be positive, it is 0"),
-    (of_fit('prior = "colour.npy"'), 18, "shape (ny, nx)"),
+    (of_fit('prior = { heights = 0, std = "colour.npy" }'), 18, "colour.npy: heights must have shape (ny, nx)"),
+    (of_fit("prior = { heights = 0 }"), 18, "fit.prior must have 'std', it is missing"),
+    (of_fit("prior_std = 1"), 18, "unknown key 'prior_std' in fit; did you mean 'prior'"),
 ]
 
 
@@ -299,7 +301,8 @@ def test_mistakes_are_named_with_their_line(folder, text, line, message):
 # What `fit` refuses, and not the reader: an option, its argument, an image, a mask.
 LOCATED = [
     (of_fit("max_steps = 0"), ":18: fit.max_steps must be a whole number from 1 on, it is 0"),
-    (of_fit("prior = 0"), ":18: fit.prior must stand with prior_std"),
+    (of_fit("[fit.prior]\nheights = 0\nstd = 0"), ":20: fit.prior.std must be finite, from 0 on, not all 0; it is 0"),
+    (of_fit("unknown.camera_std = [7, 1]"), ":18: fit.unknown.camera_std must have a position that is off by at most"),
     (WHOLE.replace("grey", "nan"), ":15: pictures[0].image must be finite where "),
     (of_picture('mask = "nothing.npy"'), ":16: pictures[0].mask must be finite, from 0 on, not all 0"),
 ]
@@ -310,8 +313,11 @@ def test_what_fit_refuses_is_named_with_its_line(folder, text, message):
     np.save(folder / "nan.npy", np.array([[0.0, np.nan, 1.0], [0.0, 0.0, 1.0]]))
     np.save(folder / "nothing.npy", np.zeros((3, 4)))
     given = case(folder, text)
-    with pytest.raises(jaxhf.ArgumentError, match=r"^fit: ") as refused:
-        jaxhf.fit(given.scenes, given.targets, weights=given.weights, noise=given.noise, **given.options)
+    with pytest.raises(jaxhf.ArgumentError) as refused:
+        jaxhf.fit(
+            given.scenes, given.targets, weights=given.weights, noise=given.noise, unknown=jaxhf.Unknown(**given.unknown),
+            prior=jaxhf.Prior(**given.prior) if given.prior else None, **given.options,
+        )  # fmt: skip
     assert str(given.located(refused.value)).startswith(f"{folder}/case.toml{message}")
 
 

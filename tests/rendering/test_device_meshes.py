@@ -41,7 +41,7 @@ in_parts = lambda **how: render(progress=lambda done, total: None, **how)
 slope = lambda h=jnp.asarray(heights), **how: jax.grad(lambda h: render(h, **how).sum())(h)
 cast = lambda h=heights, **how: jaxhf.cast(jaxhf.Heightfield(h), np.array([0.5, 0.4, 3]), d).t
 horizon = lambda h=heights, **how: jaxhf.horizon(h, 4, dx=0.25, **how)
-short = dict(settings=settings, start=0.0, levels=(1.0,), max_steps=2)
+short = dict(settings=settings, start=0.0, max_steps=2)
 fit = lambda **how: jaxhf.fit([scene(heights)], [target], **short, **how).heights
 target = np.asarray(render())
 ready = jaxhf.prepare(scene(heights), settings)

@@ -62,7 +62,7 @@ small = [jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights[:6, :6]))], view, [
 settings = jaxhf.Settings(chunk=64, shading="flat", shadows=False)
 if "fitted" in parts:
     targets = [np.asarray(jaxhf.render(scene, settings, mesh=mesh)) for scene in small]
-    found = jaxhf.fit(small, targets, settings=settings, start=0.0, levels=(1.0,), max_steps=3, mesh=mesh)
+    found = jaxhf.fit(small, targets, settings=settings, start=0.0, max_steps=3, mesh=mesh)
     results |= {"fitted": found.heights, "truth": heights[:6, :6]}
 np.savez(path, devices=jax.device_count(), **results)
 """

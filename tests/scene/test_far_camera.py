@@ -9,7 +9,7 @@ import oracle
 import pytest
 
 import jaxhf
-from jaxhf.fitting.view import View, motion, moved
+from jaxhf.fitting.model.view import View, motion, moved
 from jaxhf.preparation.localise import localise
 from jaxhf.rendering.cast import cast_camera
 

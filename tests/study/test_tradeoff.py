@@ -176,11 +176,6 @@ def test_plan_of_some_knobs():
         frozenset(), frozenset({"samples"}), frozenset({"shading"}), frozenset({"samples", "shading"}),
     }  # fmt: skip
     assert len(plan(SCENES / "texture.toml", knobs=("edge_samples",)).configurations) == 5
-    fits = plan(SCENES / "texture.toml", knobs=("shading",), fits=True).configurations
-    assert [one["tolerance"] for one in fits if one["task"] == "fit"] == [1e-4, 1e-2, 1e-3, 1e-5, 1e-4]
-    fits = plan(SCENES / "texture.toml", knobs=("levels",)).configurations
-    levels = {None: None, "coarse to fine": None, "1.0": (1.0,)}
-    assert [(one["task"], levels[one.get("levels")]) for one in fits] == [("picture", None), ("fit", None), ("fit", (1.0,))]
 
 
 @pytest.mark.parametrize(
@@ -189,14 +184,6 @@ def test_plan_of_some_knobs():
 def test_the_reference_is_finer_than_the_base(tmp_path, samples, quick, expected):
     (tmp_path / "a.toml").write_text(SCENE.replace("samples = 1", f"samples = {samples}"))
     assert plan(tmp_path / "a.toml", quick=quick).references[0]["samples"] == expected
-
-
-def test_plan_refuses_fits_of_holes(tmp_path):
-    np.save(tmp_path / "hole.npy", np.array([[0, 0.1, 0.3], [0.2, np.nan, 0.1]]))
-    (tmp_path / "a.toml").write_text(SCENE[: SCENE.index("heights = ")] + 'file = "hole.npy"\n')
-    with pytest.raises(ValueError, match=r"a\.toml: a fit's terrain must be without holes, this one has 1"):
-        plan(tmp_path / "a.toml", fits=True)
-    assert plan(tmp_path / "a.toml").configurations
 
 
 def test_identity(tmp_path):

@@ -35,7 +35,7 @@ def outcomes(every: bool) -> dict[str, Any]:
     if not every:
         return found
     known, target = scene(0.9 * HEIGHTS), np.asarray(jaxhf.render(scene(HEIGHTS)))
-    fitted = jaxhf.fit([known], [target], noise=0.01, prior=known.heights, prior_std=0.02, max_steps=3)
+    fitted = jaxhf.fit([known], [target], noise=0.01, prior=jaxhf.Prior(known.heights, 0.02), max_steps=3)
     both = jax.vmap(lambda heights: jaxhf.render(scene(heights)))(jnp.stack([heights, 2 * heights]))
     _, tangent = jax.jvp(picture, (heights,), (heights**2,))
     gradient = jax.grad(lambda heights: (picture(heights) ** 2).sum())(heights)

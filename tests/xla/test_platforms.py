@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.fitting import residuals as _residuals
-from jaxhf.fitting.options import FitOptions
-from jaxhf.fitting.problem import make_problem
+from jaxhf.fitting.given import Given
+from jaxhf.fitting.model import expansion as _expansion
+from jaxhf.fitting.model.problem import make_problem
 
 HEIGHTS = (0.1 * np.sin(np.arange(40.0)).reshape(5, 8)).astype(np.float32)
 CAMERA = jaxhf.Perspective.look_at((0.5, -0.9, 0.8), (0.5, 0.5, 0.0), width=40, height=30)
@@ -32,10 +32,10 @@ def linearised(heights: jax.Array) -> list[jax.Array]:
     with jax.ensure_compile_time_eval():
         scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(HEIGHTS))], CAMERA, [SUN])
         known = {name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items()}
-        known["settings"] = jaxhf.Settings(edge_samples=300)
-        options = FitOptions(**{name: known[name] for name in FitOptions.__dataclass_fields__})
-        made, unknowns = make_problem([scene], [np.zeros((30, 40), np.float32)], options)
-    return jax.tree.leaves(_residuals._linearised(heights, unknowns, made))
+        known |= {"settings": jaxhf.Settings(edge_samples=300), "unknown": jaxhf.Unknown(albedo="map")}
+        given = Given(**{name: known[name] for name in Given.__dataclass_fields__})
+        made, unknowns = make_problem([scene], [np.zeros((30, 40), np.float32)], given)
+    return jax.tree.leaves(_expansion._linearised(heights, unknowns.without_modes(), made))
 
 
 PROGRAMS = {

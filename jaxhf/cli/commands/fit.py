@@ -78,15 +78,18 @@ def _require_writable(options: argparse.Namespace, *heights: Path) -> None:
 def _fit(case: "Case", checkpoint: Path, resume: bool) -> "Fit":
     """Fits what the file asks for; KeyboardInterrupt says how to go on, an error of an argument in which line it stands."""
     from ...fitting.fit import fit
+    from ...fitting.given import Checkpoint, Prior, Unknown
     from ..progress import told
 
     interruption.raise_from_now_on()
-    progress = _Progress(", then deviations" if "uncertainty" in case.options else "")
+    progress = _Progress(", then deviations" if case.options.get("draws") else "")
     try:
         with told(progress.line) as tell:
             return fit(
-                case.scenes, case.targets, settings=case.settings, weights=case.weights, noise=case.noise,
-                progress=lambda done: (progress.note(done), tell())[1], checkpoint=checkpoint, resume=resume, **case.options,
+                case.scenes, case.targets, prior=Prior(**case.prior) if case.prior else None,
+                unknown=Unknown(**case.unknown), noise=case.noise, weights=case.weights, settings=case.settings,
+                progress=lambda done: (progress.note(done), tell())[1], checkpoint=Checkpoint(checkpoint, resume=resume),
+                **case.options,
             )  # fmt: skip
     except KeyboardInterrupt:
         if not checkpoint.exists():

@@ -27,8 +27,7 @@ def run(options: argparse.Namespace) -> None:
     require_devices(options.devices)
     import_extra("matplotlib", "tradeoff draws with", "plot")
     sweep = plan(
-        options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick,
-        fits=options.fit,
+        options.scene, options.output, width=options.width, devices=options.devices, knobs=options.knobs, quick=options.quick
     )  # fmt: skip
     interruption.raise_from_now_on()
     failures = _watched(sweep, options.repeats) if sweep.missing() else []
@@ -87,7 +86,6 @@ COMMAND = Command(
         ),
         "what is measured": (
             flag("--quick", "fewer values, a smaller picture, a coarser reference"),
-            flag("--fit", "sweep tolerance and levels of a small fit, too"),
             option("--knobs", nargs="+", default=(), metavar="KNOB", help="sweep only these"),
             whole("--width", "PIXELS", "size [the scene's, at most 480 for the longer side]"),
             whole("--devices", "N", "cores that share the work [all, at most 16]"),

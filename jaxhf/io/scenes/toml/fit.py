@@ -24,7 +24,7 @@ from .checks import Part
 from .priors import Provenance, known_deviations, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene, transfer_of
 from .tables import SCENE, Key, Keys, optional
-from .values import flag, number, number_list, numbers, or_word, table, tables, whole, word
+from .values import flag, number, numbers, or_word, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
 _CASE: Keys = {
@@ -44,18 +44,21 @@ _PICTURE: Keys = {
     **optional("lights", kind=tables),
 }
 _ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argument of `fit` is in such a table
-# Those of `fit` and of `Settings`, whose defaults they have and who check their values.
+# Those of `fit`, `Prior`, `Unknown` and `Settings`, whose defaults they have and who check their values.
 _FIT: Keys = {
-    **optional("start", "prior", "prior_std", kind=or_word(number)),
-    **optional("prior_length", "prior_exponent", "smoothness", "albedo_smoothness", kind=number),
-    **optional("noise", "light_std", "loss_scale", "tolerance", kind=number),
-    **optional("albedo", "loss", "solver", kind=word),
+    **optional("start", kind=or_word(number)),
+    **optional("noise", kind=number),
+    **optional("draws", "max_steps", kind=whole),
+    **optional("prior", "unknown", kind=table),
+}
+_PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number))), **optional("length", kind=number)}
+_UNKNOWN: Keys = {
+    **optional("albedo", kind=word),
+    **optional("albedo_std", "light_std", kind=number),
     **optional("exposures", "offsets", kind=flag),
     **optional("camera_std", kind=numbers(2)),
-    **optional("max_steps", "inner_steps", "checkpoint_every", kind=whole),
-    **optional("levels", kind=number_list),
-    **optional("uncertainty", kind=or_word(whole)),
 }
+_ARGUMENTS = {("fit",): _FIT, ("fit", "prior"): _PRIOR, ("fit", "unknown"): _UNKNOWN}
 _SETTINGS: Keys = {
     knob.name: Key({OneOf: word, Whole: whole}.get(type(knob.metadata["rule"]), flag), None)
     for knob in dataclasses.fields(Settings)
@@ -68,7 +71,8 @@ class Case:
 
     Attributes:
       scenes, targets, weights, noise, settings: as `fit` takes them; a grey picture has shape (h, w).
-      options: further arguments of `fit`, those that the file gives.
+      options: `start`, `draws` and `max_steps` of `fit`, those that the file gives.
+      prior, unknown: the same of `Prior` and `Unknown`; empty: there is no such table.
       names: the pictures' files, as written.
       like: the GeoTIFF whose georeference the heights have; None: there is none.
       part: the file, for errors.
@@ -80,12 +84,14 @@ class Case:
     noise: tuple[float, ...] | None
     settings: Settings
     options: dict[str, Any]
+    prior: dict[str, Any]
+    unknown: dict[str, Any]
     names: tuple[str, ...]
     like: Path | None
     part: Part
 
     def located(self, error: ArgumentError) -> UserError:
-        """An error of `fit`'s about its arguments, on the line where they stand; others as they are."""
+        """An error about an argument of `fit`, `Prior` or `Unknown`, on the line where that stands; others as they are."""
         name, _, index = error.argument.removesuffix("]").partition("[")
         if name == "scenes":  # those of a case differ in cameras and lights only
             place = self.part.at("objects" if "objects" in self.part.table else "scene")
@@ -93,8 +99,8 @@ class Case:
         if index:
             given = self.part.table["pictures"][int(index)]
             place = self.part.at("pictures", int(index), next(key for key in _ABOUT[name] if key in given))
-        elif name in _FIT:
-            place = self.part.at("fit", name)
+        elif within := next((within for within, keys in _ARGUMENTS.items() if name in keys), None):
+            place = self.part.at(*within, name)
         else:
             return error
         return place.error(f"{place.name} {error.rule}")
@@ -125,19 +131,23 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     if not values["pictures"]:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
     chosen = part.at("fit")
-    options = _given(chosen, _FIT)
-    noise = options.pop("noise", None)
-    for name in ("start", "prior", "prior_std"):
-        if isinstance(options.get(name), str):
-            known = known_deviations if name == "prior_std" else known_heights
-            options[name] = _read(chosen, name, partial(known, base.field), options[name])
+    options, unknown = _given(chosen, _FIT), _given(chosen.at("unknown"), _UNKNOWN)
+    prior = _given(chosen.at("prior"), _PRIOR) if "prior" in options else {}
+    noise, *_ = (options.pop(name, None) for name in ("noise", "prior", "unknown"))
+    for place, given in ((chosen, options), (chosen.at("prior"), prior)):
+        for name, value in given.items():
+            if isinstance(value, str):
+                reader = known_deviations if name == "std" else known_heights
+                given[name] = _read(place, name, partial(reader, base.field), value)
     pictures = [_picture(picture, base, chosen, noise) for picture in part.all("pictures")]
     scenes, targets, weights, noises, names = zip(*pictures, strict=True)
     known = [value for value in noises if value is not None]
     if known and len(known) < len(noises):
         place = part.at("pictures", noises.index(None))
         raise place.error(f"{place.name} must have a noise, as another picture has one; or none, then it is estimated")
-    return Case(scenes, targets, weights, tuple(known) or None, settings, options, names, base.field.like, part)
+    return Case(
+        scenes, targets, weights, tuple(known) or None, settings, options, prior, unknown, names, base.field.like, part
+    )  # fmt: skip
 
 
 def _picture(

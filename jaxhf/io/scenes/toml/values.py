@@ -86,17 +86,11 @@ def or_word(kind: Kind, tail: str = " or a string") -> Kind:
     return either
 
 
-def number_list(value: Any) -> list[float]:
-    if not isinstance(value, list) or not all(map(_is_number, value)):
-        raise ValueError("a list of finite numbers")
-    return [_in_range(item, _FARTHEST) for item in value]
-
-
 def numbers(count: int) -> Kind:
     def kind(value: Any) -> list[float]:
         if not _is_list(value, count, _is_number):
             raise ValueError(f"a list of {count} finite numbers")
-        return number_list(value)
+        return [_in_range(item, _FARTHEST) for item in value]
 
     return kind
 

@@ -1,18 +1,21 @@
-"""What the last pictures of a fit say about it: gathered here, put into words by `diagnosis`."""
+"""What the last pictures of a fit say about it: gathered here, put into words by `words`."""
 
+import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..core.types import AnyArray
-from .diagnosis import Places
-from .noise import octaves
-from .normals import share_of_normals
-from .options import FitOptions
-from .problem import Problem
+from ...trace.normals import vertex_normals
+from ...xla.compilation import compiled
+from ..given import Given
+from ..model.expansion import Expansion
+from ..model.problem import Problem
+from ..model.robust import influence_function
+from ..solve.noise import Freedom, octaves
+from .words import Places
 
 _ALIKE = 0.3  # correlation of neighbouring residuals above which they are no noise
 _LIKE_NOISE = 0.2  # below which they may be
@@ -28,6 +31,9 @@ _LEAST_MODES = 8  # in an octave
 _LIKE_ONE = 0.5  # correlation of the channels' residuals
 _OUTLIER = 4.0  # standard deviations
 _LEAST_CHI2 = 0.5  # below which what is left is mostly the error of few samples, which all channels have
+_MOST_UNKNOWNS = 0.25  # of the values, where it is not known how much of the noise is explained: it is told 13 % too small then
+_MOST_EXPLAINED = 0.75  # of a picture's noise: one sun without a prior has 0.8, and 0.65 to 1 of its noise is found
+_LEAST_SLOPE = 0.1  # of a robust loss, on average
 _WIDER = 1.2  # the spread of residuals over the noise, above which that may be larger
 
 
@@ -66,7 +72,7 @@ def neighbour_correlation(residual: Float[np.ndarray, "h w c"], counts: Bool[np.
     return float(products / squares), float(np.sqrt(squares / pairs))
 
 
-def unlike_noise(pictures: Sequence[Left], options: FitOptions) -> str | None:
+def unlike_noise(pictures: Sequence[Left], given: Given) -> str | None:
     """What is left of pictures although it is no noise, in words; None: nothing.
 
     An estimate of the noise takes it for noise, and chi2 is about 1.
@@ -83,7 +89,7 @@ def unlike_noise(pictures: Sequence[Left], options: FitOptions) -> str | None:
     several = "" if len(found) == 1 else f" and of {len(found) - 1} more"
     return (
         f"what is left of picture {worst}{several} is no noise: neighbouring pixels are off alike (correlation {alike:.2f}), "
-        f"by {size:.0%} of its brightness; {_cause(pictures[worst], options)}"
+        f"by {size:.0%} of its brightness; {_cause(pictures[worst], given)}"
     )
 
 
@@ -105,43 +111,43 @@ def dependent_channels(pictures: Sequence[Left]) -> str | None:
     return None
 
 
-def _cause(left: Left, options: FitOptions) -> str:
+def _cause(left: Left, given: Given) -> str:
     image, target = (values[left.informing].astype(np.float64) for values in (left.image, left.target))
     factor, offset = float(image @ target / max(image @ image, 1e-30)), float(np.mean(target - image))
     most = (1 - _EXPLAINED) * np.sum((target - image) ** 2)
     scaled, moved = np.sum((target - factor * image) ** 2), np.sum((target - image - offset) ** 2)
-    if not options.offsets and moved < min(most, scaled) and abs(offset) > _TRIFLE * left.brightness:
-        return f"it is brighter than the scene by {offset:.3g}: offsets=True finds what haze or the sensor adds; {_REFLECTANCE}"
-    if not options.exposures and factor > 0 and scaled < most and abs(factor - 1) > _TRIFLE:
+    if not given.unknown.offsets and moved < min(most, scaled) and abs(offset) > _TRIFLE * left.brightness:
+        unknown = "Unknown(offsets=True) finds what haze or the sensor adds"
+        return f"it is brighter than the scene by {offset:.3g}: {unknown}; {_REFLECTANCE}"
+    if not given.unknown.exposures and factor > 0 and scaled < most and abs(factor - 1) > _TRIFLE:
         return (
-            f"it is {factor:.3g} times as bright as the scene: exposures=True finds such factors, if the exposure, the light "
-            f"or the albedo is not known; {_REFLECTANCE}"
+            f"it is {factor:.3g} times as bright as the scene: Unknown(exposures=True) finds such factors, if the exposure, "
+            f"the light or the albedo is not known; {_REFLECTANCE}"
         )
-    prior = "" if options.prior is None else "prior_std may be too small, or "
-    if options.prior_length is not None:
-        prior = "prior_std may be too small or prior_length too long, or "
-    off = "lights, cameras or the albedo may be off: light_std, camera_std and albedo let the fit find them"
+    prior = "" if given.prior is None else "the prior's std may be too small, or "
+    if given.prior is not None and given.prior.length is not None:
+        prior = "the prior's std may be too small or its length too long, or "
+    off = "lights, cameras or the albedo may be off: Unknown(light_std=, camera_std=, albedo=) lets the fit find them"
     return f"{prior}{off}; {_REFLECTANCE}"
 
 
-def informing_values(problem: Problem) -> list[Bool[np.ndarray, "h w c"]]:
+def informing_values(expansion: Expansion) -> list[Bool[np.ndarray, "h w c"]]:
     """Which values of each picture depend on the heights; all of those with a weight where that is not known."""
-    found = [np.zeros((1, 1, 1), bool)] * problem.count
-    for number, group in enumerate(problem.groups):
+    found = [np.zeros((1, 1, 1), bool)] * expansion.problem.count
+    for group, known in zip(expansion.problem.groups, expansion.linearised, strict=True):
         informing = np.asarray(group.weights) > 0
-        if problem.linearised is not None:
-            informing &= np.asarray(problem.linearised[number].depends)[..., None]
+        if known is not None:
+            informing &= np.asarray(known.depends)[..., None]
         for k, values in zip(group.indices, informing, strict=True):
             found[k] = values
     return found
 
 
-def boundary_places(problem: Problem) -> list[Places]:
+def boundary_places(expansion: Expansion) -> list[Places]:
     """Where boundaries are in each picture."""
-    found = [Places(np.zeros((1, 1), bool), None)] * problem.count
-    for number, group in enumerate(problem.groups):
+    found = [Places(np.zeros((1, 1), bool), None)] * expansion.problem.count
+    for group, known in zip(expansion.problem.groups, expansion.linearised, strict=True):
         h, w = group.targets.shape[1:3]
-        known = None if problem.linearised is None else problem.linearised[number]
         for position, k in enumerate(group.indices):
             if known is None:
                 found[k] = Places(np.zeros((h, w), bool), None)
@@ -154,26 +160,24 @@ def boundary_places(problem: Problem) -> list[Places]:
     return found
 
 
-def what_may_help(problem: Problem, heights: Float[AnyArray, "ny nx"], pictures: Sequence[Left], options: FitOptions) -> str:
+def what_may_help(expansion: Expansion, pictures: Sequence[Left], given: Given) -> str:
     """The one option to try where pictures are left unexplained."""
-    if options.noise is not None and all(map(_is_wider_noise, pictures)):
+    problem = expansion.problem
+    if given.noise is not None and all(map(_is_wider_noise, pictures)):
         return "what is left looks like noise that is larger than the given one: leave noise out, and the fit estimates it"
-    if problem.loss == "squares":
-        return "loss='geman' lets pixels go that the scene cannot explain"
     if not problem.settings.shadows:
         return "Settings(shadows=True), the default, renders shadows, too"
-    if options.settings.edge_samples == 0:
+    if given.settings.edge_samples == 0:
         return "Settings(edge_samples=None), the default, lets the fit move silhouettes, shadows and the terrain's border"
-    share = share_of_normals(problem, heights) if problem.by_angle is None else 0.0  # else the fit has tried them
-    if share > 1:
+    if (share := _share_of_normals(expansion)) > 1:
         return (
             f"pictures of terrain as rough as this differ by {share:.2g} times the noise between normals weighted by area, the "
             "default, and by angle, as by Mitsuba: for those, Settings(normals='six-angle')"
         )
     if (problem.settings.samples or 1) < 16:
         return (
-            "Settings(samples=16) makes pictures of finer samples; if that changes nothing, camera_std finds a camera that is "
-            "off, or mask those pixels by weights"
+            "Settings(samples=16) makes pictures of finer samples; if that changes nothing, Unknown(camera_std=) finds a "
+            "camera that is off, or mask those pixels by weights"
         )
     return (
         "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo, a surface that "
@@ -186,46 +190,66 @@ def _is_wider_noise(left: Left) -> bool:
     return spread > _WIDER and abs(alike) < _LIKE_NOISE
 
 
-def strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, prior_std: Any) -> float | None:
+def _share_of_normals(expansion: Expansion) -> float:
+    """By about how much pictures change, in units of the noise, as normals are weighted by angle, not by area: the horizontal
+    part of what they turn by times the pictures' brightness; 0 where the settings are not the default ones."""
+    problem = expansion.problem
+    if problem.settings.normals not in (None, "six") or problem.settings.shading != "smooth":
+        return 0.0
+    field = problem.field
+    area, angle = (np.asarray(n, np.float64) for n in _by_area_and_angle(expansion.heights, field.dx, field.dy))
+    horizontal = (angle - area / np.linalg.norm(area, axis=-1, keepdims=True))[..., :2]
+    return float(np.sqrt(np.mean(np.square(horizontal))) * np.median(problem.brightness / problem.noise))
+
+
+@functools.partial(compiled, static_argnames=("dx", "dy"))
+def _by_area_and_angle(heights: Float[jax.Array, "ny nx"], dx: float, dy: float) -> list[Float[jax.Array, "ny nx 3"]]:
+    return [vertex_normals(heights, dx, dy, scheme) for scheme in ("six", "six-angle")]
+
+
+def strayed(problem: Problem, heights: np.ndarray, seen: np.ndarray, given: Given) -> float | None:
     """By how many of its deviations the heights that are seen differ from the prior, root mean square; None: there is none."""
-    if problem.prior is None or not seen.any():
+    if given.prior is None:
         return None
-    ratio = (heights - np.asarray(problem.basis.crop(problem.prior.heights))) / np.asarray(prior_std, np.float64)
-    return float(np.sqrt(np.mean(np.broadcast_to(ratio, seen.shape)[seen] ** 2)))
+    std = np.broadcast_to(np.asarray(given.prior.std, np.float64), heights.shape)
+    counted = seen & (std > 0)
+    off = (heights - np.asarray(problem.basis.crop(np.asarray(problem.terms.surface.mean))))[counted] / std[counted]
+    return float(np.sqrt(np.mean(off**2))) if off.size else None
 
 
-def misfit_of_length(problem: Problem, options: FitOptions) -> str | None:
+def misfit_of_length(problem: Problem, given: Given) -> str | None:
     """In which waves heights differ from a correlated prior by far more than its deviations, in words; None: in none."""
-    length, basis = options.prior_length, problem.basis
-    if problem.prior is None or problem.prior.stiffness is None or length is None:
+    length = None if given.prior is None else given.prior.length
+    if length is None:
         return None
-    weight, stiffness = (np.asarray(values, np.float64) for values in (problem.prior.weight, problem.prior.stiffness))
-    off = weight * (np.asarray(basis.base, np.float64) - np.asarray(problem.prior.heights, np.float64))
-    modes = stiffness * (np.asarray(basis.rows, np.float64) @ off @ np.asarray(basis.columns, np.float64).T)
+    basis, term = problem.basis, problem.terms.surface
+    weight, spectrum = (np.asarray(values, np.float64) for values in (term.weight, term.spectrum))
+    off = weight * (np.asarray(basis.base, np.float64) - np.asarray(term.mean, np.float64))
+    modes = spectrum * (np.asarray(basis.rows, np.float64) @ off @ np.asarray(basis.columns, np.float64).T)
     bands = octaves(modes.shape).ravel()
     counts = np.bincount(bands)
     sizes = np.sqrt(np.bincount(bands, (modes**2).ravel()) / counts)
     worst = int(np.argmax(np.where(counts >= _LEAST_MODES, sizes, 0)))
     if sizes[worst] < _FAR_FROM_PRIOR:
         return None
-    field = problem.groups[0].shared.heightfields[0]
-    cell = min(field.dx, field.dy)
+    cell = min(problem.field.dx, problem.field.dy)
     shortest = 2 * cell * 2**worst
     kind = "short" if sizes[worst] > 2 * sizes[max(worst - 2, 0)] else "long"  # it is waves of all lengths that are off then
     return (
         f"in waves of {shortest:.3g} to {2 * shortest:.3g} the heights differ from the prior by {sizes[worst]:.2g} times its "
-        f"deviations there: prior_length, {length:.6g} or {length / cell:.3g} cells, may be too {kind}, or prior_std too "
-        f"small. prior_length is in the unit of dx and dy, of which a cell has {cell:.6g}, not in cells"
+        f"deviations there: its length, {length:.6g} or {length / cell:.3g} cells, may be too {kind}, or its std too "
+        f"small. The length is in the unit of dx and dy, of which a cell has {cell:.6g}, not in cells"
     )
 
 
-def shows_mean(influence: Float[np.ndarray, "ny nx"]) -> bool:
+def shows_mean(gradients: Float[np.ndarray, "k ny nx"]) -> bool:
     """Whether pictures change as all heights move up together; orthophotos do not.
 
     Args:
-      influence: Jᵀz for a normal z, J the pictures' derivative in the heights: its sum is normal, with the deviation |J 1|.
+      gradients: Jᵀz for normal z, see `Expansion.random_gradients`: their sums are normal, with the deviation |J 1|.
     """
-    return abs(float(np.sum(influence, dtype=np.float64))) > _RELATIVE * float(np.linalg.norm(influence))
+    sums = gradients.sum(axis=(1, 2))
+    return float(np.linalg.norm(sums)) > _RELATIVE * float(np.linalg.norm(gradients))
 
 
 def light_directions(problem: Problem) -> int:
@@ -235,3 +259,46 @@ def light_directions(problem: Problem) -> int:
         for k in range(len(group.indices)):
             found.add(b"".join(np.asarray(leaf)[k].tobytes() for leaf in jax.tree.leaves(group.scenes.lights)))
     return len(found)
+
+
+def why_noise_is_unsure(problem: Problem, unknowns: int, freedom: Freedom | None) -> str | None:
+    """Why an estimate of the noise may be too small, in words; None: it is sure.
+
+    Args:
+      problem: of the fit.
+      unknowns: how many numbers were sought.
+      freedom: None: it is not known.
+    """
+    if freedom is not None:
+        worst = int(np.argmax(freedom.explained))
+        if freedom.explained[worst] <= _MOST_EXPLAINED:
+            return None
+        return f"heights explain {freedom.explained[worst]:.0%} of the noise of picture {worst}: what is left hardly tells it"
+    share = unknowns / problem.values
+    if share <= _MOST_UNKNOWNS:
+        return None
+    return f"there are {share:.2g} unknowns to each value of the pictures, which explain an unknown part of its noise"
+
+
+def chi_squared(
+    problem: Problem, residuals: Float[np.ndarray, " n"], counts: Sequence[int], freedom: Freedom | None
+) -> tuple[float, float | None]:
+    """The mean square of residuals by degree of freedom, about 1 where they are noise; and the mean of `Freedom.free`.
+
+    A value that a robust loss lets go takes no part in the fit, so heights explain none of it, and its residual r is larger
+    than by least squares. With ψ = ρ', v the mean of ψ' and h the share that least squares explain, r + h / (1 - h) ψ / v is
+    about its residual from the fit to all other values; times 1 - h, that has the size of the residual by least squares (Cook
+    and Weisberg, Residuals and influence in regression, 1982, section 2.2).
+
+    Args:
+      problem: of the fit.
+      residuals: in units of the noise, picture after picture.
+      counts: how many of them each picture has.
+      freedom: None: heights are few, and explain nothing of the noise.
+    """
+    if residuals.size == 0 or freedom is None:
+        return (float(np.mean(residuals**2)) if residuals.size else 0.0), None
+    psi, slope, _ = map(np.asarray, influence_function(residuals, problem.loss_scale))
+    explained, free = (np.repeat(values, counts) for values in (freedom.explained, freedom.free))
+    left = residuals + explained * (psi / max(np.mean(slope), _LEAST_SLOPE) - residuals)
+    return float(np.sum(left**2) / np.sum(free)), float(np.mean(free))

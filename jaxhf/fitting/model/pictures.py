@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..core.errors import ArgumentError
-from ..core.precision import numbers
-from ..core.settings import Settings
-from ..preparation.localise import localise
-from ..preparation.world import resolve_settings
-from ..scene.scene import Scene
-from .options import FitOptions
+from ...core.errors import ArgumentError
+from ...core.precision import numbers
+from ...core.settings import Settings
+from ...preparation.localise import localise
+from ...preparation.world import resolve_settings
+from ...scene.scene import Scene
 
 
 class Group(eqx.Module):
@@ -67,17 +66,23 @@ def masked_targets(scenes: Sequence[Scene], targets: Sequence[Any], weights: Seq
     return tuple(found)
 
 
+def weights_of(
+    scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None
+) -> list[Float[np.ndarray, "h w c"]]:
+    """Of each value of each picture, 0 where it does not count."""
+    return [_checked_picture(k, *pair, weights)[1] for k, pair in enumerate(zip(scenes, targets, strict=True))]
+
+
 def make_groups(
     scenes: Sequence[Scene],
     targets: Sequence[Any],
-    noise: Float[np.ndarray, " pictures"],
-    options: FitOptions,
+    weights: Sequence[Any] | None,
     settings: Settings,
 ) -> tuple[Group, ...]:
-    """Checks pictures, and gathers those that one program can render with these settings."""
+    """Checks pictures, and gathers those that one program can render with these settings; their noise is 1."""
     found: dict[Any, list[tuple[int, Scene, Any, Any]]] = {}
     for k, scene in enumerate(scenes):
-        target, weight = _picture(*_checked_picture(k, scene, targets[k], options.weights))
+        target, weight = _picture(*_checked_picture(k, scene, targets[k], weights))
         local = _with_heights(localise(scene), None)
         leaves, structure = jax.tree.flatten(local)
         kind = (
@@ -90,15 +95,14 @@ def make_groups(
     dtype = scenes[0].heights.dtype
     groups = []
     for members in found.values():
-        given = np.stack([weight for *_, weight in members])
-        indices = tuple(k for k, *_ in members)
+        given = jnp.asarray(np.stack([weight for *_, weight in members]), dtype)
         groups.append(
             Group(
                 *_stacked([local for _, local, _, _ in members]),
                 jnp.asarray(np.stack([target for *_, target, _ in members]), dtype),
-                jnp.asarray(given, dtype),
-                jnp.asarray(given / noise[list(indices)].reshape(-1, 1, 1, 1), dtype),
-                indices,
+                given,
+                given,
+                tuple(k for k, *_ in members),
             )
         )
     return tuple(groups)

@@ -11,12 +11,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-from ..core.affine import Affine, affine
-from ..core.types import Vector
-from ..core.vector import dot, unit
-from ..scene.camera import Camera
-from ..scene.light import Directional, Light
-from ..scene.scene import Scene
+from ...core.affine import Affine, affine
+from ...core.types import Vector
+from ...core.vector import dot, unit
+from ...scene.camera import Camera
+from ...scene.light import Directional, Light
+from ...scene.scene import Scene
 
 
 class View(eqx.Module):

@@ -3,13 +3,14 @@
 The radiance of a sample depends on the heights and normals at the three vertices of one triangle (and on which triangle
 that is, which has no derivative). So its row of the matrix is a dozen numbers, taken once by reverse differentiation. A
 product then is three lookups for each sample, where JAX's own linearised picture reads every intermediate value of its
-shading again. A sample of a moving boundary depends on five heights at most.
+shading again. A sample of a moving boundary depends on five heights at most, and on the albedo at four texels.
 """
 
 import dataclasses
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,24 +19,25 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
-from ..boundary.guiding import has_edges
-from ..boundary.sample import BoundarySample, deciding_vertices, picture_point
-from ..boundary.term import Packed, draw_boundaries
-from ..core.autodiff import with_tangent
-from ..core.settings import Settings
-from ..core.types import Flag
-from ..preparation.world import World, make_world
-from ..rendering.samples import PictureSamples
-from ..scene.camera import Camera
-from ..scene.light import Sun
-from ..scene.scene import Scene
-from ..shade.radiance import direct, has_mirrors
-from ..trace.grid import Grid
-from ..trace.hit import Hit
-from ..trace.triangle import Corners, triangle_vertices
-from ..xla.devices import map_over, on_every_device
-from ..xla.kernel import one_kernel
-from ..xla.materialise import materialise
+from ...boundary.guiding import has_edges
+from ...boundary.sample import BoundarySample, deciding_vertices, picture_point
+from ...boundary.term import Packed, draw_boundaries
+from ...core.autodiff import with_tangent
+from ...core.settings import Settings
+from ...preparation.world import World, make_world, resolve_settings
+from ...rendering.samples import PictureSamples
+from ...scene.camera import Camera
+from ...scene.light import Sun
+from ...scene.material import Matte
+from ...scene.scene import Scene
+from ...scene.texture import ImageTexture
+from ...shade.radiance import direct, has_mirrors
+from ...trace.grid import Grid
+from ...trace.hit import Hit
+from ...trace.triangle import Corners, triangle_vertices
+from ...xla.devices import map_over, on_every_device
+from ...xla.kernel import one_kernel
+from ...xla.materialise import materialise
 from .view import KNOWN, View, motion, moved
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
@@ -43,6 +45,7 @@ _TOGETHER = 1024
 # Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
 _POINTS_PER_PIXEL = 4
 _SAMPLING_ERROR = 0.25
+_LEAST_FACTOR = 1e-6  # of an albedo, about which a relative change is taken
 
 
 class Linearised(eqx.Module):
@@ -59,6 +62,7 @@ class Linearised(eqx.Module):
       edges: of samples of moving boundaries; None where the settings ask for none.
       view: derivatives of each sample in the numbers of the light and of the camera that are sought, see `moved`,
         (chunks, c, 2 or 6, samples).
+      albedo: derivatives in the factors of the albedo that are sought; None where it is known.
     """
 
     image: Float[jax.Array, "*n h w c"]
@@ -68,6 +72,20 @@ class Linearised(eqx.Module):
     vertices: Int[jax.Array, "*n chunks 3 samples"]
     edges: "LinearisedEdges | None"
     view: View = KNOWN
+    albedo: "LinearisedAlbedo | None" = None
+
+
+class LinearisedAlbedo(eqx.Module):
+    """The part of the factors of an albedo in a linearised picture.
+
+    Attributes:
+      slopes: derivatives of each sample in the factors' relative changes at four texels, channel by channel of these,
+        (chunks, k, 4, samples).
+      texels: their numbers, row by row, (chunks, 4, samples).
+    """
+
+    slopes: Float[jax.Array, "*n chunks k 4 samples"]
+    texels: Int[jax.Array, "*n chunks 4 samples"]
 
 
 class LinearisedEdges(eqx.Module):
@@ -108,7 +126,7 @@ def linearise_each(
     mesh: Mesh,
     channels: int,
     still: View = KNOWN,
-    by_angle: Flag | None = None,
+    factors: Float[jax.Array, "ty tx k"] | None = None,
 ) -> Linearised:
     """Pictures of scenes that differ in numbers only, one after the other, and their derivatives in the heights, and in the
     light and the camera that `still` names.
@@ -120,7 +138,7 @@ def linearise_each(
       mesh: the devices that share the work.
       channels: 3, or 1 for their mean.
       still: zeros, (2,) for a light and (6,) for a camera in which the derivative is taken.
-      by_angle: see `make_world`.
+      factors: by which `change` multiplies the albedo of the first heightfield, if they are sought.
 
     Returns:
       Leaves with a leading axis of n pictures.
@@ -128,7 +146,7 @@ def linearise_each(
 
     def one(scene: Scene) -> Linearised:
         scene = on_every_device(change(scene), mesh)
-        return _linearise(make_world(scene, settings, by_angle), scene.camera, mesh, channels, still)
+        return _linearise(make_world(scene, settings), scene.camera, mesh, channels, still, factors)
 
     return lax.map(one, scenes)
 
@@ -139,28 +157,60 @@ def picture_each(
     change: Callable[[Scene], Scene],
     settings: Settings,
     mesh: Mesh,
-    by_angle: Flag | None = None,
+    factors: Float[jax.Array, "ty tx k"] | None = None,
 ) -> Float[jax.Array, "n h w c"]:
-    """The pictures that are known, with their derivatives in the heights, light and camera that `change` gives to the scenes.
+    """The pictures that are known, with their derivatives in the heights, light and camera that `change` gives to the scenes,
+    and in the albedo's factors.
 
     Those must be the ones at which `linearise_each` was called.
     """
+    if jax.tree.leaves(scenes.objects):  # each picture has vertices of its own
+        each = lax.map(lambda scene: _values(change(scene), settings, mesh), scenes)
+        first = jnp.arange(each.shape[0])[:, None, None, None] * each.shape[1]
+        at_vertices = each.reshape(-1, each.shape[-1])
+    else:
+        at_vertices, first = _values(change(jax.tree.map(lambda leaf: leaf[0], scenes)), settings, mesh), 0
+    # All pictures at once: a loop over them would copy what it reads of each.
+    (n, chunks, _, _, size), channels = known.slopes.shape, known.image.shape[-1]
+    joined = known.slopes.reshape(-1, *known.slopes.shape[2:]), (known.vertices + first).reshape(-1, 3, size)
+    of_samples = _product(mesh, at_vertices, *joined).reshape(n, chunks, size, channels)
+    numbers = jax.vmap(lambda scene: motion(scene.lights, scene.camera, known.view))(scenes)
+    if known.albedo is not None and factors is not None:
+        of_samples = of_samples + jax.vmap(lambda albedo: _by_albedo(albedo, factors, channels))(known.albedo)
+    light = None
+    if known.edges is not None:
+        heights = at_vertices[:, 0].at[known.edges.vertices + first].get(mode="promise_in_bounds")
+        light = jnp.moveaxis(jnp.sum(known.edges.slopes * heights[:, :, None], axis=3), 2, -1)
 
-    def one(pair: tuple[Linearised, Scene]) -> Float[jax.Array, "h w c"]:
-        scene = on_every_device(change(pair[1]), mesh)
-        return _picture(pair[0], scene, make_world(scene, settings, by_angle), mesh)
+    def one(known: Linearised, of_samples: jax.Array, light: jax.Array | None, numbers: View) -> Float[jax.Array, "h w c"]:
+        of_samples, edges = _with_view(of_samples, known.view, numbers), known.edges
+        samples = PictureSamples(camera, settings, None if edges is None else edges.resampled)
+        change = samples.in_pixels(of_samples)
+        if edges is not None and light is not None:
+            light, flat = _with_view(light, edges.view, numbers), change.reshape(-1, channels)
+            finer = samples.of_resampled(of_samples).mean(1)
+            flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, channels))
+            change = flat.reshape(change.shape)
+        return with_tangent(known.image, change)
 
-    return lax.map(one, (known, scenes))
+    camera, settings = scenes.camera, resolve_settings(settings, scenes)
+    return jax.vmap(one)(known, of_samples, light, numbers)
 
 
-def _linearise(world: World, camera: Camera, mesh: Mesh, channels: int, still: View) -> Linearised:
+def _values(scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "vertices n"]:
+    return vertex_values(make_world(on_every_device(scene, mesh), settings))
+
+
+def _linearise(
+    world: World, camera: Camera, mesh: Mesh, channels: int, still: View, factors: Float[jax.Array, "ty tx k"] | None
+) -> Linearised:
     drawn, edge_samples = None, world.settings.edge_samples or 0
     if has_edges(world):
         drawn = draw_boundaries(world, camera, None, mesh, math.ceil(edge_samples / _POINTS_PER_PIXEL))
     samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
-    sampled = functools.partial(_samples, channels)
+    sampled = functools.partial(_samples, channels, None if factors is None else factors.shape)
     seen = world, camera, still
-    light, slopes, vertices, view = map_over(mesh, lambda *args: one_kernel(sampled, *args), seen, samples.positions())
+    light, slopes, vertices, view, albedo = map_over(mesh, lambda *args: one_kernel(sampled, *args), seen, samples.positions())
     image, edges = samples.in_pixels(light), None
     sampling = _sampling_error(samples.in_rows(light), math.isqrt(world.settings.samples or 1))
     if drawn is not None:
@@ -178,7 +228,9 @@ def _linearise(world: World, camera: Camera, mesh: Mesh, channels: int, still: V
         )
     moving = (slopes != 0).any(axis=(1, 2)).astype(light.dtype)[..., None]
     depends = samples.in_pixels(moving)[..., 0] > 0
-    return Linearised(image, depends, jnp.sqrt(jnp.mean(sampling * sampling, axis=-1)), slopes, vertices, edges, view)
+    sampling = jnp.sqrt(jnp.mean(sampling * sampling, axis=-1))
+    albedo = None if albedo is None else LinearisedAlbedo(*albedo)
+    return Linearised(image, depends, sampling, slopes, vertices, edges, view, albedo)
 
 
 def _sampling_error(samples: Float[jax.Array, "rows columns c"], side: int) -> Float[jax.Array, "h w c"]:
@@ -208,24 +260,6 @@ def _second_differences(samples: Float[jax.Array, "rows columns c"], side: int) 
     return jnp.concatenate([first, size[:, :, 1:-1], last], axis=2).reshape(samples.shape)
 
 
-def _picture(known: Linearised, scene: Scene, world: World, mesh: Mesh) -> Float[jax.Array, "h w c"]:
-    at_vertices = vertex_values(world)
-    numbers = motion(scene.lights, scene.camera, known.view)
-    of_samples = _product(mesh, at_vertices, known.slopes, known.vertices)
-    of_samples = _with_view(of_samples, known.view, numbers)
-    samples = PictureSamples(scene.camera, world.settings, None if known.edges is None else known.edges.resampled)
-    change = samples.in_pixels(of_samples)
-    if known.edges is not None:
-        edges, flat = known.edges, change.reshape(-1, change.shape[-1])
-        finer = samples.of_resampled(of_samples).mean(1)
-        heights = at_vertices[:, 0].at[edges.vertices].get(mode="promise_in_bounds")
-        light = jnp.moveaxis(jnp.sum(edges.slopes * heights[:, None], axis=2), 1, -1)
-        light = _with_view(light, edges.view, numbers)
-        flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, flat.shape[1]))
-        change = flat.reshape(change.shape)
-    return with_tangent(known.image, change)
-
-
 def _with_view(change: Float[jax.Array, "chunks n c"], slopes: View, numbers: View) -> Float[jax.Array, "chunks n c"]:
     """What samples change by, with their part from the light and the camera."""
     for slope, values in zip(jax.tree.leaves(slopes), jax.tree.leaves(numbers), strict=True):
@@ -234,17 +268,30 @@ def _with_view(change: Float[jax.Array, "chunks n c"], slopes: View, numbers: Vi
     return change
 
 
+def _by_albedo(known: LinearisedAlbedo, factors: Float[jax.Array, "ty tx k"], channels: int) -> Float[jax.Array, "chunks n c"]:
+    """What samples change by with the factors of the albedo."""
+    relative = (factors / _apart_from_zero(lax.stop_gradient(factors))).reshape(-1, factors.shape[-1])
+    there = relative.at[known.texels].get(mode="promise_in_bounds")  # (chunks, 4, samples, k)
+    change = jnp.einsum("qkts,qtsk->qsk", known.slopes, there)
+    return change if channels == change.shape[-1] else jnp.sum(change, axis=-1, keepdims=True)
+
+
+def _apart_from_zero(factors: Float[jax.Array, "..."]) -> Float[jax.Array, "..."]:
+    return jnp.where(jnp.abs(factors) < _LEAST_FACTOR, _LEAST_FACTOR, factors)
+
+
 def _channels(light: Float[jax.Array, "*rest 3"], channels: int) -> Float[jax.Array, "*rest c"]:
     return light if channels == 3 else jnp.mean(light, axis=-1, keepdims=True)
 
 
-def _samples(channels: int, seen: tuple[World, Camera, View], points: tuple[jax.Array, ...]):
-    """Radiance at points of the picture, (n, c), and its slopes, vertices and view, see `Linearised`."""
+def _samples(channels: int, factors: tuple[int, ...] | None, seen: tuple[World, Camera, View], points: tuple[jax.Array, ...]):
+    """Radiance at points of the picture, (n, c), and its slopes, vertices, view and albedo, see `Linearised`; `factors` is the
+    shape of those that are sought."""
     world, camera, still = seen
     x, y = points
     smooth = world.settings.shading == "smooth"
 
-    def one(x: jax.Array, y: jax.Array, perturbation: jax.Array, view: View) -> tuple[jax.Array, jax.Array]:
+    def one(x: jax.Array, y: jax.Array, perturbation: jax.Array, view: View) -> tuple[jax.Array, Any]:
         corners = Corners(perturbation[:3], perturbation[3:].reshape(3, 3) if smooth else None)
         surfaces = tuple(
             dataclasses.replace(surface, perturbation=corners) if isinstance(surface, Grid) else surface
@@ -253,19 +300,41 @@ def _samples(channels: int, seen: tuple[World, Camera, View], points: tuple[jax.
         lights, eye = moved(world.lights, camera, view)
         there = dataclasses.replace(world, surfaces=surfaces, lights=lights)
         light, _, hit = direct(there, materialise(eye.ray(x, y)))
-        return _channels(light, channels), _vertices(world, hit)
+        albedo = None if factors is None else _texels(world, hit, lax.stop_gradient(light), channels, factors)
+        return _channels(light, channels), (_vertices(world, hit), albedo)
 
-    def shade(perturbations: jax.Array, view: View) -> tuple[jax.Array, jax.Array]:
-        return jax.vmap(one, in_axes=(0, 0, 1, 1), out_axes=(0, 1))(x, y, perturbations, view)
+    def shade(perturbations: jax.Array, view: View) -> tuple[jax.Array, Any]:
+        return jax.vmap(one, in_axes=(0, 0, 1, 1), out_axes=(0, -1))(x, y, perturbations, view)
 
     none = jnp.zeros((12 if smooth else 3, x.shape[0]), x.dtype)
-    light, pull_back, vertices = jax.vjp(shade, none, _each(still, x.shape[0]), has_aux=True)
+    light, pull_back, (vertices, albedo) = jax.vjp(shade, none, _each(still, x.shape[0]), has_aux=True)
     each = jnp.broadcast_to(jnp.eye(channels, dtype=x.dtype)[:, None], (channels, *light.shape))
     if channels == 1:
         slopes, view = jax.tree.map(lambda leaf: leaf[None], pull_back(each[0]))
     else:
         slopes, view = jax.vmap(pull_back)(each)
-    return light, slopes, vertices, view
+    return light, slopes, vertices, view, albedo
+
+
+def _texels(
+    world: World, hit: Hit, light: jax.Array, channels: int, factors: tuple[int, ...]
+) -> tuple[Float[jax.Array, "k 4"], Int[jax.Array, "4"]]:
+    """How the light from a hit goes with the factors of the first heightfield's albedo: see `LinearisedAlbedo`."""
+    number = world.grids[0][0]
+    material = world.materials[number]
+    assert isinstance(material, Matte)
+    places, shares = jnp.zeros(4, jnp.int32), jnp.zeros((3, 4), light.dtype).at[:, 0].set(1)
+    if isinstance(texture := material.albedo, ImageTexture):
+        rows, columns, weights = texture.corners(hit.uv)
+        parts = weights[None] * jnp.asarray(texture.texels)[rows, columns].T
+        total = jnp.sum(parts, axis=1, keepdims=True)
+        shares = jnp.where(total == 0, 0, parts / jnp.where(total == 0, 1, total))
+        if factors[:2] != (1, 1):
+            places = rows * factors[1] + columns
+    slopes = jnp.where(hit.object == number, light, 0)[:, None] * shares
+    if channels == 1:
+        slopes = slopes / 3 if factors[2] == 3 else jnp.mean(slopes, axis=0, keepdims=True)
+    return slopes, places
 
 
 def _each(still: View, count: int) -> View:
@@ -321,22 +390,20 @@ def _product(
     parts = mesh.devices.size * math.ceil(chunks / (mesh.devices.size * _TOGETHER))
 
     def in_parts(values: jax.Array) -> jax.Array:
-        values = jnp.pad(values, ((0, -chunks % parts), *((0, 0) for _ in values.shape[1:])))
-        values = jnp.moveaxis(values.reshape(parts, -1, *values.shape[1:]), 1, -2)
-        return values.reshape(*values.shape[:-2], -1)
+        padded = jnp.pad(values, ((0, -chunks % parts), *((0, 0) for _ in values.shape[1:]))) if chunks % parts else values
+        return padded.reshape(parts, -1, *values.shape[1:])
 
     def part(at_vertices: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         slopes, vertices = rows
-        total = jnp.zeros((channels, slopes.shape[-1]), slopes.dtype)
+        total = jnp.zeros((slopes.shape[0], channels, size), slopes.dtype)
         # Looked up a row of four at a time and used number by number: 262144 samples took 0.8 ms, and 2.9 ms transposed. A
         # number at a time it was 1.1 and 10 ms, with sums over the rows 11 and 3.9 ms.
         for vertex in range(3):
-            row = at_vertices.at[vertices[vertex]].get(mode="promise_in_bounds")
-            for number in range(row.shape[1]):
-                slope = slopes[:, vertex if number == 0 else 3 * vertex + number + 2]
-                total = total + slope * row[:, number][None]
+            row = at_vertices.at[vertices[:, vertex]].get(mode="promise_in_bounds")
+            for number in range(row.shape[-1]):
+                slope = slopes[:, :, vertex if number == 0 else 3 * vertex + number + 2]
+                total = total + slope * row[:, None, :, number]
         return total
 
     moved = map_over(mesh, part, at_vertices, (in_parts(slopes), in_parts(vertices)))
-    moved = jnp.moveaxis(moved.reshape(parts, channels, -1, size), 1, -1)
-    return moved.reshape(-1, size, channels)[:chunks]
+    return jnp.moveaxis(moved.reshape(-1, channels, size), 1, -1)[:chunks]

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import equinox as eqx
 
-from ..boundary.guiding import boundary_length
-from ..core.settings import Settings
-from ..core.types import Scalar
-from ..preparation.world import make_world, resolve_settings
-from ..scene.scene import Scene
-from ..scene.skirt import Skirt
-from ..xla.compilation import compiled
+from ...boundary.guiding import boundary_length
+from ...core.settings import Settings
+from ...core.types import Scalar
+from ...preparation.world import make_world, resolve_settings
+from ...scene.scene import Scene
+from ...scene.skirt import Skirt
+from ...xla.compilation import compiled
 from .linearise import can_be_linearised
 
 _SAMPLES = 4  # a pixel, at least

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .history import Stop
+from ..history import Stop
 
 FAR_FROM_ONE = 1.5  # by which factor chi2 may differ from 1
 _STRAYED = 2.0  # standard deviations of the prior, root mean square
@@ -110,17 +110,17 @@ class Findings(NamedTuple):
       unlike_noise: what is left although it is no noise, in words; None: nothing.
       channels: which channels are hardly more than one measurement, in words; None: none.
       help: what to try where the pictures are not explained.
-      strayed: root mean square of (heights - prior) / prior_std over the heights that are seen; None: no prior.
+      strayed: root mean square of (heights - prior) / std over the heights that are seen; None: no prior.
       seen: which heights the pictures show.
       mean_shown: whether pictures change as all heights move up together.
       noise_share: the least noise of a picture over its brightness.
       lights: how many directions light comes from, over all pictures.
       scaled: by what the noise was multiplied for the standard deviations; None: there are none.
       displaced: by how much boundaries may be, height units, and what that multiplies the deviations by; None: as `scaled`.
-      draws: asked for, made; None: none were asked for.
+      draws: asked for, made; (0, 0): none were asked for.
+      parts: the deviations of the mean height and of the heights about it; None: as `scaled`.
       unsure_noise: why the noise that was estimated may be too small, in words; None: it was given, or is sure.
       length: how the prior's correlation length does not fit, in words; None: it does.
-      normals: the scheme that the fit chose in place of the default one; None: none.
     """
 
     result: Stop
@@ -138,10 +138,10 @@ class Findings(NamedTuple):
     lights: int
     scaled: float | None
     displaced: tuple[float, float] | None
-    draws: tuple[int, int] | None
+    draws: tuple[int, int]
+    parts: tuple[float, float] | None
     unsure_noise: str | None
     length: str | None
-    normals: str | None
 
 
 def warnings(found: Findings) -> tuple[str, ...]:
@@ -172,7 +172,7 @@ def warnings(found: Findings) -> tuple[str, ...]:
         said.append(f"{'it stalled' if found.result is Stop.STALLED else 'it came no nearer'}: {found.help}")
     if strays:
         said.append(
-            f"the heights differ from the prior by {found.strayed:.2g} times prior_std, root mean square: either prior_std is "
+            f"the heights differ from the prior by {found.strayed:.2g} times its std, root mean square: either std is "
             "too small or the heights are wrong, as where the surface does not reflect as Matte does"
         )
     if found.length is not None and found.unlike_noise is None:
@@ -197,8 +197,8 @@ def warnings(found: Findings) -> tuple[str, ...]:
         )
     if found.strayed is None and found.noise_share > _NOISY and found.unlike_noise is None and found.scaled is None:
         said.append(
-            f"the noise is {found.noise_share:.0%} of the pictures' brightness, and no prior holds the heights: uncertainty=20 "
-            "says how far they may be off"
+            f"the noise is {found.noise_share:.0%} of the pictures' brightness, and no prior holds the heights: draws=20 says "
+            " how far they may be off"
         )
     if found.scaled is not None and found.scaled > 1.05:
         said.append(
@@ -211,12 +211,13 @@ def warnings(found: Findings) -> tuple[str, ...]:
             f"heights that make them were off by {found.displaced[0]:.2g}, and are {found.displaced[1]:.2g} times as large for "
             "it (variance component, Richardson and Welsh, Biometrics 51, 1429, 1995; see docs/concepts/recovery.md)"
         )
-    if found.normals is not None:
+    if found.parts is not None and found.parts[0] > found.parts[1]:
+        mean, shape = found.parts
         said.append(
-            f"normals at vertices are weighted as Settings(normals={found.normals!r}) says, which explains the pictures better "
-            "than the default, 'six': render the heights with these, or give the normals that you know to be right"
+            f"most of what is unsure of the heights they share: their mean ± {mean:.2g}, their shape ± {shape:.2g}; "
+            "Fit.samples has terrains from which slopes and volumes get deviations of their own"
         )
-    if found.draws is not None and found.draws[1] < found.draws[0]:
+    if found.draws[1] < found.draws[0]:
         said.append(
             f"interrupted after {found.draws[1]} of {found.draws[0]} samples of the standard deviations: they are less sure"
         )

@@ -1,0 +1,1 @@
+"""From unknown heights to pictures, and their derivatives."""

@@ -1,0 +1,271 @@
+"""The loss of a fit about some unknowns: pictures, residuals, and products with their derivative J.
+
+This is the only place that knows how J is kept: as `Linearised` pictures, or, where mirrors or a sun with a size make samples
+depend on more than one triangle, as a program that renders again for each product.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...rendering.render import render_each
+from ...scene.material import Matte
+from ...scene.scene import Scene
+from ...scene.texture import ImageTexture
+from ...xla.compilation import compiled
+from ...xla.devices import on_every_device
+from .linearise import Linearised, can_be_linearised, linearise_each, picture_each
+from .pictures import Group
+from .problem import Problem
+from .robust import soften
+from .surface import Basis, Unknowns
+from .view import moved
+
+Rows = list[Float[Array, "n h w c"]]
+"""A number for each value of each picture, group by group."""
+Surface = tuple[Float[Array, "my mx"], Unknowns]
+"""A number for each height of the padded surface, and the other unknowns, without `coefficients`."""
+_PROBES = 8  # of the pictures' curvature
+
+
+class Expansion(eqx.Module):
+    """A problem about some unknowns.
+
+    Attributes:
+      problem, unknowns: these.
+      linearised: the pictures of each group with their derivatives; None: there are none such, see `can_be_linearised`.
+    """
+
+    problem: Problem
+    unknowns: Unknowns
+    linearised: tuple[Linearised | None, ...]
+
+    @property
+    def heights(self) -> Float[Array, "ny nx"]:
+        return self.problem.basis.heights(self.unknowns.coefficients)
+
+    @property
+    def sampling(self) -> list[Float[np.ndarray, "n h w"] | None]:
+        """The error of each pixel's samples, radiance."""
+        return [None if known is None else np.asarray(known.sampling) for known in self.linearised]
+
+    def of(self, problem: Problem) -> "Expansion":
+        """The same pictures in a problem that differs in noise, priors or basis alone."""
+        return dataclasses.replace(self, problem=problem)
+
+    def pictures(self) -> Rows:
+        """As they would be measured."""
+        return _pictures(*on_every_device((self.unknowns, self.problem, self.linearised), self.problem.mesh))
+
+    def left(self) -> Rows:
+        """(picture - target) / noise."""
+        pairs = zip(self.problem.groups, self.pictures(), strict=True)
+        return [group.weights * (image - group.targets) for group, image in pairs]
+
+    def push(self, change: Surface) -> Rows:
+        """J times a change of the surface and of the other unknowns: by what the pictures change, in units of the noise."""
+        return _push(*on_every_device((self, change), self.problem.mesh))
+
+    def pull(self, rows: Rows) -> Surface:
+        """Jᵀ times a number for each value of the pictures."""
+        return _pull(*on_every_device((self, rows), self.problem.mesh))
+
+    def random_gradients(self) -> tuple[Float[np.ndarray, "k ny nx"], list[Any]]:
+        """The derivatives in each height, and in the other unknowns, of sums of residuals with random normal factors, of a few
+        such sums.
+
+        They are exactly zero for a height on which no picture depends, as its column of J is zero; for another height they are
+        zero with probability zero. Their covariance over the factors is JᵀJ.
+        """
+        found, of_others = [], []
+        for seed in range(_PROBES):
+            rng = np.random.default_rng(seed)
+            rows = [rng.standard_normal(group.targets.shape, np.float32) for group in self.problem.groups]
+            gradient, others = self.pull([jnp.asarray(row, self.unknowns.coefficients.dtype) for row in rows])
+            found.append(self.problem.basis.crop(np.asarray(gradient, np.float64)))
+            of_others.append(jax.tree.map(np.asarray, others))
+        return np.stack(found), of_others
+
+
+def expand(unknowns: Unknowns, problem: Problem) -> Expansion:
+    """The problem about these unknowns: its pictures are rendered here, by one program."""
+    # What enters a compiled program must lie in the same places each time, or it is compiled again for the other ones.
+    unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
+    heights = _heights(unknowns, problem.basis)
+    still = unknowns.without_modes()
+    return Expansion(problem, unknowns, _linearised(heights, still, problem))
+
+
+def place_of(unknowns: Unknowns, problem: Problem) -> list[np.ndarray]:
+    """All on which pictures depend: the heights, whatever modes they are made of, and the other unknowns."""
+    others = unknowns.without_modes()
+    return [np.asarray(_heights(unknowns, problem.basis)), *map(np.asarray, jax.tree.leaves(others))]
+
+
+def residuals(unknowns: Unknowns, about: tuple[Problem, tuple[Linearised | None, ...]]) -> tuple[Any, None]:
+    """All residuals, whose half squares add up to the loss; the second value is optimistix's auxiliary output.
+
+    Those of the pictures pass through `soften`, so that a solver that accepts steps by the loss needs to know nothing of
+    reweighting. (Steps by reweighted least squares left the terrain's border in a wrong place: far outliers pull.)
+    """
+    problem, linearised = about
+    images = _simulate(unknowns, problem, linearised, problem.basis.heights(unknowns.coefficients))
+    pairs = zip(problem.groups, images, strict=True)
+    parts = [soften(group.weights * (image - group.targets), problem.loss_scale) for group, image in pairs]
+    return (parts, prior_residuals(unknowns, problem)), None
+
+
+def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
+    """How far the unknowns are from what is known of them without the pictures, in standard deviations."""
+    basis, terms = problem.basis, problem.terms
+    parts = [terms.surface.of_surface(unknowns.coefficients, basis)]
+    return [*parts, *(term.residual(values) for term, values in terms.others(unknowns))]
+
+
+@eqx.filter_jit
+def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
+    """The heights with their padding, from one program, so that they can be compared bit for bit."""
+    return basis.surface(unknowns.coefficients)
+
+
+@eqx.filter_jit
+def _heights(unknowns: Unknowns, basis: Basis) -> Float[Array, "ny nx"]:
+    return basis.heights(unknowns.coefficients)
+
+
+@functools.partial(compiled, jit=eqx.filter_jit)
+def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
+    still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), unknowns.view)
+
+    def of(group: Group) -> Linearised | None:
+        if not can_be_linearised(group.scenes, problem.settings):
+            return None
+        return linearise_each(
+            views(unknowns, problem, group),
+            completion(unknowns, group, heights),
+            problem.settings,
+            problem.mesh,
+            group.targets.shape[-1],
+            still,
+            unknowns.albedo,
+        )
+
+    return on_every_device(tuple(map(of, problem.groups)), problem.mesh)
+
+
+@eqx.filter_jit
+def _pictures(unknowns: Unknowns, problem: Problem, linearised: tuple[Linearised | None, ...]) -> Rows:
+    return _simulate(unknowns, problem, linearised, problem.basis.heights(unknowns.coefficients))
+
+
+def _by_surface(expansion: Expansion) -> tuple[Callable[[Float[Array, "my mx"], Unknowns], Rows], Surface]:
+    """Pictures in units of the noise as a function of the surface and the other unknowns, and these."""
+    problem, unknowns = expansion.problem, expansion.unknowns
+    others = unknowns.without_modes()
+
+    def pictures(surface: Float[Array, "my mx"], others: Unknowns) -> Rows:
+        images = _simulate(others, problem, expansion.linearised, problem.basis.crop(surface))
+        return [group.weights * image for group, image in zip(problem.groups, images, strict=True)]
+
+    return pictures, (problem.basis.surface(unknowns.coefficients), others)
+
+
+@eqx.filter_jit
+def _push(expansion: Expansion, change: Surface) -> Rows:
+    pictures, here = _by_surface(expansion)
+    return jax.jvp(pictures, here, change)[1]
+
+
+@eqx.filter_jit
+def _pull(expansion: Expansion, rows: Rows) -> Surface:
+    pictures, here = _by_surface(expansion)
+    return jax.vjp(pictures, *here)[1](rows)
+
+
+def _simulate(
+    unknowns: Unknowns,
+    problem: Problem,
+    linearised: Sequence[Linearised | None],
+    heights: Float[Array, "ny nx"],
+) -> Rows:
+    """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
+    images = []
+    for group, known in zip(problem.groups, linearised, strict=True):
+        change, scenes = completion(unknowns, group, heights), views(unknowns, problem, group)
+        if known is not None:
+            image = picture_each(known, scenes, change, problem.settings, problem.mesh, unknowns.albedo)
+        else:
+            image = render_each(scenes, change, problem.settings, problem.mesh)
+            if group.targets.shape[-1] == 1:
+                image = jnp.mean(image, axis=-1, keepdims=True)
+        if unknowns.exposures is not None:
+            image = image * _each(unknowns.exposures, group)
+        if unknowns.offsets is not None:
+            image = image + problem.bright * _each(unknowns.offsets, group)
+        images.append(image)
+    return images
+
+
+def _each(values: Float[Array, " pictures"], group: Group) -> Float[Array, "n 1 1 1"]:
+    return jnp.stack([values[k] for k in group.indices]).reshape(-1, 1, 1, 1)
+
+
+def views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
+    """`group.scenes` under the lights and from the cameras that are sought."""
+    given, found = (group.scenes.lights, group.scenes.camera), []
+    if not jax.tree.leaves(unknowns.view):
+        return group.scenes
+    for n, k in enumerate(group.indices):
+        lights, camera = jax.tree.map(lambda leaf, n=n: leaf[n], given)
+        by = jax.tree.map(lambda values, unit, k=k: values[k] * unit, unknowns.view, problem.view_unit)
+        found.append(moved(lights, camera, by))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, stacked)
+
+
+def completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
+    """Makes the scene of one picture from its own leaves, those that the group shares, these heights and the unknowns."""
+
+    def complete(scene: Scene) -> Scene:
+        scene = group.complete(scene, heights)
+        return scene if unknowns.albedo is None else _with_albedo(scene, unknowns.albedo)
+
+    return complete
+
+
+def _with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
+    """The scene with the albedo of its first heightfield multiplied."""
+    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
+    material = scene.objects[k].material
+    assert isinstance(material, Matte)
+    old = material.albedo
+    texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.asarray(old).reshape(1, 1, 3))
+    shape = (*(max(pair) for pair in zip(texture.texels.shape[:2], factor.shape[:2], strict=True)), 3)
+    new = jnp.broadcast_to(texture.texels, shape) * jnp.broadcast_to(factor, shape)
+    albedo = new.reshape(3) if shape[:2] == (1, 1) and texture is not old else dataclasses.replace(texture, texels=new)
+    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
+
+
+def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:
+    """The scenes as they were given, with all that was found; positions keep double precision."""
+    heights, found = _heights(unknowns, problem.basis), list(scenes)
+    for group in problem.groups:
+        new, old = ((part.lights, part.camera) for part in (views(unknowns, problem, group), group.scenes))
+        change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)
+        for n, k in enumerate(group.indices):
+            scene = scenes[k].with_heights(heights)
+            if unknowns.albedo is not None:
+                scene = _with_albedo(scene, unknowns.albedo)
+            if jax.tree.leaves(unknowns.view):
+                given = scene.lights, scene.camera
+                lights, camera = jax.tree.map(lambda leaf, more, n=n: np.asarray(leaf) + more[n], given, change)
+                scene = scene.with_lights(lights).with_camera(camera)
+            found[k] = scene
+    return tuple(found)

@@ -1,0 +1,141 @@
+"""The normal matrix H = JᵀJ of all residuals about some unknowns, and random draws from N(0, H⁻¹)."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+import scipy.fft
+import scipy.sparse.linalg
+from jaxtyping import Float
+
+from .expansion import Expansion
+
+linalg: Any = scipy.sparse.linalg  # whose stubs miss much
+fft: Any = scipy.fft
+Flat = Float[np.ndarray, " n"]
+_MOST_ITERATIONS = 300
+
+
+class Noise(NamedTuple):
+    """Independent N(0, 1) for all residuals: of the pictures, of the modes of the surface's prior, and of the other priors."""
+
+    pictures: Float[np.ndarray, " rows"]
+    modes: Float[np.ndarray, "my mx"]
+    others: Float[np.ndarray, " k"]
+
+
+class NormalMatrix:
+    """H as products with it, those of J by JAX, all else on the host and in double precision.
+
+    Vectors are flat: the heights of the padded surface, and then the other unknowns' numbers.
+
+    Args:
+      expansion: all of whose modes are varied.
+      roots: of the weights of the pictures' residuals, flat as `in_row`.
+      inverse: times which vectors are about H⁻¹ times them; None: by the modes' units, in which H is about the unit matrix.
+    """
+
+    def __init__(self, expansion: Expansion, roots: Float[np.ndarray, " rows"], inverse: Callable[[Flat], Flat] | None = None):
+        self.expansion, self.roots, self.inverse = expansion, roots, inverse or self._by_modes
+        problem, unknowns = expansion.problem, expansion.unknowns
+        self.shape, self.dtype = problem.basis.base.shape, unknowns.coefficients.dtype
+        term = problem.terms.surface
+        self.weight, self.spectrum = (np.asarray(values, np.float64) for values in (term.weight, term.spectrum))
+        self.free = 1.0 if problem.basis.free is None else np.asarray(problem.basis.free, np.float64)
+        self.off = np.asarray(problem.basis.base, np.float64) - np.asarray(term.mean, np.float64)
+        others, self.unflat = jax.flatten_util.ravel_pytree(unknowns.without_modes())
+        terms = problem.terms.others(unknowns)
+        self.others_weight = _joined([np.broadcast_to(np.asarray(term.weight), values.shape) for term, values in terms])
+        self.others_off = _joined([np.asarray(term.residual(values)) for term, values in terms])
+        self.size = int(np.prod(self.shape)) + others.size
+
+    def product(self, x: Flat) -> Flat:
+        """H x."""
+        surface, others = self._split(x)
+        result = self._pulled(self.seen(x) * self.roots)
+        result[: surface.size] += self._prior_pull(self._prior_push(surface)).ravel()
+        result[surface.size :] += self.others_weight**2 * others
+        return result
+
+    def seen(self, x: Flat) -> Float[np.ndarray, " rows"]:
+        """J x: the change of the pictures, in units of the noise, times the roots."""
+        surface, others = self._split(x)
+        change = jnp.asarray(self.free * surface, self.dtype), self.unflat(jnp.asarray(others, self.dtype))
+        return in_row(self.expansion.push(change)) * self.roots
+
+    def _pulled(self, rows: Float[np.ndarray, " rows"]) -> Flat:
+        surface, others = self.expansion.pull(in_groups(rows.astype(self.dtype), self.expansion))
+        others = np.asarray(jax.flatten_util.ravel_pytree(others)[0], np.float64)
+        return np.concatenate([(self.free * np.asarray(surface, np.float64)).ravel(), others])
+
+    def solved(self, right: Flat, tolerance: float) -> Flat:
+        """H⁻¹ times `right` by conjugate gradients."""
+        n = self.size
+        product, near = (linalg.LinearOperator((n, n), f, dtype=np.float64) for f in (self.product, self.inverse))
+        return linalg.cg(product, right, rtol=tolerance, maxiter=_MOST_ITERATIONS, M=near)[0]
+
+    def gradient(self, pictures: Float[np.ndarray, " rows"]) -> Flat:
+        """Of half the squares of all residuals: those of the pictures are given, times the roots, those of the priors known."""
+        return self.gathered(Noise(pictures, self._prior_push(self.off), self.others_off))
+
+    def gathered(self, residuals: Noise) -> Flat:
+        """Jᵀ times a number for each residual."""
+        result = self._pulled(residuals.pictures * self.roots)
+        result[: residuals.modes.size] += self._prior_pull(residuals.modes).ravel()
+        result[residuals.modes.size :] += self.others_weight * residuals.others
+        return result
+
+    def drawn(self, seed: int, widths: float | Float[np.ndarray, "my mx"] = 1.0) -> Noise:
+        """Noise whose modes of the surface's prior are `widths` times as large."""
+        rng = np.random.default_rng(seed)
+        return Noise(
+            rng.standard_normal(self.roots.size),
+            rng.standard_normal(self.shape) * widths,
+            rng.standard_normal(self.others_weight.size),
+        )
+
+    def modes_of(self, x: Flat) -> Float[np.ndarray, "my mx"]:
+        """The modes of the surface's prior by which it moves, in units of their deviations."""
+        return self._prior_push(self._split(x)[0])
+
+    def modes_before(self) -> Float[np.ndarray, "my mx"]:
+        """By which the surface differs from its prior."""
+        return self._prior_push(self.off)
+
+    def heights_of(self, x: Flat) -> Float[np.ndarray, "ny nx"]:
+        """The change of the heights, without their padding."""
+        return self.expansion.problem.basis.crop(self.free * self._split(x)[0])
+
+    def _split(self, x: Flat) -> tuple[Float[np.ndarray, "my mx"], Float[np.ndarray, " k"]]:
+        count = int(np.prod(self.shape))
+        return x[:count].reshape(self.shape), x[count:]
+
+    def _prior_push(self, surface: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "my mx"]:
+        return self.spectrum * fft.dctn(self.weight * surface, norm="ortho")
+
+    def _prior_pull(self, modes: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "my mx"]:
+        return self.weight * fft.idctn(self.spectrum * modes, norm="ortho")
+
+    def _by_modes(self, x: Flat) -> Flat:
+        surface, others = self._split(x)
+        squares = np.asarray(self.expansion.problem.basis.scale, np.float64) ** 2
+        return np.concatenate([fft.idctn(squares * fft.dctn(surface, norm="ortho"), norm="ortho").ravel(), others])
+
+
+def _joined(parts: list[Any]) -> Float[np.ndarray, " k"]:
+    return np.concatenate([np.zeros(0), *(np.asarray(part, np.float64).ravel() for part in parts)])
+
+
+def in_row(rows: Sequence[Any]) -> Float[np.ndarray, " rows"]:
+    """All values of all pictures, one after the other."""
+    return np.concatenate([np.asarray(part, np.float64).ravel() for part in rows])
+
+
+def in_groups(row: np.ndarray, expansion: Expansion) -> list[Any]:
+    """The inverse of `in_row`."""
+    shapes = [group.targets.shape for group in expansion.problem.groups]
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
+    return [jnp.asarray(part.reshape(shape)) for part, shape in zip(np.split(row, ends), shapes, strict=True)]

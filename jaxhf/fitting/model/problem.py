@@ -1,0 +1,255 @@
+"""What a fit minimises, but for the unknowns: pictures with their noise, priors, and how to render."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jaxtyping import Array, Float
+
+from ...core.errors import ArgumentError
+from ...core.precision import numbers
+from ...core.settings import Settings
+from ...scene.heightfield import Heightfield
+from ...scene.light import Sky
+from ...scene.material import Matte
+from ...scene.scene import Scene
+from ...scene.texture import ImageTexture
+from ...xla.devices import chosen_mesh
+from ..given import Given, Unknown
+from .defaults import choose_edge_samples, choose_samples
+from .pictures import Group, make_groups, require_scenes
+from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units
+from .terms import Terms, make_terms
+from .view import View, sun
+
+LOSS_SCALE = 3.0  # standard deviations from which on the robust loss makes less of a residual, in the end
+_FIRST_NOISE = 0.01  # of a picture's brightness, where none is given
+_DARK = 0.03  # of a picture's brightness: what lies in shadow
+_DARK_SHARE = 0.003  # of its pixels
+_LEAST_NOISE = 5e-4  # of it: about the rounding of a picture with 8 bits
+
+
+class Problem(eqx.Module):
+    """All that the loss depends on beside the unknowns; nothing of it changes but by making another one.
+
+    Attributes:
+      groups: the pictures.
+      basis: from DCT coefficients to heights; another for each stage.
+      terms: the priors.
+      loss_scale: the size, in standard deviations, above which a residual counts less; changes with the stage.
+      noise: standard deviation of each picture's values at weight 1, by which the groups' weights are divided.
+      brightness: of each picture, the value that 1 % of it exceeds.
+      bright: the unit of `Unknowns.offsets`, radiance.
+      view_unit: of the numbers of `Unknowns.view`, radians and world units, shapes (2,) and (6,).
+      settings: how to render.
+      mesh: the devices that share the work.
+      field: the heightfield that is sought, for its size and spacing.
+      albedo_shape: of `Unknowns.albedo`.
+      known: whether its heights have a prior of the user's.
+    """
+
+    groups: tuple[Group, ...]
+    basis: Basis
+    terms: Terms
+    loss_scale: Float[Array, ""]
+    noise: Float[np.ndarray, " pictures"]
+    brightness: Float[np.ndarray, " pictures"]
+    bright: Float[Array, ""]
+    view_unit: View
+    field: Heightfield
+    albedo_shape: tuple[int, ...] | None = eqx.field(static=True)
+    settings: Settings = eqx.field(static=True)
+    mesh: Mesh = eqx.field(static=True)
+    known: bool = eqx.field(static=True)
+
+    @property
+    def least_noise(self) -> Float[np.ndarray, " pictures"]:
+        """Below which no estimate of the noise may fall."""
+        return _LEAST_NOISE * self.brightness
+
+    @property
+    def count(self) -> int:
+        """How many pictures there are."""
+        return sum(len(group.indices) for group in self.groups)
+
+    @property
+    def values(self) -> int:
+        """How many values of pictures count."""
+        return sum(int(np.count_nonzero(np.asarray(group.given))) for group in self.groups)
+
+    def edge_samples_for(self, heights: Float[Array, "ny nx"], settings: Settings) -> int:
+        """As many points on edges as pictures of these heights call for, if the user's settings leave that open.
+
+        Where there were some, others are taken only if it calls for four times as many: all is then compiled again.
+        """
+        before = self.settings.edge_samples
+        if settings.edge_samples is not None:
+            return settings.edge_samples
+        views = [
+            group.complete(jax.tree.map(lambda leaf, k=k: np.asarray(leaf)[k], group.scenes), heights)
+            for group in self.groups
+            for k in range(len(group.indices))
+        ]
+        dark = self.settings.shadows and any(_shadows_in(group) for group in self.groups)
+        count = choose_edge_samples(views, self.settings, dark)
+        return before if before and count < 4 * before else count
+
+    def with_edge_samples(self, count: int) -> "Problem":
+        return dataclasses.replace(self, settings=dataclasses.replace(self.settings, edge_samples=count))
+
+    def with_noise(
+        self, noise: Float[np.ndarray, " pictures"], sampling: Sequence[Float[np.ndarray, "n h w"] | None] | None = None
+    ) -> "Problem":
+        """The same problem with another standard deviation of each picture's values at weight 1.
+
+        To it comes the error of the pictures' samples, of each group; None: it is not known, and does not count.
+        """
+        groups = []
+        for number, group in enumerate(self.groups):
+            # By NumPy: each operation of JAX's would be a program to compile.
+            given = np.asarray(group.given)
+            variance = noise[list(group.indices)].astype(given.dtype).reshape(-1, 1, 1, 1) ** 2
+            variance = variance / np.where(given > 0, given, 1) ** 2
+            if sampling is not None and sampling[number] is not None:
+                variance = variance + np.asarray(sampling[number])[..., None] ** 2
+            weights = np.where(given > 0, 1 / np.sqrt(variance), 0)
+            groups.append(dataclasses.replace(group, weights=jnp.asarray(weights, given.dtype)))
+        return dataclasses.replace(self, groups=tuple(groups), noise=noise)
+
+
+def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) -> tuple[Problem, Unknowns]:
+    """The problem, and the unknowns from which a fit starts.
+
+    Raises:
+      ValueError: scenes, targets and arguments do not belong together.
+    """
+    require_scenes(scenes, targets)
+    first = scenes[0]
+    field, dtype = first.heightfields[0], first.heights.dtype
+    length = None if given.prior is None else given.prior.length
+    start = _without_holes(np.asarray(first.heights)) if given.start is None else given.start
+    heights = make_heights("fit", "start", start, field)
+    free = None
+    if given.prior is not None and not np.asarray(numbers(given.prior.std)).all():
+        held = np.broadcast_to(np.asarray(numbers(given.prior.std)) == 0, heights.shape)
+        heights = np.where(held, make_heights("Prior", "heights", given.prior.heights, field), heights)
+        free = pad((~held).astype(np.float64), padding(field, length))
+    base = pad(heights, padding(field, length))
+    basis = make_basis(field, base, slope_units(base.shape, field.dx, field.dy)[0], free=free)
+    settings = choose_samples(scenes, given.settings)
+    brightness, view_unit = _brightness(targets), _view_unit(scenes, given.unknown)
+    terms = make_terms(field, given.prior, given.unknown, base, free, view_unit)
+    groups = make_groups(scenes, targets, given.weights, settings)
+    problem = Problem(
+        groups=groups,
+        basis=basis,
+        terms=terms,
+        loss_scale=jnp.asarray(LOSS_SCALE, dtype),
+        noise=np.ones(len(scenes)),
+        brightness=brightness,
+        bright=jnp.asarray(np.median(brightness), dtype),
+        view_unit=view_unit,
+        field=field,
+        albedo_shape=None,
+        settings=settings,
+        mesh=chosen_mesh("fit", given.mesh),
+        known=given.prior is not None,
+    ).with_noise(_noise(given.noise, brightness))
+    unknowns = _first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), given.unknown)
+    if unknowns.albedo is not None:
+        problem = dataclasses.replace(problem, albedo_shape=unknowns.albedo.shape)
+    return problem.with_edge_samples(problem.edge_samples_for(jnp.asarray(heights, dtype), given.settings)), unknowns
+
+
+def _view_unit(scenes: Sequence[Scene], unknown: Unknown) -> View:
+    """The units of what is sought of lights and cameras; ArgumentError where there is no such light, or the camera may be
+    farther off than the terrain is long, as by a deviation in another unit.
+
+    A radian, and for cameras a quarter of the terrain: so they change pictures about as much as modes of one slope do. In units
+    of deviations of 1 degree a light's columns of J were 20 to 40 times smaller, and a fit of 15 steps took 58 and stopped
+    short.
+    """
+    field, light, camera = scenes[0].heightfields[0], None, None
+    dtype = field.heights.dtype
+    if unknown.light_std is not None:
+        for k, scene in enumerate(scenes):
+            if sun(scene.lights) is None:
+                raise ArgumentError("Unknown", "light_std", f"must stand with Directional lights, scenes[{k}] has none")
+        light = jnp.ones(2, dtype)
+    if unknown.camera_std is not None:
+        side = max((n - 1) * d for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True))
+        position = unknown.camera_std[0]
+        if position > side:
+            rule = (
+                f"must have a position that is off by at most the terrain's longer side, {side:.6g}; it is {position:.6g}, or "
+                f"{position / min(field.dx, field.dy):.3g} cells. It is in the unit of dx and dy"
+            )
+            raise ArgumentError("Unknown", "camera_std", rule)
+        camera = jnp.asarray([side / 4] * 3 + [1 / 4] * 3, dtype)
+    return View(light, camera)
+
+
+def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
+    """The first scene's heights, where a fit is to begin with them."""
+    holes = np.argwhere(~np.isfinite(heights))
+    if len(holes):
+        iy, ix = holes[0]
+        raise ArgumentError(
+            "fit",
+            "scenes[0]",
+            f": the heights must have no holes where there is no start, row {iy} column {ix} is "
+            f"{heights[iy, ix]}; fill them, or give a start without holes",
+        )
+    return heights
+
+
+def _shadows_in(group: Group) -> bool:
+    """Whether pictures without a sky have dark places."""
+    if any(isinstance(light, Sky) for light in group.scenes.lights):
+        return False
+    targets, counts = np.asarray(group.targets), np.asarray(group.given) > 0
+    shares = [np.mean(t[c] < _DARK * np.percentile(t[c], 99)) for t, c in zip(targets, counts, strict=True)]
+    return bool(max(shares) > _DARK_SHARE)
+
+
+def _noise(given: Any, brightness: Float[np.ndarray, " pictures"]) -> Float[np.ndarray, " pictures"]:
+    """The standard deviation of each picture's values; where none is given, one from which an estimate begins."""
+    if given is None:
+        return _FIRST_NOISE * brightness
+    noise = np.asarray(numbers(given), np.float64)
+    if noise.shape not in ((), brightness.shape) or not (np.isfinite(noise) & (noise > 0)).all():
+        raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {given!r}")
+    return np.broadcast_to(noise, brightness.shape).copy()
+
+
+def _brightness(targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
+    """Of each picture, the value that 1 % of it exceeds; 1 for a black one."""
+    bright = [np.nanpercentile(np.asarray(target, np.float64), 99) for target in targets]
+    return np.where(np.asarray(bright) > 0, bright, 1.0)
+
+
+def _first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, unknown: Unknown) -> Unknowns:
+    """Those from which a fit starts: coefficients 0, the albedo, lights and cameras of the scenes, exposure 1 and offset 0."""
+    shape, dtype, albedo = scene.heights.shape, scene.heights.dtype, None
+    if unknown.albedo is not None:
+        material = next(obj.material for obj in scene.objects if obj.shape is scene.heightfields[0])
+        if not isinstance(material, Matte):
+            rule = f"is sought, so the heightfield's material must be Matte, it is {type(material).__name__}"
+            raise ArgumentError("Unknown", "albedo", rule)
+        image = material.albedo.texels.shape[:2] if isinstance(material.albedo, ImageTexture) else shape
+        albedo = jnp.ones((*(image if unknown.albedo == "map" else (1, 1)), channels), dtype)
+    return Unknowns(
+        jnp.zeros_like(basis.base),
+        albedo,
+        jnp.ones(count, dtype) if unknown.exposures else None,
+        jnp.zeros(count, dtype) if unknown.offsets else None,
+        View(
+            None if unknown.light_std is None else jnp.zeros((count, 2), dtype),
+            None if unknown.camera_std is None else jnp.zeros((count, 6), dtype),
+        ),
+    )

@@ -1,0 +1,149 @@
+"""What is known of the unknowns without the pictures: Gaussian priors."""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...core.errors import ArgumentError
+from ...core.precision import numbers
+from ...scene.heightfield import Heightfield
+from ..given import Prior, Unknown
+from .surface import Basis, Unknowns, dct_matrix, make_heights, pad, padding, slope_units
+from .view import View
+
+
+class Term(eqx.Module):
+    """A Gaussian prior of some numbers: weight · (them - mean) is N(0, 1), or of a surface `spectrum` times the DCT of that.
+
+    Attributes:
+      mean: what they are expected to be.
+      weight: 1 / their standard deviation. Where errors are correlated: 1 / the standard deviation that is left when each DCT
+        coefficient of the errors is divided by its amplitude. 0 where they are held.
+      spectrum: of a surface's prior, 1 / the amplitude of each DCT coefficient of the errors over their deviation, shape
+        (my, mx).
+    """
+
+    mean: Float[Array, "..."]
+    weight: Float[Array, "..."]
+    spectrum: Float[Array, "my mx"] | Float[Array, ""]
+
+    def residual(self, values: Float[Array, "..."]) -> Float[Array, "..."]:
+        """How far these numbers are from what is expected, in standard deviations."""
+        return self.weight * (values - self.mean)
+
+    def of_surface(self, coefficients: Float[Array, "my mx"], basis: Basis) -> Float[Array, "my mx"]:
+        """The residuals of a surface by its modes."""
+        if self.weight.ndim == 0 and basis.free is None:  # then nothing is to be transformed again for each product
+            modes = basis.analysis(basis.base - self.mean) + basis.scale * coefficients
+            return self.spectrum * (self.weight * modes)
+        return self.spectrum * basis.analysis(self.weight * (basis.surface(coefficients) - self.mean))
+
+
+class Terms(eqx.Module):
+    """A `Term` for each of the `Unknowns`; None for what is known."""
+
+    surface: Term
+    albedo: Term | None
+    exposures: Term | None
+    offsets: Term | None
+    light: Term | None
+    camera: Term | None
+
+    def others(self, unknowns: Unknowns) -> list[tuple[Term, Float[Array, "..."]]]:
+        """Those of what is sought besides the surface, each with its numbers."""
+        view = unknowns.view
+        pairs = (
+            (self.albedo, unknowns.albedo),
+            (self.exposures, unknowns.exposures),
+            (self.offsets, unknowns.offsets),
+            (self.light, view.light),
+            (self.camera, view.camera),
+        )
+        return [(term, values) for term, values in pairs if term is not None and values is not None]
+
+
+def make_terms(
+    field: Heightfield,
+    prior: Prior | None,
+    unknown: Unknown,
+    start: Float[np.ndarray, "my mx"],
+    free: Float[np.ndarray, "my mx"] | None,
+    view_unit: View,
+) -> Terms:
+    """The priors of a fit from `start`, which is padded; `free` is that of `Basis`, `view_unit` that of `Problem`.
+
+    Factors have their mean 1, offsets 0, and what else is not told the deviation 1.
+    """
+    dtype = field.heights.dtype
+    one, none = jnp.ones((), dtype), jnp.zeros((), dtype)
+
+    def term(mean: Array, weight: Array) -> Term:
+        return Term(mean, weight, one)
+
+    surface = _shape_term(field, start) if prior is None else _prior_term(field, prior)
+    if free is not None:
+        surface = eqx.tree_at(lambda term: term.weight, surface, surface.weight * jnp.asarray(free, dtype))
+    light = camera = None
+    if view_unit.light is not None and unknown.light_std is not None:
+        light = term(none, (view_unit.light / math.radians(unknown.light_std))[None])
+    if view_unit.camera is not None and unknown.camera_std is not None:
+        position, rotation = unknown.camera_std
+        camera = term(none, (view_unit.camera / np.array([position] * 3 + [math.radians(rotation)] * 3, dtype))[None])
+    return Terms(
+        surface,
+        None if unknown.albedo is None else term(one, one / unknown.albedo_std),
+        term(one, one) if unknown.exposures else None,
+        term(none, one) if unknown.offsets else None,
+        light,
+        camera,
+    )
+
+
+def _shape_term(field: Heightfield, start: Float[np.ndarray, "my mx"]) -> Term:
+    """Where nothing is known: modes about the start whose amplitudes fall as 1 / frequency², the longest a quarter of the
+    terrain high. A mode that no picture shows, such as the mean of all heights, then has a large deviation, not an infinite
+    one."""
+    units, frequency = slope_units(start.shape, field.dx, field.dy)
+    dtype = field.heights.dtype
+    return Term(jnp.asarray(start, dtype), jnp.ones((), dtype), jnp.asarray((1 + frequency) / units, dtype))
+
+
+def _prior_term(field: Heightfield, prior: Prior) -> Term:
+    shape, dtype = field.heights.shape, field.heights.dtype
+    std = np.asarray(numbers(prior.std), np.float64)
+    if std.shape not in ((), shape):
+        raise ArgumentError("Prior", "std", f"must be a number or of shape {shape}, as the heights; its shape is {std.shape}")
+    if prior.length is not None:
+        _require_plausible(field, prior.length)
+    border = padding(field, prior.length)
+    mean = pad(make_heights("Prior", "heights", prior.heights, field), border)
+    with np.errstate(divide="ignore"):
+        weight = np.where(std > 0, 1 / std, 0)
+    spectrum = np.ones(mean.shape)
+    if prior.length is not None:
+        spectrum = _whittle(field, mean.shape, prior.length)
+        rows, columns = (dct_matrix(n) ** 2 for n in mean.shape)
+        weight = pad(np.broadcast_to(weight, shape), border) * np.sqrt(rows.T @ spectrum**-2 @ columns)
+    return Term(*(jnp.asarray(values, dtype) for values in (mean, weight, spectrum)))
+
+
+def _require_plausible(field: Heightfield, length: float) -> None:
+    """Refuses a correlation length that no terrain of this size and spacing can show, such as one in cells."""
+    cell = min(field.dx, field.dy)
+    side = max((n - 1) * d for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True))
+    if not cell * (1 - 1e-6) <= length <= side * (1 + 1e-6):
+        raise ArgumentError(
+            "Prior",
+            "length",
+            f"must lie from one cell to the terrain's longer side, {cell:.6g} to {side:.6g}; it is {length:.6g}, or "
+            f"{length / cell:.3g} cells. It is in the unit of dx and dy: {length:.6g} cells would be {length * cell:.6g}",
+        )
+
+
+def _whittle(field: Heightfield, shape: tuple[int, ...], length: float) -> Float[np.ndarray, "my mx"]:
+    """1 - length² · Laplacian of each DCT mode, the Laplacian being that of second differences."""
+    steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, (field.dy, field.dx), strict=True)]
+    return 1 + length**2 * (steps[0][:, None] + steps[1][None, :])

@@ -1,0 +1,1 @@
+"""From a start to the heights that explain the pictures."""

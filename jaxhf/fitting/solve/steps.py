@@ -1,0 +1,188 @@
+"""Steps after Levenberg (1944) and Marquardt (1963) by optimistix, whose linear problems conjugate gradients solve."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from ...core.types import Flag, Scalar
+from ...xla.devices import on_every_device
+from ..model.expansion import Expansion, residuals
+from ..model.surface import Unknowns
+
+FIRST_DAMPING = 1e-2  # as a share of the loss's curvature along a mode
+_REJECTED = 0.1  # by which 1 / λ is multiplied at a rejected step, the first in a row
+_LEAST_GAIN = 0.01  # of what was predicted: a step that lowers the loss by less is rejected
+_GOOD = 0.75  # of it: after a step that lowers the loss by more, 1 / λ is multiplied by _HIGHER
+_HIGHER = 4.0
+
+
+class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
+    """The step argmin |J d + r|² + λ |d|², as far as it is needed: an inexact Newton method (Eisenstat and Walker, SIAM
+    Journal on Scientific Computing 17, 16, 1996).
+
+    The modes have balanced units, which is Jacobi's preconditioner; of the other unknowns it is divided by their curvature.
+
+    Attributes:
+      tolerance: of the gradient of the damped model, as a share of that at the beginning.
+      iterations: at most.
+      others: the curvature along the unknowns besides the modes, over that along these: what preconditions them.
+    """
+
+    tolerance: Float[Array, ""]
+    iterations: Int[Array, ""]
+    others: Any
+
+    def __init__(self, tolerance: float, iterations: int, others: Any):
+        self.tolerance, self.iterations, self.others = jnp.asarray(tolerance), jnp.asarray(iterations), others
+
+    def init(self, y: Unknowns, f_info_struct: Any) -> Any:
+        return jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if _is_shaped(leaf) else leaf, f_info_struct)
+
+    def query(self, y: Unknowns, f_info: Any, state: Any) -> Any:
+        return f_info
+
+    def step(self, step_size: Scalar, state: Any) -> Any:
+        push, residual = state.jac, state.residual
+        pull = jax.linear_transpose(push.mv, push.in_structure())
+
+        def product(change: Unknowns) -> Unknowns:
+            return jax.tree.map(lambda a, b: a + b / step_size, pull(push.mv(change))[0], change)
+
+        right = jax.tree.map(jnp.negative, pull(residual)[0])
+        tolerance: Any = self.tolerance.astype(step_size.dtype)
+
+        def inverse(x: Unknowns) -> Unknowns:
+            others = jax.tree.map(lambda value, curvature: value / curvature, x.without_modes(), self.others)
+            return eqx.tree_at(lambda u: u.coefficients, others, x.coefficients, is_leaf=lambda leaf: leaf is None)
+
+        found, _ = jax.scipy.sparse.linalg.cg(product, right, tol=tolerance, maxiter=self.iterations, M=inverse)
+        return found, optx.RESULTS.successful
+
+
+class LevenbergMarquardt(optx.AbstractGaussNewton):
+    """optimistix's own class but for the linear solver and the trust region.
+
+    Each rejection in a row raises λ by twice the factor of the one before (Nielsen, Damping parameter in Marquardt's method,
+    1999), and the step that is accepted after them does not lower it: else every second step is rejected.
+    """
+
+    rtol: float
+    atol: float
+    norm: Callable[..., Any]
+    descent: Any
+    search: Any
+    verbose: Callable[..., None]
+
+    def __init__(self, rejections: int, tolerance: float, iterations: int, others: Any):
+        self.rtol = self.atol = 0.0  # when a fit ends, `run` decides
+        self.norm = optx.rms_norm
+        self.descent = ConjugateGradients(tolerance, iterations, others)
+        self.search = optx.ClassicalTrustRegion(
+            high_cutoff=_GOOD,
+            low_cutoff=_LEAST_GAIN,
+            high_constant=jnp.asarray(_HIGHER if rejections == 0 else 1.0),
+            low_constant=jnp.asarray(_REJECTED / 2**rejections),
+        )
+        self.verbose = _silent
+
+
+def _is_shaped(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array | jax.ShapeDtypeStruct)
+
+
+def _silent(**_: Any) -> None:
+    pass
+
+
+class Outcome(NamedTuple):
+    """What one step did.
+
+    Attributes:
+      loss: half the sum of squared residuals at the unknowns.
+      accepted: whether these changed.
+      predicted: by how much the linear model of the next step lowers the loss.
+      step_size: 1 / λ of the next step.
+      change: of the heights, root mean square.
+    """
+
+    loss: Scalar
+    accepted: Flag
+    predicted: Scalar
+    step_size: Scalar
+    change: Scalar
+
+
+_OPTIONS: dict[str, Any] = {}
+_TAGS: frozenset[object] = frozenset()
+
+
+def first_position(expansion: Expansion) -> Any:
+    """optimistix's state of a fit before anything is evaluated.
+
+    Call it once for each size of a problem: a state also holds compiled functions, which compare by identity, so that a step
+    that is given the state of another call would be compiled again. `position_at` makes later ones.
+    """
+    return _first_position(on_every_device(expansion, expansion.problem.mesh))
+
+
+@eqx.filter_jit
+def _first_position(expansion: Expansion) -> Any:
+    others = expansion.unknowns.without_modes()
+    solver, about = LevenbergMarquardt(0, 0.0, 0, others), (expansion.problem, expansion.linearised)
+    shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, about)
+    state = solver.init(residuals, expansion.unknowns, about, _OPTIONS, shape, None, _TAGS)
+    size = jnp.ones((), expansion.unknowns.coefficients.dtype)
+    return on_every_device(_with_step_size(state, size), expansion.problem.mesh)
+
+
+def _with_step_size(position: Any, step_size: Float[Array, ""]) -> Any:
+    return eqx.tree_at(lambda state: state.search_state.step_size, position, step_size)
+
+
+def position_at(first: Any, unknowns: Unknowns, step_size: Float[Array, ""]) -> Any:
+    """optimistix's state at these unknowns, before anything is evaluated there; `first` is what `first_position` made.
+
+    The next step evaluates there, and always accepts: the state is then, to the bit, what it was after the step that reached
+    them, if 1 / λ is the same. So a checkpoint need not hold linearised pictures.
+    """
+    return _with_step_size(eqx.tree_at(lambda state: state.y_eval, first, unknowns), step_size)
+
+
+def advance(
+    unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int, tolerance: float, iterations: int
+) -> tuple[Unknowns, Any, Outcome]:
+    """One step: new unknowns, which are the old ones if the step is rejected, optimistix's new state, and what it did.
+
+    Args:
+      unknowns, position: of the step before.
+      expansion: at `position.y_eval`.
+      others: see `ConjugateGradients`.
+      rejections: how many steps before were rejected in a row.
+      tolerance, iterations: see `ConjugateGradients`.
+    """
+    solver = LevenbergMarquardt(rejections, tolerance, iterations, others)
+    return _advance(*on_every_device((solver, unknowns, position, expansion), expansion.problem.mesh))
+
+
+@eqx.filter_jit
+def _advance(
+    solver: LevenbergMarquardt, unknowns: Unknowns, position: Any, expansion: Expansion
+) -> tuple[Unknowns, Any, Outcome]:
+    problem = expansion.problem
+    with jax.numpy_dtype_promotion("standard"):
+        new, state, _ = solver.step(residuals, unknowns, (problem, expansion.linearised), _OPTIONS, position, _TAGS)
+    step = jax.tree.map(lambda to, here: to - here, state.y_eval, new)
+    moved = problem.basis.heights(new.coefficients) - problem.basis.heights(unknowns.coefficients)
+    outcome = Outcome(
+        loss=state.f_info.as_min(),
+        accepted=state.num_accepted_steps > position.num_accepted_steps,
+        predicted=-solver.search.predict_reduction(step, state.f_info),
+        step_size=state.search_state.step_size,
+        change=jnp.sqrt(jnp.mean(moved * moved)),
+    )
+    return on_every_device((new, state, outcome), problem.mesh)

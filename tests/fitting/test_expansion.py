@@ -1,0 +1,181 @@
+"""The pictures of a fit and products with their derivative J, against `jaxhf.render` of scenes that are made by hand."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_fits import SETTINGS, SIZE, TRUTH, expanded, given, rms, scenes
+
+import jaxhf
+from jaxhf.fitting.model.expansion import Expansion, expand
+from jaxhf.fitting.model.normal_matrix import in_row
+from jaxhf.fitting.model.problem import make_problem
+from jaxhf.fitting.model.surface import Unknowns
+from jaxhf.fitting.model.view import moved
+from jaxhf.fitting.trust.boundaries import _on_boundaries
+from jaxhf.fitting.trust.factors import pictures_by_heights
+
+PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])
+SUN, SKY = jaxhf.Directional((0.3, -0.4, 0.5)), jaxhf.Sky(0.1)
+LAMP = jaxhf.Point((0.1, 0.3, 0.9), (0.9, 0.8, 0.7))
+CAMERAS = [
+    jaxhf.Perspective.look_at(eye, (0.5, 0.5, 0.1), fov=50.0, width=width, height=22)
+    for eye, width in (((0.6, -0.8, 0.9), 37), ((-0.6, 0.3, 1.1), 30))
+]
+TEXELS = np.random.default_rng(1).uniform(0.2, 0.9, (3, 4, 3))
+EVERYTHING = jaxhf.Unknown(albedo="map", exposures=True, offsets=True, light_std=1.0, camera_std=(0.1, 1.0))
+ROUNDING = {"single": 2e-4, "double": 1e-10}  # of the largest value: sums of some hundred terms that are rounded
+
+
+def waves(ny: int, nx: int, height: float) -> np.ndarray:
+    y, x = np.mgrid[0:ny, 0:nx] / max(ny, nx)
+    return height * (np.sin(5 * x + 2 * y) + np.cos(3 * x - 6 * y + 1))
+
+
+def scene_of(k: int, crowded: bool) -> jaxhf.Scene:
+    """The sought terrain, turned and painted; if `crowded`, between a cylinder and another heightfield, which has a hole."""
+    painted = jaxhf.Matte(jaxhf.ImageTexture(TEXELS))
+    objects = [jaxhf.Object(jaxhf.Heightfield(waves(9, 8, 0.05), dx=0.09), painted, PLACE)]
+    if crowded:
+        holed = waves(12, 10, 0.08) - 0.3
+        holed[4, 3] = np.nan
+        tube = jaxhf.Object(jaxhf.Cylinder(radius=0.15, z_min=-0.3, z_max=0.3), painted)
+        objects = [tube, *objects, jaxhf.Object(jaxhf.Heightfield(holed), jaxhf.Matte((0.3, 0.5, 0.7)))]
+    return jaxhf.Scene(objects, CAMERAS[k], (SKY, SUN, LAMP) if crowded else (SKY, SUN))
+
+
+def moved_expansion(settings: jaxhf.Settings, channels: tuple[int, ...]) -> Expansion:
+    """Of pictures with so many channels each, about unknowns that have all moved."""
+    rng = np.random.default_rng(5)
+    targets = [rng.uniform(0.1, 0.3, (22, camera.width, c)) for camera, c in zip(CAMERAS, channels, strict=False)]
+    weights = [rng.uniform(0.5, 2.0, target.shape) for target in targets]
+    options = given(settings=settings, unknown=EVERYTHING, noise=0.01, weights=weights)
+    problem, unknowns = make_problem([scene_of(k, len(channels) > 1) for k in range(len(targets))], targets, options)
+    rng, leaves, tree = np.random.default_rng(7), *jax.tree.flatten(unknowns)
+    leaves = [leaf + jnp.asarray(0.02 * rng.standard_normal(leaf.shape), leaf.dtype) for leaf in leaves]
+    return expand(jax.tree.unflatten(tree, leaves), problem)
+
+
+def by_render(expansion: Expansion, surface: jax.Array, others: Unknowns) -> list[jax.Array]:
+    """The same pictures in units of the noise, each by `jaxhf.render`."""
+    images, problem = [], expansion.problem
+    crowded = problem.count > 1
+    assert others.albedo is not None
+    assert others.exposures is not None
+    assert others.offsets is not None
+    for group in problem.groups:
+        (k,) = group.indices
+        scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene_of(k, crowded), surface)
+        painted = jaxhf.Matte(jaxhf.ImageTexture(jnp.asarray(TEXELS, surface.dtype) * others.albedo))
+        scene = eqx.tree_at(lambda scene: scene.objects[int(crowded)].material, scene, painted)
+        view = jax.tree.map(lambda values, unit, k=k: values[k] * unit, others.view, problem.view_unit)
+        lights, camera = moved(scene.lights, scene.camera, view)
+        image = jaxhf.render(dataclasses.replace(scene, lights=lights, camera=camera), problem.settings)
+        if group.targets.shape[-1] == 1:
+            image = image.mean(-1, keepdims=True)
+        images.append(group.weights * (others.exposures[k] * image + problem.bright * others.offsets[k])[None])
+    return images
+
+
+NO_EDGES = jaxhf.Settings(samples=1, chunk=64, shadows=False, edge_samples=0)
+EDGES = jaxhf.Settings(samples=4, chunk=256, edge_samples=300)
+FLAT = dataclasses.replace(NO_EDGES, shading="flat", samples=4)
+
+
+@pytest.mark.parametrize(
+    ("settings", "channels", "precision"),
+    [
+        (NO_EDGES, (1,), "single"),
+        pytest.param(NO_EDGES, (1, 3), "double", marks=[pytest.mark.x64, pytest.mark.deep]),
+        pytest.param(EDGES, (3,), "double", marks=[pytest.mark.x64, pytest.mark.deep]),
+        pytest.param(FLAT, (3,), "double", marks=[pytest.mark.x64, pytest.mark.deep]),
+    ],
+    ids=["single", "crowded, double", "edges, double", "flat, double"],
+)
+def test_products_are_those_of_the_derivative_of_render(settings, channels, precision, monkeypatch):
+    """J and its transpose, in all unknowns at once; and the derivative in heights as a sparse matrix.
+
+    A pixel that is resampled differs from `render`'s in its value, so in exposures times that, which are still there.
+    """
+    monkeypatch.setattr("jaxhf.fitting.model.linearise._POINTS_PER_PIXEL", 64)  # then as many are resampled as by `render`
+    here, rounding = moved_expansion(settings, channels), ROUNDING[precision]
+    others = here.unknowns.without_modes()
+    rng = np.random.default_rng(3)
+
+    def drawn(tree: Any) -> Any:
+        return jax.tree.map(lambda leaf: jnp.asarray(rng.standard_normal(leaf.shape), leaf.dtype), tree)
+
+    at = here.heights, others
+    change, rows = drawn(at), drawn([group.targets for group in here.problem.groups])
+    if settings.edge_samples:
+        change = eqx.tree_at(lambda change: change[1].exposures, change, jnp.zeros(1))
+    images, expected = jax.jit(lambda at, change: jax.jvp(lambda *at: by_render(here, *at), at, change))(at, change)
+    found = here.push(change)
+    for mine, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=rounding * np.abs(theirs).max())
+    left = [image - group.weights * group.targets for image, group in zip(images, here.problem.groups, strict=True)]
+    off, resampled = in_row(here.left()) - in_row(left), _on_boundaries(here)
+    np.testing.assert_allclose(off[~resampled], 0, atol=rounding * np.abs(in_row(images)).max())
+    assert (np.abs(off[resampled]) > 0.01).any() == (settings.edge_samples > 0)  # of the noise
+    there = sum(np.vdot(a, b) for a, b in zip(rows, found, strict=True))
+    back = sum(np.vdot(a, b) for a, b in zip(jax.tree.leaves(here.pull(rows)), jax.tree.leaves(change), strict=True))
+    np.testing.assert_allclose(back, there, rtol=0, atol=rounding * in_row(found).size * rms(in_row(found)))
+    still = change[0], jax.tree.map(jnp.zeros_like, others)
+    matrix, by_heights = pictures_by_heights(here), in_row(here.push(still))
+    assert matrix is not None
+    assert matrix.nnz < 0.3 * np.prod(matrix.shape)
+    np.testing.assert_allclose(matrix @ np.ravel(change[0]), by_heights, rtol=0, atol=rounding * np.abs(by_heights).max())
+
+
+PAINTED = TEXELS.astype(np.float32)
+ALBEDOS = {
+    "one factor": (0.7, "constant"),
+    "one factor of a texture": (jaxhf.ImageTexture(PAINTED), "constant"),
+    "vertices": (0.7, "map"),
+    "texels that repeat": (jaxhf.ImageTexture(PAINTED), "map"),
+    "texels that end": (jaxhf.ImageTexture(PAINTED, wrap="clamp"), "map"),
+    "texels at vertices": (jaxhf.ImageTexture(PAINTED, at_vertices=True), "map"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "channels"),
+    [
+        ("vertices", 1),
+        ("texels that repeat", 3),
+        *(pytest.param(name, 1, marks=pytest.mark.deep) for name in ALBEDOS if name not in ("vertices", "texels that repeat")),
+    ],
+)
+def test_the_derivative_in_an_albedo_is_a_difference_of_two_pictures(name, channels):
+    """Light is proportional to it, so the difference is exact however far apart they are."""
+    albedo, kind = ALBEDOS[name]
+    scene = scenes(TRUTH, albedo)[:1]
+    target = np.random.default_rng(0).uniform(0.1, 0.3, (SIZE, SIZE, channels)).astype(np.float32)
+    here = expanded(scene, [target], settings=SETTINGS, noise=0.1, unknown=jaxhf.Unknown(albedo=kind))
+    assert here.unknowns.albedo is not None
+    old = albedo if isinstance(albedo, jaxhf.ImageTexture) else jaxhf.ImageTexture(np.full((1, 1, 3), albedo, np.float32))
+    rng, shape = np.random.default_rng(1), here.unknowns.albedo.shape
+    at = rng.uniform(0.5, 1.5, shape).astype(np.float32)
+    here = expand(dataclasses.replace(here.unknowns, albedo=jnp.asarray(at)), here.problem)
+
+    def picture(factors: np.ndarray) -> np.ndarray:
+        texture = dataclasses.replace(old, texels=np.asarray(old.texels) * factors)
+        image = np.asarray(jaxhf.render(scenes(TRUTH, texture)[0], SETTINGS), np.float64)
+        return image.mean(-1, keepdims=True) if channels == 1 else image
+
+    np.testing.assert_allclose(in_row(here.pictures()), np.ravel(picture(at)), rtol=1e-5)
+    surface, moves = jnp.zeros_like(here.problem.basis.base), [rng.uniform(-0.4, 0.4, shape).astype(np.float32)]
+    for k in rng.permutation(at.size)[:8]:
+        moves.append(np.zeros(shape, np.float32))
+        moves[-1].flat[k] = 0.4
+    expected = np.zeros(0)
+    for move in moves:
+        change = eqx.tree_at(lambda u: (u.coefficients, u.albedo), here.unknowns, (None, jnp.asarray(move)))
+        expected = np.ravel(picture(at + move) - picture(at - move)) / 2 / 0.1
+        # To rounding of the pictures, whose largest value is 3 in units of the noise.
+        np.testing.assert_allclose(in_row(here.push((surface, change))), expected, atol=1e-5)
+    assert rms(expected) > 1e-3
