@@ -35,7 +35,7 @@ ENTRANCES = {
     "slope": lambda z, _: jaxhf.slope(z, 1.0),
     "horizon": lambda z, _: jaxhf.horizon(z, 4, dx=1.0),
     "file": by_toml,
-    "start of a fit": lambda z, _: make_heights("fit", "start", z, FLAT),
+    "prior of a fit": lambda z, _: make_heights("Prior", "heights", z, FLAT),
 }
 
 

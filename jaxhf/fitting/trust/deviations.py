@@ -16,7 +16,7 @@ from ..model.robust import influence_function, robust_weight
 from .boundaries import Boundaries
 from .factors import near_inverse, pictures_by_heights
 
-_TOLERANCE = 1e-4  # of a draw's linear problem; the draw is then right to a thousandth
+_TOLERANCE = 1e-5  # of a draw's linear problem; the draw is then right to a thousandth
 
 
 class Deviations(NamedTuple):
