@@ -28,8 +28,8 @@ from .robust import soften
 from .surface import Basis, Unknowns
 from .view import moved
 
-Rows = list[Float[Array, "n h w c"]]
-"""A number for each value of each picture, group by group."""
+Rows = list[Float[Array, "_ _ _ _"]]
+"""A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""
 Surface = tuple[Float[Array, "my mx"], Unknowns]
 """A number for each height of the padded surface, and the other unknowns, without `coefficients`."""
 _PROBES = 8  # of the pictures' curvature
