@@ -63,7 +63,7 @@ class Settings:
         OneOf(NormalScheme),
         "normals at the vertices: central, of central differences; four, the mean of four triangles; the mean of "
         "the six that touch the vertex, weighted by area (six), by angle (six-angle) or equally (six-equal)",
-        none="six, but in a fit six-angle where its pictures show that",
+        none="six",
         metavar="SCHEME",
     )
     shadows: bool = _setting(True, flag, "shadows of every light but the sky, which casts none")

@@ -66,6 +66,9 @@ def test_it_is_the_square_of_the_derivative(prior, rounding):
     if prior == "none" and rounding < 1e-6:
         rounding = 1e-8  # of modes whose prior is a hundred thousand times tighter than that of others
     here = expanded(scenes(TRUTH + 0.001), pictures(), prior=PRIORS[prior], unknown=EVERYTHING, **OPTIONS)
+    moved = 0.1 * np.random.default_rng(3).standard_normal(here.unknowns.coefficients.shape)  # a step from where it began
+    moved = jnp.asarray(moved, here.unknowns.coefficients.dtype)
+    here = dataclasses.replace(here, unknowns=eqx.tree_at(lambda u: u.coefficients, here.unknowns, moved))
     roots = np.random.default_rng(1).uniform(0.5, 1.0, VALUES)
     matrix = NormalMatrix(here, roots)
     by_pictures, by_priors, free = dense(here, roots)

@@ -11,7 +11,7 @@ import scipy.fft
 import scipy.sparse.linalg
 from jaxtyping import Float
 
-from .expansion import Expansion
+from .expansion import Expansion, surface_of
 
 linalg: Any = scipy.sparse.linalg  # whose stubs miss much
 fft: Any = scipy.fft
@@ -45,7 +45,7 @@ class NormalMatrix:
         term = problem.terms.surface
         self.weight, self.spectrum = (np.asarray(values, np.float64) for values in (term.weight, term.spectrum))
         self.free = 1.0 if problem.basis.free is None else np.asarray(problem.basis.free, np.float64)
-        self.off = np.asarray(problem.basis.base, np.float64) - np.asarray(term.mean, np.float64)
+        self.off = np.asarray(surface_of(unknowns, problem.basis), np.float64) - np.asarray(term.mean, np.float64)
         others, self.unflat = jax.flatten_util.ravel_pytree(unknowns.without_modes())
         terms = problem.terms.others(unknowns)
         self.others_weight = _joined([np.broadcast_to(np.asarray(term.weight), values.shape) for term, values in terms])
@@ -71,11 +71,11 @@ class NormalMatrix:
         others = np.asarray(jax.flatten_util.ravel_pytree(others)[0], np.float64)
         return np.concatenate([(self.free * np.asarray(surface, np.float64)).ravel(), others])
 
-    def solved(self, right: Flat, tolerance: float) -> Flat:
-        """H⁻¹ times `right` by conjugate gradients."""
+    def solved(self, right: Flat, tolerance: float, begin: Flat | None = None) -> Flat:
+        """H⁻¹ times `right` by conjugate gradients, from `begin` or from 0."""
         n = self.size
         product, near = (linalg.LinearOperator((n, n), f, dtype=np.float64) for f in (self.product, self.inverse))
-        return linalg.cg(product, right, rtol=tolerance, maxiter=_MOST_ITERATIONS, M=near)[0]
+        return linalg.cg(product, right, begin, rtol=tolerance, maxiter=_MOST_ITERATIONS, M=near)[0]
 
     def gradient(self, pictures: Float[np.ndarray, " rows"]) -> Flat:
         """Of half the squares of all residuals: those of the pictures are given, times the roots, those of the priors known."""

@@ -16,7 +16,7 @@ from ..model.expansion import Expansion, expand, place_of, surface_of
 from ..model.problem import LOSS_SCALE, Problem
 from ..model.surface import Unknowns, make_basis
 from ..model.units import balanced
-from .noise import estimated_noise, explains_noise, spreads
+from .noise import Estimate, estimated_noise, explains_noise, spreads
 from .stages import on_finer, stages, why_ended
 from .state import State
 from .steps import FIRST_DAMPING, Outcome, advance, first_position, position_at
@@ -128,7 +128,7 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
         here, first = expand(state.unknowns, state.posed(problems[stage.level], 1.0)), None
     posed = here.problem
     spread = spreads(here)
-    noise = _noise(here, spread, state.noise, repeats, stage.share, given)
+    noise, widths = _noise(here, spread, state, repeats, stage.share, given)
     scale = max(LOSS_SCALE, 3 * _rms(spread / noise))
     if scale <= _LEAST_CHANGE * LOSS_SCALE or state.stage + 2 == len(order):
         scale = LOSS_SCALE
@@ -139,8 +139,9 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
         if same and edge_samples == state.edge_samples:
             return None
     dtype, units, others = posed.field.heights.dtype, state.units, state.others
-    step_size = float(state.step_size) * float(np.mean((noise / state.noise) ** 2))  # λ goes on from where it came to
-    if not repeats:
+    if repeats:  # λ goes on from where it came to, or begins anew where rejections raised it: the loss is another one
+        step_size = max(float(state.step_size), 1 / state.steps[0].damping) * float(np.mean((noise / state.noise) ** 2))
+    else:
         units, curvature, others = balanced(here.of(posed.with_noise(noise, here.sampling)))
         step_size = 1 / (FIRST_DAMPING * curvature)
     begin = state.unknowns.at_base()
@@ -152,6 +153,7 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
         units=units,
         others=others,
         noise=noise,
+        widths=widths,
         loss_scale=jnp.asarray(scale, dtype),
         step_size=jnp.asarray(step_size, dtype),
         stage=state.stage + 1,
@@ -182,27 +184,25 @@ def _resumed(problems: Sequence[Problem], state: State) -> _Place:
     return place._replace(expansion=here, position=position)
 
 
-def _noise(
-    here: Expansion, spread: np.ndarray, before: np.ndarray, repeats: bool, share: float, given: Given
-) -> Float[np.ndarray, " pictures"]:
+def _noise(here: Expansion, spread: np.ndarray, state: State, repeats: bool, share: float, given: Given) -> Estimate:
     """The noise of each picture by its residuals, where none is given; unchanged where it would hardly change.
 
     Args:
       here: where the stage before ended.
       spread: of each picture's residuals, radiance.
-      before: what it was taken for.
+      state: with what it was taken for.
       repeats: whether all modes were varied; before, what is left is mostly for shorter ones to explain.
       share: of the modes that the stage to come varies.
       given: for the noise that is given.
     """
     if given.noise is not None:
-        return before
+        return Estimate(state.noise, state.widths)
     if repeats and explains_noise(here.problem):
-        noise = estimated_noise(here, True).noise
+        found = estimated_noise(here, True, state.widths)
     else:
-        noise = np.maximum(spread, here.problem.least_noise)
-    changes = np.maximum(noise / before, before / noise)
-    return before if share == 1 and changes.max() < _LEAST_CHANGE else noise
+        found = Estimate(np.maximum(spread, here.problem.least_noise), state.widths)
+    changes = np.maximum(found.noise / state.noise, state.noise / found.noise)
+    return found._replace(noise=state.noise) if share == 1 and changes.max() < _LEAST_CHANGE else found
 
 
 def with_all_modes(ended: Ended, problems: Sequence[Problem], given: Given) -> Expansion:

@@ -16,6 +16,7 @@ from ..given import Given
 from ..history import Step
 from ..model.problem import Problem
 from ..model.surface import Unknowns, make_basis
+from .noise import OCTAVES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +30,7 @@ class State:
       units: of the modes, see `Basis.scale`, shape (my, mx).
       others: the curvature along the other unknowns, see `Units`.
       noise, loss_scale: see `Problem`.
+      widths: see `Estimate`; 1 where the noise was not estimated so.
       step_size: 1 / λ of the next step.
       stage: the number of the stage, from 0; -1: none has begun.
       stage_start: steps taken before it.
@@ -45,6 +47,7 @@ class State:
     units: Float[np.ndarray, "my mx"]
     others: Any
     noise: Float[np.ndarray, " pictures"]
+    widths: Float[np.ndarray, " octaves"]
     loss_scale: Float[Array, ""]
     step_size: Float[Array, ""]
     stage: int = -1
@@ -77,7 +80,7 @@ class State:
         return problem.with_edge_samples(self.edge_samples)
 
 
-_ARRAYS = ("unknowns", "begin", "base", "units", "others", "noise", "loss_scale", "step_size")
+_ARRAYS = ("unknowns", "begin", "base", "units", "others", "noise", "widths", "loss_scale", "step_size")
 
 
 def first_state(problem: Problem, unknowns: Unknowns) -> State:
@@ -90,6 +93,7 @@ def first_state(problem: Problem, unknowns: Unknowns) -> State:
         np.asarray(problem.basis.scale, np.float64),
         jax.tree.map(np.ones_like, unknowns.without_modes()),
         problem.noise,
+        np.ones(OCTAVES),
         problem.loss_scale,
         jnp.ones((), dtype),
         edge_samples=problem.settings.edge_samples or 0,

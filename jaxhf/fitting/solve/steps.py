@@ -15,7 +15,7 @@ from ..model.expansion import Expansion, residuals
 from ..model.surface import Unknowns
 
 FIRST_DAMPING = 1e-2  # as a share of the loss's curvature along a mode
-_REJECTED = 0.1  # by which 1 / λ is multiplied at a rejected step, the first in a row
+_REJECTED = 0.25  # by which 1 / λ is multiplied at a rejected step, the first in a row
 _LEAST_GAIN = 0.01  # of what was predicted: a step that lowers the loss by less is rejected
 _GOOD = 0.75  # of it: after a step that lowers the loss by more, 1 / λ is multiplied by _HIGHER
 _HIGHER = 4.0

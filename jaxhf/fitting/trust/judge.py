@@ -55,7 +55,7 @@ class Judgement(NamedTuple):
 def judged(ended: Ended, problems: Sequence[Problem], given: Given, report: Callable[..., None] | None) -> Judgement:
     """The judgement; `problems` are those of `run`. `report` is called after each draw."""
     fitted = stages(problems)[ended.state.stage] == stages(problems)[-1] and bool(np.isfinite(ended.state.loss))
-    expansion, free = _restricted(with_all_modes(ended, problems, given), fitted, given)
+    expansion, free = _restricted(with_all_modes(ended, problems, given), fitted, ended.state.widths, given)
     problem = expansion.problem
     left, residuals = _left(expansion)
     in_noise = [picture.residual for picture in left]
@@ -97,12 +97,14 @@ def judged(ended: Ended, problems: Sequence[Problem], given: Given, report: Call
     return Judgement(expansion, images, residuals, regions, seen, std, samples, chi2, warnings(findings))
 
 
-def _restricted(expansion: Expansion, fitted: bool, given: Given) -> tuple[Expansion, Freedom | None]:
+def _restricted(
+    expansion: Expansion, fitted: bool, widths: Float[np.ndarray, " octaves"], given: Given
+) -> tuple[Expansion, Freedom | None]:
     """The expansion with the noise of restricted maximum likelihood, and what of it the heights explain; None where they are
-    few, or were not all `fitted`."""
+    few, or were not all `fitted`; `widths` as an estimate before left them."""
     if not (fitted and explains_noise(expansion.problem)):
         return expansion, None
-    estimate = estimated_noise(expansion, given.noise is None)
+    estimate = estimated_noise(expansion, given.noise is None, widths)
     problem = expansion.problem
     if given.noise is None:
         problem = problem.with_noise(estimate.noise, expansion.sampling)
