@@ -347,7 +347,6 @@ def aslant(sources: Sources) -> Case:
 UNEXPLAINED = (
     "chi2",
     "no nearer",
-    "stalled",  # or so, by rounding
     "noise allowed for",
     "boundaries allowed for",
 )  # boundaries that the pictures have elsewhere

@@ -1,4 +1,4 @@
-"""What the plain call of `jaxhf.fit` makes of pictures that jaxhf did not make, against the terrain that was photographed.
+"""What `jaxhf.fit` makes of pictures that jaxhf did not make, against the terrain that was photographed.
 
 Mitsuba 3 rendered a part of the Jacksboro valley under three low suns, with 1024 samples a pixel: shadows on a fifth of the
 ground, the terrain's border against a black background. Known beforehand are a map smoothed over 4 cells and how far it is off.
@@ -13,7 +13,7 @@ import pytest
 
 import jaxhf
 
-AS_MITSUBA = jaxhf.Settings(normals="six-angle")  # with other normals exposures are off by 1.8 %
+AS_MITSUBA = jaxhf.Settings(normals="six-angle")  # with other normals exposures are off by 1.7 %
 FOLDER = Path(__file__).parents[1] / "references"
 
 
@@ -105,7 +105,7 @@ def test_exposures_and_offsets_come_back_with_the_terrain():
 def test_suns_and_cameras_come_back_with_the_terrain():
     """Suns that are off by 1 to 1.5 degrees, cameras by 50 m, half a cell.
 
-    As measured they come to 0.05, 0.13 and 0.44 degrees and 13 to 19 m, most of it by a common shift with the terrain: pictures
+    As measured they come to 0.06, 0.09 and 0.32 degrees and 13 to 17 m, most of it by a common shift with the terrain: pictures
     do not tell that. The heights come 4.5 times nearer.
     """
     known = case("fit-small")
@@ -125,5 +125,5 @@ def test_suns_and_cameras_come_back_with_the_terrain():
         (light,) = scene.lights
         assert isinstance(light, jaxhf.Directional)
         cosine = np.float64(light.towards) @ towards / np.linalg.norm(np.float64(light.towards)) / np.linalg.norm(towards)
-        assert np.degrees(np.arccos(cosine)) < 0.7
+        assert np.degrees(np.arccos(cosine)) < 0.5
         assert np.linalg.norm(np.asarray(scene.camera.world_from_camera)[:3, 3] - eye) < 30

@@ -22,7 +22,7 @@ _ROUNDS = 8  # at most; three or four are usual
 _NOISE_CHANGE, _WIDTH_CHANGE = 1.02, 1.1  # by less in a round: it has converged
 _DRAWN_VALUES = 8192  # from which the mean square of simulated residuals is taken: right to 2 %
 _MOST_DRAWS = 8
-_TOLERANCE = 0.02  # of linear problems, each from the one before: noise then differs by 1 % from that at 0.01, at 0.05 by 3 %
+_TOLERANCE = 0.02  # of linear problems, each from the one before: noise is within 2 % of that at 0.01, at 0.05 within 3 %
 
 Labels = Int[np.ndarray, " rows"]
 
@@ -119,7 +119,7 @@ def freedom(expansion: Expansion, widths: Float[np.ndarray, " octaves"]) -> Free
     far = _far_off(in_row(expansion.left()), labels, expansion.problem)
     matrix = NormalMatrix(expansion, np.where(far, _NO_WEIGHT, 1.0))
     wider = widths[octaves(matrix.shape)]
-    draws = [_simulated(matrix, seed, wider, None) for seed in range(_draws(labels))]
+    draws = [_simulated(matrix, seed, wider) for seed in range(_draws(labels))]
     found = Freedom(np.ones(count), np.zeros(count))
     for k, here in _each_picture(labels):
         found.free[k] = np.mean([np.mean(draw.left[here] ** 2) for draw in draws])
@@ -144,7 +144,9 @@ class _Simulated(NamedTuple):
     change: Flat
 
 
-def _simulated(matrix: NormalMatrix, seed: int, widths: float | Float[np.ndarray, "my mx"], begin: Flat | None) -> _Simulated:
+def _simulated(
+    matrix: NormalMatrix, seed: int, widths: float | Float[np.ndarray, "my mx"], begin: Flat | None = None
+) -> _Simulated:
     """What is left of noise in a fit of heights that differ from their prior by so many times its deviations.
 
     `begin`: what was found in a problem like this one.
