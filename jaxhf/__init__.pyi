@@ -5,6 +5,7 @@ from .core.version import __version__ as __version__
 from .fitting.fit import Fit as Fit, fit as fit
 from .fitting.given import Checkpoint as Checkpoint, Prior as Prior, Unknown as Unknown
 from .fitting.history import Step as Step, Stop as Stop
+from .fitting.windows import Fitted as Fitted, Mosaic as Mosaic, fit_windows as fit_windows
 from .io.errors import SceneError as SceneError
 from .io.pictures.images import load_image as load_image, save_image as save_image
 from .io.scenes.load import load_scene as load_scene

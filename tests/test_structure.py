@@ -11,7 +11,7 @@ PACKAGE = ROOT / "jaxhf"
 ORDER = "core < xla scene < trace io < preparation < maps shade < boundary < rendering < fitting mujoco < study < cli"
 ROOMS = {  # and modules, in this order, too; what they share stands beside them
     "io": ["pictures", "terrain", "scenes"],
-    "fitting": ["model", "solve", "trust", "coarser", "fit"],
+    "fitting": ["model", "solve", "trust", "coarser", "fit", "windows"],
 }
 READ_FILES = {"maps", "fitting", "study", "cli"}  # the only ones that import from io
 
@@ -72,7 +72,7 @@ RULES = {"xla/masked", "trace/search"}  # of what `vmap` makes of a call
 PLACES = {  # what stands in these modules alone
     "custom_vmap": RULES,
     "jax.vmap": MAPS_OVER_RAYS | RULES,
-    "lax.map(": MAPS_OVER_RAYS | {"xla/devices", "preparation/horizon", "fitting/trust/factors", "mujoco/hfield"},
+    "lax.map(": MAPS_OVER_RAYS | {"xla/devices", "preparation/horizon", "fitting/model/rows", "mujoco/hfield"},
     "jax.jit": {"xla/compilation", "xla/insides", "xla/kernel", "xla/masked"},
     "shard_map(": {"xla/devices"},
     "default_backend(": {"xla/devices", "xla/kept", "study/plan"},  # in the last to tell measurements apart

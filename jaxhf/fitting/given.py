@@ -31,10 +31,11 @@ class Prior:
       std: standard deviation of their errors, a number or shape (ny, nx), height units. Where it is 0 heights are held as they
         are: so a window is fitted within a terrain that goes on around it.
       length: correlation length L of those errors, in world units as dx and dy are, not in cells; from one cell to the
-        terrain's longer side. None: they are independent. The amplitudes of the errors' DCT modes, over std, go as
-        1 / (1 + (L · frequency)²): Whittle's (1954) correlation (r/L) K₁(r/L) at the distance r. For a terrain that was
-        smoothed by a Gaussian of standard deviation s, L is about s / √2: cells of 30 m smoothed over 8 of them have s = 240 m
-        and L = 170 m, see docs/concepts/recovery.md.
+        terrain's longer side. The amplitudes of the errors' DCT modes, over std, go as 1 / (1 + (L · frequency)²): Whittle's
+        (1954) correlation (r/L) K₁(r/L) at the distance r. For a terrain that was smoothed by a Gaussian of standard deviation
+        s, L is about s / √2: cells of 30 m smoothed over 8 of them have s = 240 m and L = 170 m, see docs/concepts/recovery.md.
+        None: it is not known. The pictures say how large errors of each wavelength are, octave by octave (restricted maximum
+        likelihood, Patterson and Thompson, 1971); where they do not tell it errors count as independent.
     """
 
     heights: Any

@@ -1,5 +1,6 @@
 """Cameras: from a point of the picture to a ray in the world, and back."""
 
+import dataclasses
 from typing import Any, Literal
 
 import equinox as eqx
@@ -222,6 +223,26 @@ class Orthographic(Record):
 
 
 Camera = Perspective | Orthographic
+
+
+def cropped(camera: Camera, x: int, y: int, width: int, height: int) -> Camera:
+    """The camera of a part of a picture: of `width` by `height` pixels from column x and row y on.
+
+    Its matrix may be no rotation any more, see `Perspective`.
+    """
+    matrix = np.array(camera.world_from_camera, np.float64)
+    short = min(camera.width, camera.height)
+    sx, sy = (2 * x + width - camera.width) / short, (camera.height - 2 * y - height) / short  # `_screen` of its centre
+    times = min(width, height) / short
+    if isinstance(camera, Perspective):
+        half = np.tan(np.radians(np.asarray(camera.fov, np.float64)) / 2)
+        matrix[:, 2] += half * (sx * matrix[:, 0] + sy * matrix[:, 1])
+        return dataclasses.replace(
+            camera, world_from_camera=matrix, fov=np.degrees(2 * np.arctan(times * half)), width=width, height=height
+        )
+    half = np.asarray(camera.extent, np.float64) / 2
+    matrix[:, 3] += half * (sx * matrix[:, 0] + sy * matrix[:, 1])
+    return dataclasses.replace(camera, world_from_camera=matrix, extent=2 * times * half, width=width, height=height)
 
 
 def _shown(camera: Camera, lens: str) -> str:

@@ -130,6 +130,59 @@ def test_what_the_file_says_reaches_fit_and_results_lie_where_the_terrain_lies(f
         assert image.std() > 20
 
 
+def windowed(options: dict, ends: bool = True):
+    """The same for `fit_windows`."""
+
+    def fit_windows(scenes, targets, *, checkpoint, progress, **more) -> jaxhf.Mosaic:
+        options.update(more, scenes=scenes, resume=checkpoint.resume)
+        progress(1, 2, jaxhf.Step(1, 9, 0.1, True, 0.1, 0.2, 0.5))
+        save_checkpoint(checkpoint.path, {}, ())
+        if not ends:
+            raise KeyboardInterrupt
+        first = jaxhf.Fitted(0, 0, 9, 6, 1, jaxhf.Stop.CONVERGED.value, 3, 1.0, 0.98765, float("nan"), ("chi2 is 9",))
+        done = first, jaxhf.Fitted(0, 3, 9, 6, 1, jaxhf.Stop.MAX_STEPS.value, 1, 1.0, 1.5, 0.125)
+        return jaxhf.Mosaic(TRUTH, 0 * TRUTH + 1.5, TRUTH <= 15, done)
+
+    return fit_windows
+
+
+def test_windows_are_told_one_by_one(folder, monkeypatch, run):
+    options, checkpoint = {}, folder / "all.npz.checkpoint"
+    monkeypatch.setattr("jaxhf.fitting.windows.fit_windows", windowed(options, ends=False))
+    code, _, said = run("all.npz", "--window", 32, "--overlap", 8)
+    assert (code, said) == (130, f"\njaxhf: interrupted; the same command with --resume goes on from {checkpoint}\n")
+    monkeypatch.setattr("jaxhf.fitting.windows.fit_windows", windowed(options))
+    code, said, warned = run("all.npz", "--window", 32, "--overlap", 8, "--resume")
+    lines = said.splitlines()
+    assert code == 0
+    assert re.fullmatch(rf"{folder}/all.npz: 9 x 9 heights from 1 picture in 2 windows, [0-9.e-]+ s", lines[0])
+    assert lines[1:] == [
+        f"rows 0-8 columns 0-5: {jaxhf.Stop.CONVERGED.value}; 3 steps, chi2 0.9877",
+        f"rows 0-8 columns 3-8: {jaxhf.Stop.MAX_STEPS.value}; 1 step, chi2 1.5, 0.125 off its neighbours",
+    ]
+    assert warned == "jaxhf: warning: rows 0-8 columns 0-5: chi2 is 9\n"
+    assert (options["window"], options["overlap"], options["resume"], options["draws"]) == (32, 8, True, 2)
+    assert (options["prior"].std, options["unknown"].camera_std) == (30, [5, 1])
+    np.testing.assert_array_equal(jaxhf.load_heights(folder / "all.npz").heights, TRUTH)
+    np.testing.assert_array_equal(jaxhf.load_heights(folder / "all_std.npz").heights, 0 * TRUTH + 1.5)
+    assert not checkpoint.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--overlap", 8), "--overlap must stand with --window"),
+        (("--window", 32, "--report", "page.html"), "--report must stand without --window: it shows one fit"),
+        (("--window", 9), "a whole number from 32 on"),
+        (("--window", 32), "unknown must be left out: windows share no unknowns"),
+    ],
+)
+def test_what_windows_cannot_have_is_refused(run, words, text):
+    code, _, said = run("none.npz", *words)
+    assert code == 2
+    assert text in said
+
+
 def test_after_ctrl_c_it_says_how_to_go_on(folder, monkeypatch, run):
     options, checkpoint = {}, folder / "part.tif.checkpoint"
     monkeypatch.setattr("jaxhf.fitting.fit.fit", pretended(options, ends=False))

@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
-from small_fits import given
+from scipy.ndimage import gaussian_filter
+from small_fits import expanded, given
 
 import jaxhf
 from jaxhf.fitting.model.problem import make_problem
+from jaxhf.fitting.solve import noise as _noise, run as _run
+from jaxhf.fitting.solve.noise import Restricted
 from jaxhf.fitting.trust.facts import misfit_of_length
 
 SUNS = ((315, 20), (60, 30), (180, 40))
@@ -104,3 +107,38 @@ def test_a_noise_that_pictures_cannot_tell_is_asked_for():
 def test_a_surface_that_is_not_lamberts_is_a_suspect():
     found = fitted(1, 0.6, 1, matte=False)
     assert any("does not reflect as Matte does" in warning for warning in found.warnings)
+
+
+def test_a_part_of_the_pictures_tells_their_noise(monkeypatch):
+    """Of a block of heights, and of the pixels that show no others."""
+    heights, rng = terrain(1, 0.6)
+    (scene,) = scenes(heights, 1)
+    exact = np.asarray(jaxhf.render(scene, jaxhf.Settings(samples=16)))[..., 0]
+    target = exact + NOISE * rng.standard_normal(exact.shape)
+    here = expanded([scene], [target], settings=SETTINGS, prior=jaxhf.Prior(heights, 0.05, 4.0), noise=2 * NOISE)
+    whole = Restricted(here).noise(True)
+    np.testing.assert_allclose(whole.noise, NOISE, rtol=0.1)
+    for name, value in (("_MOST_SIDE", 32), ("_BLOCK", 24), ("_LEAST_TOLD", 100)):
+        monkeypatch.setattr(_noise, name, value)
+    part = Restricted(here)
+    assert 400 < part._values.size < 24 * 24
+    np.testing.assert_allclose(part.noise(True).noise, NOISE, rtol=0.15)  # of some 300 degrees of freedom: to 4 %
+
+
+def test_errors_of_a_map_are_asked_of_the_pictures(monkeypatch):
+    """A map of smooth errors, of which that is not known, is as good as where it is; taken for independent they cost most."""
+    heights, rng = terrain(1, 0.6)
+    smooth = gaussian_filter(heights, 3.0)
+    std = float((smooth - heights).std())
+    exact = np.asarray(jaxhf.render(scenes(heights, 1)[0], jaxhf.Settings(samples=16)))[..., 0]
+    target = exact + NOISE * rng.standard_normal(exact.shape)
+
+    def error(length: float | None) -> float:
+        found = jaxhf.fit(scenes(smooth, 1), [target], settings=SETTINGS, prior=jaxhf.Prior(smooth, std, length))
+        return float(np.std(np.asarray(found.heights) - heights))
+
+    asked, told = error(None), error(2.1)
+    monkeypatch.setattr(_run, "_MOST_WIDTH", 1.0)
+    independent = error(None)
+    assert asked < 1.1 * told
+    assert asked < 0.8 * independent

@@ -15,11 +15,12 @@ from small_fits import SETTINGS, SIZE, TRUTH, expanded, pictures, rms, scenes
 import jaxhf
 from jaxhf.fitting.model.expansion import Expansion, prior_residuals
 from jaxhf.fitting.model.linearise import LinearisedEdges
-from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
+from jaxhf.fitting.model.near_inverse import near_inverse
+from jaxhf.fitting.model.normal_matrix import NormalMatrix, PartMatrix, in_row
+from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
 from jaxhf.fitting.trust import deviations as _deviations
 from jaxhf.fitting.trust.boundaries import Boundaries
 from jaxhf.fitting.trust.deviations import standard_deviations
-from jaxhf.fitting.trust.factors import near_inverse, pictures_by_heights
 
 OPTIONS = {"settings": SETTINGS, "noise": 0.01}
 VALUES = 3 * SIZE * SIZE
@@ -70,17 +71,45 @@ def test_it_is_the_square_of_the_derivative(prior, rounding):
     moved = jnp.asarray(moved, here.unknowns.coefficients.dtype)
     here = dataclasses.replace(here, unknowns=eqx.tree_at(lambda u: u.coefficients, here.unknowns, moved))
     roots = np.random.default_rng(1).uniform(0.5, 1.0, VALUES)
-    matrix = NormalMatrix(here, roots)
     by_pictures, by_priors, free = dense(here, roots)
-    x, rows = np.random.default_rng(0).standard_normal(matrix.size), np.random.default_rng(2).standard_normal(roots.size)
-    expected = by_pictures.T @ (by_pictures @ x) + by_priors.T @ (by_priors @ x)
-    np.testing.assert_allclose(matrix.product(x), expected, rtol=0, atol=rounding * rms(expected))
-    np.testing.assert_allclose(matrix.seen(x), by_pictures @ x, rtol=0, atol=rounding * rms(by_pictures @ x))
+    x, rows = np.random.default_rng(0).standard_normal(free.size), np.random.default_rng(2).standard_normal(roots.size)
     off = np.concatenate([np.ravel(part) for part in prior_residuals(here.unknowns, here.problem)])
-    expected = by_pictures.T @ rows + by_priors.T @ off
-    np.testing.assert_allclose(matrix.gradient(rows), expected, rtol=0, atol=rounding * rms(expected))
-    assert not matrix.product(x)[~free].any()
-    assert np.count_nonzero(~free) == (0 if "held" not in prior else np.count_nonzero(matrix.free == 0))
+    for kept in (None, pictures_by_heights(here)):  # products by JAX, and by a sparse matrix
+        matrix = NormalMatrix(here, roots, kept)
+        expected = by_pictures.T @ (by_pictures @ x) + by_priors.T @ (by_priors @ x)
+        np.testing.assert_allclose(matrix.product(x), expected, rtol=0, atol=rounding * rms(expected))
+        np.testing.assert_allclose(matrix.seen(x), by_pictures @ x, rtol=0, atol=rounding * rms(by_pictures @ x))
+        expected = by_pictures.T @ rows + by_priors.T @ off
+        np.testing.assert_allclose(matrix.gradient(rows), expected, rtol=0, atol=rounding * rms(expected))
+        assert not matrix.product(x)[~free].any()
+        assert np.count_nonzero(~free) == (0 if "held" not in prior else np.count_nonzero(matrix.free == 0))
+
+
+PLACE = (slice(0, 8), slice(4, 12))
+
+
+@pytest.mark.parametrize("prior", ["correlated", "independent, some held"])
+def test_a_part_of_the_pictures_depends_on_a_part_of_the_heights(prior):
+    """On no others, and as all pictures do; so do its products, but for the prior of heights beyond."""
+    here = expanded(scenes(TRUTH), pictures(), prior=PRIORS[prior], **OPTIONS)
+    whole, part = pictures_by_heights(here), part_by_heights(here, PLACE)
+    assert whole is not None
+    inside = np.zeros(TRUTH.shape, bool)
+    inside[PLACE] = True
+    rows = whole.toarray()[part.values]
+    assert not rows[:, ~inside.ravel()].any()
+    np.testing.assert_array_equal(part.matrix.toarray(), rows[:, inside.ravel()])
+    # All that is seen of these cells but the outermost: a picture shows 12 x 12 vertices in 24 x 24 pixels.
+    assert part.values.size > 0.6 * VALUES * (7 * 7) / (11 * 11)
+    roots = np.random.default_rng(1).uniform(0.5, 1.0, VALUES)
+    matrix = PartMatrix(here, roots[part.values], part.matrix, PLACE)
+    x = np.zeros(here.problem.basis.base.shape)
+    change = np.random.default_rng(0).standard_normal(matrix.shape)
+    here.problem.basis.crop(x)[PLACE] = change
+    np.testing.assert_allclose(matrix.seen(change.ravel()), NormalMatrix(here, roots, whole).seen(x.ravel())[part.values])
+    matrix.inverse = near_inverse(matrix)
+    right = matrix.gathered(matrix.drawn(0))
+    np.testing.assert_allclose(matrix.product(matrix.solved(right, 1e-6)), right, rtol=0, atol=1e-5 * rms(right) * right.size)
 
 
 @pytest.mark.parametrize("prior", PRIORS)
@@ -92,8 +121,8 @@ def test_its_near_inverse_is_near(prior):
     """
     here = expanded(scenes(TRUTH), pictures(), prior=PRIORS[prior], unknown=EVERYTHING, **OPTIONS)
     roots, rng = np.random.default_rng(1).uniform(0.5, 1.0, VALUES), np.random.default_rng(0)
-    inverse = near_inverse(NormalMatrix(here, roots), pictures_by_heights(here))
-    matrix, products, others = NormalMatrix(here, roots, inverse), [], here.unknowns.count - here.problem.basis.base.size
+    matrix, products, others = NormalMatrix(here, roots), [], here.unknowns.count - here.problem.basis.base.size
+    matrix.inverse = inverse = near_inverse(NormalMatrix(here, roots, pictures_by_heights(here)))
     asked = np.concatenate([np.ravel(matrix.free * rng.standard_normal(matrix.shape)), rng.standard_normal(others)])
     assert rms(inverse(matrix.product(asked)) - asked) < 0.2 * rms(asked)
     right = matrix.gathered(matrix.drawn(0))

@@ -1,14 +1,15 @@
 """`jaxhf fit`: a file's pictures to files of heights, watched on a terminal and safe from interruption."""
 
 import argparse
+import math
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from ...core.errors import ArgumentError, counted
+from ...core.errors import ArgumentError, UserError, counted
 from .. import arguments, interruption
-from ..arguments import flag, option, output
+from ..arguments import flag, option, output, whole
 from ..command import Command
 from ..overwriting import require_no_input
 
@@ -22,6 +23,10 @@ _EARLY = 50.0  # seconds: most fits compile no longer, and JAX reports a compila
 
 
 def run(options: argparse.Namespace) -> None:
+    if options.window is None and options.overlap is not None:
+        raise UserError("--overlap must stand with --window")
+    if options.window is not None and options.report:
+        raise UserError("--report must stand without --window: it shows one fit")
     heights, checkpoint = Path(options.output), Path(f"{options.output}.checkpoint")
     std, albedo = heights.with_stem(f"{heights.stem}_std"), heights.with_name(f"{heights.stem}_albedo.npy")
     _require_writable(options, heights, std)
@@ -37,6 +42,7 @@ def run(options: argparse.Namespace) -> None:
     import numpy as np
 
     from ...io.files import save_text
+    from ...io.pictures.images import save_image
     from ...io.scenes.toml.fit import load_case
     from ..fit_report import facts, report
     from ..limits import require_memory
@@ -45,8 +51,14 @@ def run(options: argparse.Namespace) -> None:
     case = load_case(options.case, np.dtype(options.precision))
     warn(case.scenes)
     require_memory(case.scenes[0], jax.local_device_count())
+    if options.window is not None:
+        _in_windows(case, checkpoint, options, heights, std)
+        return
     found = _fit(case, checkpoint, options.resume)
-    _save(case, found, heights, std, albedo)
+    _save(case, found.heights, found.std, heights, std)
+    if found.albedo is not None:
+        factors = np.asarray(found.albedo)[::-1]  # a texture begins at v = 0, an image at its top
+        save_image(albedo, factors if factors.shape[-1] == 3 else factors[..., 0])
     if options.report:
         save_text(options.report, report(f"Heights from {options.case}", case, found))
     checkpoint.unlink(missing_ok=True)
@@ -99,21 +111,62 @@ def _fit(case: "Case", checkpoint: Path, resume: bool) -> "Fit":
         raise case.located(error) from error
 
 
-def _save(case: "Case", found: "Fit", heights: Path, std: Path, albedo: Path) -> None:
+def _in_windows(case: "Case", checkpoint: Path, options: argparse.Namespace, heights: Path, std: Path) -> None:
+    """The same for a terrain that is fitted window by window."""
+    from ...fitting.given import Checkpoint, Prior, Unknown
+    from ...fitting.windows import fit_windows
+    from ..progress import told
+
+    interruption.raise_from_now_on()
+    progress, place = _Progress(""), ""
+
+    def note(number: int, count: int, done: "Step | Draws") -> None:
+        nonlocal place
+        place = f"window {number + 1} of {count}: "
+        progress.note(done)
+        tell()
+
+    begin = time.monotonic()
+    try:
+        with told(lambda seconds: place + progress.line(seconds)) as tell:
+            found = fit_windows(
+                case.scenes, case.targets, prior=Prior(**case.prior) if case.prior else None,
+                unknown=Unknown(**case.unknown) if case.unknown else None, noise=case.noise, weights=case.weights,
+                settings=case.settings, window=options.window, overlap=options.overlap, progress=note,
+                checkpoint=Checkpoint(checkpoint, resume=options.resume), **case.options,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        if not checkpoint.exists():
+            raise
+        raise KeyboardInterrupt(f"interrupted; the same command with --resume goes on from {checkpoint}") from None
+    except ArgumentError as error:
+        raise case.located(error) from error
+    _save(case, found.heights, found.std, heights, std)
+    checkpoint.unlink(missing_ok=True)
+    ny, nx = found.heights.shape
+    print(
+        f"{heights}: {ny} x {nx} heights from {counted(len(case.targets), 'picture')} in "
+        f"{counted(len(found.windows), 'window')}, {time.monotonic() - begin:.3g} s"
+    )
+    for done in found.windows:
+        where = f"rows {done.y}-{done.y + done.ny - 1} columns {done.x}-{done.x + done.nx - 1}"
+        seam = "" if math.isnan(done.seam) else f", {done.seam:.3g} off its neighbours"
+        print(f"{where}: {done.result or 'in no picture'}; {counted(done.steps, 'step')}, chi2 {done.chi2:.4g}{seam}")
+        for warning in done.warnings:
+            print(f"jaxhf: warning: {where}: {warning}", file=sys.stderr)
+
+
+def _save(case: "Case", heights: Any, std: Any, *paths: Path) -> None:
     import numpy as np
 
-    from ...io.pictures.images import save_image
     from ...io.terrain.save import save_heights
     from ...io.terrain.terrain import Terrain
 
     field = case.scenes[0].heightfields[0]
-    for path, values in ((heights, found.heights), (std, found.std)):
+    for path, values in zip(paths, (heights, std), strict=True):
         if values is not None:
             terrain = Terrain(np.asarray(values), float(field.dx), float(field.dy), float(field.x0), float(field.y0))
             save_heights(path, terrain, case.like)
-    if found.albedo is not None:
-        factors = np.asarray(found.albedo)[::-1]  # a texture begins at v = 0, an image at its top
-        save_image(albedo, factors if factors.shape[-1] == 3 else factors[..., 0])
 
 
 class _Progress:
@@ -161,6 +214,8 @@ COMMAND = Command(
             output("the heights: .npy, .npz or .tif"),
             option("--report", metavar="PAGE", help="an .html page with plots of heights, pictures and convergence"),
             flag("--resume", "go on from OUT.checkpoint, if it is there"),
+            whole("--window", "N", "fit windows of N x N heights one after the other: it takes the memory of one", least=32),
+            whole("--overlap", "M", "heights that neighbouring windows share [a quarter of N]", least=8),
         ),
         **arguments.MACHINE,
     },

@@ -154,7 +154,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
         brightness=brightness,
         bright=jnp.asarray(np.median(brightness), dtype),
         view_unit=view_unit,
-        field=field,
+        field=Heightfield(field.heights, field.dx, field.dy),  # wherever it stands: other windows then share programs
         albedo_shape=None,
         settings=settings,
         mesh=chosen_mesh("fit", given.mesh),

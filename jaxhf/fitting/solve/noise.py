@@ -1,5 +1,6 @@
 """How large the noise of pictures is, by what a fit leaves of them and by how much of the noise the heights explain."""
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -9,8 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..model.expansion import Expansion
-from ..model.normal_matrix import Flat, NormalMatrix, in_row
+from ..model.near_inverse import near_inverse
+from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, PartMatrix, in_row
 from ..model.problem import Problem
+from ..model.rows import Place, can_have_rows, first_vertices, part_by_heights, pictures_by_heights
 
 _FAR = 6.0  # times the median: four standard deviations of normal errors; what is farther off is not explained
 _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
@@ -23,6 +26,9 @@ _NOISE_CHANGE, _WIDTH_CHANGE = 1.02, 1.1  # by less in a round: it has converged
 _DRAWN_VALUES = 8192  # from which the mean square of simulated residuals is taken: right to 2 %
 _MOST_DRAWS = 8
 _TOLERANCE = 0.02  # of linear problems, each from the one before: noise is within 2 % of that at 0.01, at 0.05 within 3 %
+_MOST_SIDE = 192  # of heights with their padding, of which all values are taken
+_BLOCK = 128  # heights a side, of more
+_LEAST_TOLD = 4096  # values of each picture in it: they tell the noise to a few percent
 
 Labels = Int[np.ndarray, " rows"]
 
@@ -69,63 +75,121 @@ def explains_noise(problem: Problem) -> bool:
     return problem.field.heights.size > _LEAST_SHARE * problem.values
 
 
-def estimated_noise(expansion: Expansion, sought: bool, widths: Float[np.ndarray, " octaves"]) -> Estimate:
-    """The noise of each picture by restricted maximum likelihood.
+class Restricted:
+    """Restricted maximum likelihood about an expansion: the noise of pictures, and how much of it heights explain.
 
     Residuals r of a picture with n values have |r|² = σ² (n - tr A), A the hat matrix (Patterson and Thompson, Biometrika 58,
     545, 1971; Harville, JASA 72, 320, 1977). The trace is that of simulated fits: what they leave of noise. The prior decides
     how much of the noise heights explain, and is seldom quite the terrain's (Wahba, Annals of Statistics 13, 1378, 1985), so
     the deviations of its modes are estimated too, octave by octave: τ² = |u|² / g, u the modes in units of the prior, g how
-    many of them the pictures tell. All that is in the linear model about the expansion; the fit itself keeps the prior.
+    many of them the pictures tell. All that is in the linear model about the expansion.
 
     Args:
       expansion: where the fit stands, all modes varied.
-      sought: whether the noise is to be found, or only how the heights vary.
-      widths: those of an estimate before; 1 where there is none.
     """
-    problem, sampling, labels = expansion.problem, expansion.sampling, _values_that_tell(expansion)
-    noise, bands = problem.noise.copy(), octaves(problem.basis.base.shape)
-    far, change, draws = np.zeros(labels.size, bool), None, [None] * _draws(labels)
-    for _ in range(_ROUNDS):
-        here = expansion.of(_widened(problem.with_noise(noise, sampling), widths[bands]))
-        rows, matrix = in_row(here.left()), NormalMatrix(here, np.where(far, _NO_WEIGHT, 1.0))
-        change = matrix.solved(-matrix.gradient(matrix.roots * rows), _TOLERANCE, change)
-        left = rows + matrix.seen(change) / matrix.roots
-        modes = matrix.modes_before() + matrix.modes_of(change)
-        draws = [_simulated(matrix, seed, 1.0, None if draw is None else draw.change) for seed, draw in enumerate(draws)]
-        factors, before = np.ones(widths.size), noise
-        if sought:
-            noise, deviations = noise.copy(), _deviations(here.problem)
-            for k, which in _each_picture(labels):
-                simulated = np.concatenate([draw.left[which] for draw in draws])
-                if np.mean(simulated**2) > _LEAST_FREE:
-                    noise[k] = _rms(deviations[which]) * _bounded(left[which]) / _bounded(simulated)
-            noise = np.maximum(noise, problem.least_noise)
-        far = _far_off(left, labels, problem)
-        if problem.known:
-            told = np.mean([draw.told for draw in draws], axis=0)
-            squares, count = (np.bincount(bands.ravel(), part.ravel(), widths.size) for part in (modes**2, told))
-            factors = np.sqrt((squares + 1) / (np.maximum(count, 0) + 1))
-            widths = widths * factors
-        changes = [np.abs(np.log(part)).max() for part in (noise / before, factors)]
-        if changes[0] < math.log(_NOISE_CHANGE) and changes[1] < math.log(_WIDTH_CHANGE):
-            break
-    return Estimate(noise, widths)
+
+    def __init__(self, expansion: Expansion):
+        self._expansion, labels = expansion, _values_that_tell(expansion)
+        self._values, self._matrix = _told(expansion, labels)
+        self._labels, self._numbers = labels[self._values], _pictures(expansion.problem)[self._values]
+        self._rows, self._weights = in_row(expansion.left())[self._values], _weights(expansion.problem)[self._values]
+
+    def noise(self, sought: bool) -> Estimate:
+        """The noise of each picture; where it is not `sought`, only how the heights vary."""
+        problem, labels, bands = self._expansion.problem, self._labels, octaves(self._matrix.shape)
+        widths = np.ones(OCTAVES)
+        noise, far, change, draws = problem.noise.copy(), np.zeros(labels.size, bool), None, [None] * _draws(labels)
+        for _ in range(_ROUNDS):
+            here = problem.with_noise(noise, self._expansion.sampling)
+            factors = self._factors(here)
+            matrix = self._matrix.weighted(factors * np.where(far, _NO_WEIGHT, 1.0), by_mode(widths, self._matrix.shape))
+            change = matrix.solved(-matrix.gradient(matrix.roots * self._rows), _TOLERANCE, change)
+            left = factors * (self._rows + matrix.seen(change) / matrix.roots)
+            modes = matrix.modes_before() + matrix.modes_of(change)
+            draws = [_simulated(matrix, seed, 1.0, None if draw is None else draw.change) for seed, draw in enumerate(draws)]
+            growth, before = np.ones(widths.size), noise
+            if sought:
+                noise, deviations = noise.copy(), _deviations(here)[self._values]
+                for k, which in _each_picture(labels):
+                    simulated = np.concatenate([draw.left[which] for draw in draws])
+                    if np.mean(simulated**2) > _LEAST_FREE:
+                        noise[k] = _rms(deviations[which]) * _bounded(left[which]) / _bounded(simulated)
+                noise = np.maximum(noise, problem.least_noise)
+            far = self._far_off(left)
+            if problem.known:
+                told = np.mean([draw.told for draw in draws], axis=0)
+                squares, count = (np.tensordot(bands, part) for part in (modes**2, told))
+                growth = np.sqrt((squares + 1) / (np.maximum(count, 0) + 1))
+                widths = widths * growth
+            changes = [np.abs(np.log(part)).max() for part in (noise / before, growth)]
+            if changes[0] < math.log(_NOISE_CHANGE) and changes[1] < math.log(_WIDTH_CHANGE):
+                break
+        return Estimate(noise, widths)
+
+    def freedom(self, estimate: Estimate) -> Freedom:
+        """How much of its pictures' noise a fit leaves, by simulated fits of heights that vary as was estimated."""
+        problem, labels = self._expansion.problem, self._labels
+        factors = self._factors(problem.with_noise(estimate.noise, self._expansion.sampling))
+        roots = factors * np.where(self._far_off(factors * self._rows), _NO_WEIGHT, 1.0)
+        matrix = self._matrix.weighted(roots, np.ones(self._matrix.shape))
+        wider = by_mode(estimate.widths, matrix.shape)
+        draws = [_simulated(matrix, seed, wider) for seed in range(_draws(labels))]
+        found = Freedom(np.ones(problem.count), np.zeros(problem.count))
+        for k, here in _each_picture(labels):
+            found.free[k] = np.mean([np.mean(draw.left[here] ** 2) for draw in draws])
+            gone = [np.mean(draw.noise[here] * (draw.noise - draw.left)[here]) for draw in draws]
+            found.explained[k] = np.clip(np.mean(gone), 0, 1)
+        return found
+
+    def _factors(self, problem: Problem) -> Float[np.ndarray, " rows"]:
+        """By how much the weights of a problem are larger than those of the expansion."""
+        before = np.where(self._weights > 0, self._weights, 1)
+        return np.where(self._weights > 0, _weights(problem)[self._values] / before, 1)
+
+    def _far_off(self, left: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+        """Which values of each picture are far off, beside those that tell of its noise."""
+        typical = np.full(self._expansion.problem.count, np.inf)
+        for k, here in _each_picture(self._labels):
+            typical[k] = np.median(np.abs(left[here]))
+        return np.abs(left) > _FAR * typical[self._numbers]
 
 
-def freedom(expansion: Expansion, widths: Float[np.ndarray, " octaves"]) -> Freedom:
-    """How much of its pictures' noise a fit leaves, by simulated fits of heights that vary as `estimated_noise` says."""
-    labels, count = _values_that_tell(expansion), expansion.problem.count
-    far = _far_off(in_row(expansion.left()), labels, expansion.problem)
-    matrix = NormalMatrix(expansion, np.where(far, _NO_WEIGHT, 1.0))
-    wider = widths[octaves(matrix.shape)]
-    draws = [_simulated(matrix, seed, wider) for seed in range(_draws(labels))]
-    found = Freedom(np.ones(count), np.zeros(count))
-    for k, here in _each_picture(labels):
-        found.free[k] = np.mean([np.mean(draw.left[here] ** 2) for draw in draws])
-        gone = [np.mean(draw.noise[here] * (draw.noise - draw.left)[here]) for draw in draws]
-        found.explained[k] = np.clip(np.mean(gone), 0, 1)
-    return found
+def _told(expansion: Expansion, labels: Labels) -> tuple[Int[np.ndarray, " values"], NormalMatrix]:
+    """Which values are to tell the noise, and the normal matrix of their residuals, all of weight 1, with its inverse if there
+    is one: of all values or, of many heights, of those that show a block of them, as a part of the data tells it as well."""
+    values, place = np.arange(labels.size), None
+    if not can_have_rows(expansion):
+        return values, NormalMatrix(expansion, np.ones(values.size))
+    shape = expansion.problem.basis.base.shape
+    if max(shape) > _MOST_SIDE and expansion.unknowns.count - math.prod(shape) <= MOST_OTHERS:
+        place = _block(expansion, labels)
+    if place is None:
+        rows = pictures_by_heights(expansion)
+        matrix = NormalMatrix(expansion, np.ones(values.size), rows)
+    else:
+        rows, values = part_by_heights(expansion, place)
+        matrix = PartMatrix(expansion, np.ones(values.size), rows, place)
+    if rows is not None:
+        matrix.inverse = near_inverse(matrix)
+    return values, matrix
+
+
+def _block(expansion: Expansion, labels: Labels) -> Place | None:
+    """Heights that many values show of each picture that tells of its noise; None: there is no block that shows enough."""
+    shape, vertices = expansion.problem.field.heights.shape, first_vertices(expansion)
+    shown, told = (vertices >= 0) & (labels >= 0), np.unique(labels[labels >= 0])
+    y, x = np.divmod(vertices, shape[1])
+    begins = [np.arange(0, max(n - _BLOCK, 0) + 1, _BLOCK // 2) for n in shape]
+    best, most = None, _LEAST_TOLD
+    for row, column in itertools.product(*begins):
+        here = shown & (y >= row) & (y < row + _BLOCK) & (x >= column) & (x < column + _BLOCK)
+        least = np.bincount(labels[here], minlength=expansion.problem.count)[told].min(initial=labels.size)
+        if least > most:
+            best, most = (row, column), least
+    if best is None:
+        return None
+    row, column = (slice(int(begin), int(min(begin + _BLOCK, n))) for begin, n in zip(best, shape, strict=True))
+    return row, column
 
 
 class _Simulated(NamedTuple):
@@ -157,18 +221,25 @@ def _simulated(
     return _Simulated(noise.pictures, left, noise.modes * (noise.modes - matrix.modes_of(change)), change)
 
 
-def _widened(problem: Problem, widths: Float[np.ndarray, "my mx"]) -> Problem:
+def widened(problem: Problem, widths: Float[np.ndarray, " octaves"]) -> Problem:
     """The problem with a prior of the heights whose modes have deviations that are so many times as large."""
+    if (widths == 1).all():
+        return problem
     spectrum = problem.terms.surface.spectrum
-    wider = np.asarray(np.asarray(spectrum) / widths, spectrum.dtype)
+    wider = np.asarray(np.asarray(spectrum) / by_mode(widths, spectrum.shape), spectrum.dtype)
     return eqx.tree_at(lambda problem: problem.terms.surface.spectrum, problem, jnp.asarray(wider))
 
 
-def octaves(shape: tuple[int, ...]) -> Int[np.ndarray, "my mx"]:
-    """The octave of each mode's frequency, 0 being that which ends at the highest along an axis."""
+def by_mode(widths: Float[np.ndarray, " octaves"], shape: tuple[int, ...]) -> Float[np.ndarray, "my mx"]:
+    """The width of each mode: between octaves the logarithm goes straight over that of the frequency."""
+    return np.exp(np.tensordot(np.log(widths), octaves(shape), 1))
+
+
+def octaves(shape: tuple[int, ...]) -> Float[np.ndarray, "octaves my mx"]:
+    """How much of each mode belongs to each octave of frequencies, the first being that below the highest along an axis."""
     y, x = (np.arange(n) / n for n in shape)
-    frequency = np.maximum(np.hypot(y[:, None], x[None, :]), 1e-9)
-    return np.clip(np.floor(-np.log2(frequency)), 0, OCTAVES - 1).astype(int)
+    at = np.clip(-np.log2(np.maximum(np.hypot(y[:, None], x[None, :]), 1e-9)) - 0.5, 0, OCTAVES - 1)
+    return np.maximum(1 - np.abs(at - np.arange(OCTAVES)[:, None, None]), 0)
 
 
 def _values_that_tell(expansion: Expansion) -> Labels:
@@ -217,10 +288,12 @@ def _deviations(problem: Problem) -> Float[np.ndarray, " rows"]:
     return in_row([given / np.where(weights > 0, weights, 1) for given, weights in pairs])
 
 
-def _far_off(left: Float[np.ndarray, " rows"], labels: Labels, problem: Problem) -> Bool[np.ndarray, " rows"]:
-    """Which values of each picture are far off, beside those that tell of its noise."""
-    typical = np.full(problem.count, np.inf)
-    for k, here in _each_picture(labels):
-        typical[k] = np.median(np.abs(left[here]))
-    numbers = [np.broadcast_to(np.reshape(group.indices, (-1, 1, 1, 1)), group.targets.shape) for group in problem.groups]
-    return np.abs(left) > _FAR * typical[in_row(numbers).astype(int)]
+def _weights(problem: Problem) -> Float[np.ndarray, " rows"]:
+    return in_row([np.asarray(group.weights) for group in problem.groups])
+
+
+def _pictures(problem: Problem) -> Labels:
+    """The number of its picture, for each value."""
+    groups = problem.groups
+    numbers = [np.broadcast_to(np.reshape(group.indices, (-1, 1, 1, 1)), group.targets.shape) for group in groups]
+    return in_row(numbers).astype(int)

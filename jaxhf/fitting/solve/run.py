@@ -16,12 +16,13 @@ from ..model.expansion import Expansion, expand, place_of, surface_of
 from ..model.problem import LOSS_SCALE, Problem
 from ..model.surface import Unknowns, make_basis
 from ..model.units import balanced
-from .noise import Estimate, estimated_noise, explains_noise, spreads
+from .noise import Estimate, Restricted, explains_noise, spreads, widened
 from .stages import on_finer, stages, why_ended
 from .state import State
 from .steps import FIRST_DAMPING, Outcome, advance, first_position, position_at
 
 _LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
+_MOST_WIDTH = 1e3  # times wider or narrower than they were said to be, as errors of an octave may be found
 _TOLERANCE = 0.1  # of a step's linear problem: solved to 0.01 steps took twice as long, and fits came no nearer
 _ITERATIONS = 120  # of conjugate gradients
 
@@ -128,21 +129,21 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
         here, first = expand(state.unknowns, state.posed(problems[stage.level], 1.0)), None
     posed = here.problem
     spread = spreads(here)
-    noise, widths = _noise(here, spread, state, repeats, stage.share, given)
+    noise, widths = _estimated(here, spread, state, stage.share, stage == order[-1], repeats, given)
     scale = max(LOSS_SCALE, 3 * _rms(spread / noise))
     if scale <= _LEAST_CHANGE * LOSS_SCALE or state.stage + 2 == len(order):
         scale = LOSS_SCALE
     edge_samples = state.edge_samples
     if repeats:
         edge_samples = posed.edge_samples_for(here.heights, given.settings)
-        same = np.array_equal(noise, state.noise) and scale == float(state.loss_scale)
+        same = np.array_equal(noise, state.noise) and np.array_equal(widths, state.widths) and scale == float(state.loss_scale)
         if same and edge_samples == state.edge_samples:
             return None
     dtype, units, others = posed.field.heights.dtype, state.units, state.others
     if repeats:  # λ goes on from where it came to, or begins anew where rejections raised it: the loss is another one
         step_size = max(float(state.step_size), 1 / state.steps[0].damping) * float(np.mean((noise / state.noise) ** 2))
     else:
-        units, curvature, others = balanced(here.of(posed.with_noise(noise, here.sampling)))
+        units, curvature, others = balanced(here.of(widened(posed.with_noise(noise, here.sampling), widths / state.widths)))
         step_size = 1 / (FIRST_DAMPING * curvature)
     begin = state.unknowns.at_base()
     following = dataclasses.replace(
@@ -184,25 +185,32 @@ def _resumed(problems: Sequence[Problem], state: State) -> _Place:
     return place._replace(expansion=here, position=position)
 
 
-def _noise(here: Expansion, spread: np.ndarray, state: State, repeats: bool, share: float, given: Given) -> Estimate:
-    """The noise of each picture by its residuals, where none is given; unchanged where it would hardly change.
+def _estimated(
+    here: Expansion, spread: np.ndarray, state: State, share: float, last: bool, repeats: bool, given: Given
+) -> Estimate:
+    """The noise of each picture, where none is given, and how heights vary, where their prior does not say how its errors hang
+    together; unchanged where they would hardly change.
 
     Args:
       here: where the stage before ended.
       spread: of each picture's residuals, radiance.
-      state: with what it was taken for.
-      repeats: whether all modes were varied; before, what is left is mostly for shorter ones to explain.
+      state: with what they were taken for.
       share: of the modes that the stage to come varies.
-      given: for the noise that is given.
+      last: whether these are all, of the finest heights.
+      repeats: whether they were varied before; if not, what is left is mostly for shorter ones to explain.
+      given: for what is given.
     """
-    if given.noise is not None:
-        return Estimate(state.noise, state.widths)
-    if repeats and explains_noise(here.problem):
-        found = estimated_noise(here, True, state.widths)
-    else:
-        found = Estimate(np.maximum(spread, here.problem.least_noise), state.widths)
-    changes = np.maximum(found.noise / state.noise, state.noise / found.noise)
-    return found._replace(noise=state.noise) if share == 1 and changes.max() < _LEAST_CHANGE else found
+    before, posed = Estimate(state.noise, state.widths), here.problem
+    by_residuals = before.noise if given.noise is not None else np.maximum(spread, posed.least_noise)
+    is_open = given.prior is not None and given.prior.length is None
+    sought = given.noise is None and explains_noise(posed)
+    found = before._replace(noise=by_residuals)
+    if last and (is_open or (sought and repeats)):
+        found = Restricted(here if sought else here.of(posed.with_noise(by_residuals, here.sampling))).noise(sought)
+        widths = np.clip(state.widths * found.widths, 1 / _MOST_WIDTH, _MOST_WIDTH)
+        found = found._replace(widths=widths if is_open else state.widths)
+    changes = np.abs(np.log(np.concatenate(found) / np.concatenate(before)))
+    return before if share == 1 and changes.max() < math.log(_LEAST_CHANGE) else found
 
 
 def with_all_modes(ended: Ended, problems: Sequence[Problem], given: Given) -> Expansion:

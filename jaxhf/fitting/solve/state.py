@@ -16,7 +16,7 @@ from ..given import Given
 from ..history import Step
 from ..model.problem import Problem
 from ..model.surface import Unknowns, make_basis
-from .noise import OCTAVES
+from .noise import OCTAVES, widened
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +30,7 @@ class State:
       units: of the modes, see `Basis.scale`, shape (my, mx).
       others: the curvature along the other unknowns, see `Units`.
       noise, loss_scale: see `Problem`.
-      widths: see `Estimate`; 1 where the noise was not estimated so.
+      widths: how many times wider than their prior heights vary, see `Estimate`; 1 where that is not estimated.
       step_size: 1 / λ of the next step.
       stage: the number of the stage, from 0; -1: none has begun.
       stage_start: steps taken before it.
@@ -76,7 +76,7 @@ class State:
     def posed(self, problem: Problem, share: float) -> Problem:
         """The problem of this stage, which varies such a share of the modes, but for the noise."""
         basis = make_basis(problem.field, np.asarray(self.base), self.units, share, problem.basis.free)
-        problem = dataclasses.replace(problem, basis=basis, loss_scale=self.loss_scale)
+        problem = dataclasses.replace(widened(problem, self.widths), basis=basis, loss_scale=self.loss_scale)
         return problem.with_edge_samples(self.edge_samples)
 
 

@@ -11,10 +11,11 @@ from jaxtyping import Float
 
 from ..history import Draws
 from ..model.expansion import Expansion
+from ..model.near_inverse import near_inverse
 from ..model.normal_matrix import NormalMatrix, in_row
 from ..model.robust import influence_function, robust_weight
+from ..model.rows import pictures_by_heights
 from .boundaries import Boundaries
-from .factors import near_inverse, pictures_by_heights
 
 _TOLERANCE = 1e-5  # of a draw's linear problem; the draw is then right to a thousandth
 
@@ -63,9 +64,9 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
     """
     roots = np.sqrt(np.asarray(robust_weight(jnp.asarray(in_row(expansion.left())), expansion.problem.loss_scale)))
     rows = pictures_by_heights(expansion)
-    matrix = NormalMatrix(expansion, roots)
+    matrix = NormalMatrix(expansion, roots, rows)
     if rows is not None:
-        matrix = NormalMatrix(expansion, roots, near_inverse(matrix, rows))
+        matrix.inverse = near_inverse(matrix)
     boundaries = None if rows is None else Boundaries(expansion, rows)
     changes, begin = [], time.perf_counter()
     try:

@@ -226,7 +226,7 @@ def misfit_of_length(problem: Problem, given: Given) -> str | None:
     weight, spectrum = (np.asarray(values, np.float64) for values in (term.weight, term.spectrum))
     off = weight * (np.asarray(basis.base, np.float64) - np.asarray(term.mean, np.float64))
     modes = spectrum * (np.asarray(basis.rows, np.float64) @ off @ np.asarray(basis.columns, np.float64).T)
-    bands = octaves(modes.shape).ravel()
+    bands = octaves(modes.shape).argmax(axis=0).ravel()
     counts = np.bincount(bands)
     sizes = np.sqrt(np.bincount(bands, (modes**2).ravel()) / counts)
     worst = int(np.argmax(np.where(counts >= _LEAST_MODES, sizes, 0)))

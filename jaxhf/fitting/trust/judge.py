@@ -10,7 +10,7 @@ from ..given import Given
 from ..history import Stop
 from ..model.expansion import Expansion
 from ..model.problem import Problem
-from ..solve.noise import Freedom, estimated_noise, explains_noise, freedom
+from ..solve.noise import Freedom, Restricted, explains_noise
 from ..solve.run import Ended, with_all_modes
 from ..solve.stages import stages
 from .deviations import standard_deviations, with_unexplained
@@ -55,7 +55,7 @@ class Judgement(NamedTuple):
 def judged(ended: Ended, problems: Sequence[Problem], given: Given, report: Callable[..., None] | None) -> Judgement:
     """The judgement; `problems` are those of `run`. `report` is called after each draw."""
     fitted = stages(problems)[ended.state.stage] == stages(problems)[-1] and bool(np.isfinite(ended.state.loss))
-    expansion, free = _restricted(with_all_modes(ended, problems, given), fitted, ended.state.widths, given)
+    expansion, free = _restricted(with_all_modes(ended, problems, given), fitted, given)
     problem = expansion.problem
     left, residuals = _left(expansion)
     in_noise = [picture.residual for picture in left]
@@ -97,19 +97,16 @@ def judged(ended: Ended, problems: Sequence[Problem], given: Given, report: Call
     return Judgement(expansion, images, residuals, regions, seen, std, samples, chi2, warnings(findings))
 
 
-def _restricted(
-    expansion: Expansion, fitted: bool, widths: Float[np.ndarray, " octaves"], given: Given
-) -> tuple[Expansion, Freedom | None]:
+def _restricted(expansion: Expansion, fitted: bool, given: Given) -> tuple[Expansion, Freedom | None]:
     """The expansion with the noise of restricted maximum likelihood, and what of it the heights explain; None where they are
-    few, or were not all `fitted`; `widths` as an estimate before left them."""
+    few, or were not all `fitted`."""
     if not (fitted and explains_noise(expansion.problem)):
         return expansion, None
-    estimate = estimated_noise(expansion, given.noise is None, widths)
-    problem = expansion.problem
+    restricted = Restricted(expansion)
+    estimate = restricted.noise(given.noise is None)
     if given.noise is None:
-        problem = problem.with_noise(estimate.noise, expansion.sampling)
-    expansion = expansion.of(problem)
-    return expansion, freedom(expansion, estimate.widths)
+        expansion = expansion.of(expansion.problem.with_noise(estimate.noise, expansion.sampling))
+    return expansion, restricted.freedom(estimate)
 
 
 def _left(expansion: Expansion) -> tuple[list[Left], list[Float[np.ndarray, "h w c"]]]:

@@ -1,0 +1,182 @@
+"""A part of a terrain and of its pictures, for a fit of that part within the terrain that goes on around it."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Bool, Float
+
+from ..core.settings import Settings
+from ..preparation.localise import localise
+from ..rendering.render import render
+from ..scene.camera import cropped as cropped_camera
+from ..scene.heightfield import Heightfield
+from ..scene.material import Material, Matte
+from ..scene.scene import Object, Scene
+from ..scene.texture import ImageTexture
+
+_MARGIN = 2  # cells from the rim, where normals lack their neighbours; and pixels that a moving rim may come to
+_REACH = 3.0  # deviations by which heights may differ from what is known of them
+_LEAST_SIDE = 16  # of a picture, pixels
+
+ndimage: Any = scipy.ndimage  # whose stubs miss much
+
+
+class Window(NamedTuple):
+    """Heights of a terrain: ny rows from row y on, nx columns from column x on."""
+
+    y: int
+    x: int
+    ny: int
+    nx: int
+
+    @property
+    def place(self) -> tuple[slice, slice]:
+        return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
+
+    def rim(self, shape: tuple[int, ...], depth: int) -> Bool[np.ndarray, "ny nx"]:
+        """Where it is at most so many vertices from a side beyond which a terrain of that shape goes on."""
+        found = np.zeros((self.ny, self.nx), bool)
+        found[:depth] |= self.y > 0
+        found[self.ny - depth :] |= self.y + self.ny < shape[0]
+        found[:, :depth] |= self.x > 0
+        found[:, self.nx - depth :] |= self.x + self.nx < shape[1]
+        return found
+
+
+class Seen(NamedTuple):
+    """A part of a picture that shows a window.
+
+    Attributes:
+      scene: the window as its first heightfield, the terrain around it as its last object.
+      target, weight: of the pixels of its camera; those without weight show what is not sought.
+      number: of the picture among all.
+    """
+
+    scene: Scene
+    target: Float[np.ndarray, "h w *c"]
+    weight: Float[np.ndarray, "h w *c"]
+    number: int
+
+
+def cropped(
+    scenes: Sequence[Scene],
+    targets: Sequence[np.ndarray],
+    weights: Sequence[np.ndarray],
+    terrain: Float[np.ndarray, "my mx"],
+    reach: float,
+    window: Window,
+) -> list[Seen]:
+    """What the pictures show of a window of a terrain.
+
+    Args:
+      scenes: of the whole terrain.
+      targets, weights: of each, as `fit` takes them, a weight for each value.
+      terrain: its heights as far as they are known.
+      reach: by how much heights may differ from these.
+      window: which heights are sought.
+    """
+    fields = _fields(scenes[0].heightfields[0], terrain, window)
+    parts = [_with_surroundings(scene, *fields, window) for scene in scenes]
+    places = [_in_sight(scene, terrain[window.place], reach) for scene in parts]
+    # Pictures of one size share a program, those of this window and of the next ones.
+    height, width = (max([1, *(place[1][axis] - place[0][axis] for place in places if place is not None)]) for axis in (0, 1))
+    found = []
+    for index, (scene, place) in enumerate(zip(parts, places, strict=True)):
+        if place is None:
+            continue
+        camera = scene.camera
+        sides = min(_rounded(height), camera.height), min(_rounded(width), camera.width)
+        y, x = (
+            int(np.clip((low + high - side) // 2, 0, most - side))
+            for low, high, side, most in zip(*place, sides, (camera.height, camera.width), strict=True)
+        )
+        scene = scene.with_camera(cropped_camera(camera, x, y, sides[1], sides[0]))
+        here = slice(y, y + sides[0]), slice(x, x + sides[1])
+        shows, other = _sight_of(scene, window, terrain.shape)
+        weight = np.where(other.reshape(*sides, *(1,) * (weights[index].ndim - 2)), 0, weights[index][here])
+        if (weight.reshape(*sides, -1).any(-1) & shows).any():
+            found.append(Seen(scene, targets[index][here], weight, index))
+    return found
+
+
+def _fields(whole: Heightfield, terrain: Float[np.ndarray, "my mx"], window: Window) -> tuple[Heightfield, Heightfield]:
+    """A window of a terrain, and what is around it, with a hole there."""
+    around = terrain.astype(whole.heights.dtype)
+    part = around[window.place].copy()
+    around[window.y + 1 : window.y + window.ny - 1, window.x + 1 : window.x + window.nx - 1] = np.nan
+    corner = whole.x0 + window.x * whole.dx, whole.y0 + window.y * whole.dy
+    return Heightfield(part, whole.dx, whole.dy, *corner), Heightfield(around, whole.dx, whole.dy, whole.x0, whole.y0)
+
+
+def _with_surroundings(scene: Scene, part: Heightfield, around: Heightfield, window: Window) -> Scene:
+    """The scene with the one in place of its terrain and the other as its last object."""
+    old = scene.heightfields[0]
+    objects = list(scene.objects)
+    k = next(k for k, obj in enumerate(objects) if obj.shape is old)
+    material, world = objects[k].material, objects[k].world_from_object
+    objects[k] = Object(part, _cropped_material(material, old.heights.shape, window), world)
+    # Its place is given also where it is the world's: windows at the corner then share a program with the others.
+    objects.append(Object(around, material, np.eye(4) if world is None else world))
+    return eqx.tree_at(lambda scene: scene.objects, scene, tuple(objects))
+
+
+def _cropped_material(material: Material, shape: tuple[int, ...], window: Window) -> Material:
+    """A material whose image covers the window alone: a colour for each vertex, or more where the image has more."""
+    if not (isinstance(material, Matte) and isinstance(image := material.albedo, ImageTexture)):
+        return material
+    size = zip(image.texels.shape, shape, strict=False)
+    finer = 1 if image.at_vertices and image.texels.shape[:2] == shape else max(math.ceil(n / (m - 1)) for n, m in size)
+    v, u = (
+        (begin + np.linspace(0, n - 1, finer * (n - 1) + 1)) / (m - 1)
+        for begin, n, m in ((window.y, window.ny, shape[0]), (window.x, window.nx, shape[1]))
+    )
+    look_up = jnp.vectorize(image, signature="(k)->(c)")
+    texels = np.asarray(look_up(jnp.stack(jnp.meshgrid(jnp.asarray(u), jnp.asarray(v)), axis=-1)))
+    return dataclasses.replace(material, albedo=ImageTexture(texels, at_vertices=True))
+
+
+Corners = tuple[tuple[int, int], tuple[int, int]]
+
+
+def _in_sight(scene: Scene, heights: Float[np.ndarray, "ny nx"], reach: float) -> Corners | None:
+    """First and last row and column of the picture between which its first heightfield may be seen; None: it is not."""
+    local, camera = localise(scene), scene.camera
+    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
+    field, world = scene.heightfields[0], local.objects[k].world_from_object
+    ny, nx = field.heights.shape
+    sides = (0, (nx - 1) * field.dx), (0, (ny - 1) * field.dy), (heights.min() - reach, heights.max() + reach)
+    corners = np.stack([part.ravel() for part in np.meshgrid(*sides)] + [np.ones(8)])
+    p = corners[:3] if world is None else (np.asarray(world, np.float64) @ corners)[:3]
+    film = local.camera.film_from_world()
+    x, y, w, depth = np.asarray(film.linear, np.float64) @ p + np.asarray(film.offset, np.float64)[:, None]
+    low, high = [0, 0], [camera.height, camera.width]
+    if (depth > 0).all():
+        for axis, along in enumerate((y / w, x / w)):
+            low[axis] = max(low[axis], math.floor(along.min()) - _MARGIN)
+            high[axis] = min(high[axis], math.ceil(along.max()) + _MARGIN)
+    return None if low[0] >= high[0] or low[1] >= high[1] else ((low[0], low[1]), (high[0], high[1]))
+
+
+def _rounded(count: int) -> int:
+    """The next 2ⁿ or 3 · 2ⁿ."""
+    power = 2 ** math.ceil(math.log2(max(count, _LEAST_SIDE)))
+    return power * 3 // 4 if count <= power * 3 // 4 else power
+
+
+def _sight_of(scene: Scene, window: Window, shape: tuple[int, ...]) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Which pixels show what is sought, and which may show the rim or what is beyond."""
+    _, known = render(scene, Settings(samples=1, shadows=False), aovs=("object", "cell"))
+    number, cell = np.asarray(known["object"]), np.asarray(known["cell"])
+    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
+    rim = window.rim(shape, _MARGIN)
+    rim = rim[:-1, :-1] | rim[1:, 1:]
+    sought = number == k
+    outer = sought & rim[np.where(sought, cell[..., 1], 0), np.where(sought, cell[..., 0], 0)]
+    other = ndimage.binary_dilation(outer | (number == len(scene.objects) - 1), np.ones((3, 3)), _MARGIN)
+    return sought & ~other, other

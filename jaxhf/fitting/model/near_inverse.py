@@ -1,0 +1,92 @@
+"""What about inverts the normal matrix of a fit: the factors of a sparse matrix near to it."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+import scipy.sparse
+import scipy.sparse.linalg
+from jaxtyping import Float
+
+from ...scene.heightfield import Heightfield
+from .normal_matrix import MOST_OTHERS, Flat, NormalMatrix
+from .rows import Sparse, scaled
+from .surface import slope_units
+
+sp: Any = scipy.sparse  # whose stubs miss much
+_PROBES = 8  # of their curvature, where they are more
+_DEGREE = 3  # of the polynomial in the Laplacian that stands for a prior
+
+
+def near_inverse(matrix: NormalMatrix) -> Callable[[Flat], Flat]:
+    """What about inverts a normal matrix: the factors (SuperLU) of that of the heights, in which a polynomial in the Laplacian
+    stands for their prior, and the Schur complement of the other unknowns; where these are many, their diagonal.
+
+    With them conjugate gradients take 4 or 5 iterations, where LSMR on J took 300.
+
+    Args:
+      matrix: one that has rows.
+    """
+    shape, count = matrix.shape, int(np.prod(matrix.shape))
+    weighted = scaled(matrix.rows, matrix.roots)
+    weighted = sp.csr_array((weighted.data, matrix.inside[weighted.indices], weighted.indptr), shape=(weighted.shape[0], count))
+    weight = sp.diags_array(np.broadcast_to(matrix.weight, shape).ravel())
+    precision = np.broadcast_to(matrix.spectrum**2, shape)
+    near = weighted.T @ weighted + weight @ _polynomial(precision, matrix.expansion.problem.field) @ weight
+    free = np.broadcast_to(matrix.free, shape).ravel()
+    near = sp.diags_array(free) @ near @ sp.diags_array(free) + sp.diags_array(1 - free)
+    options = {"SymmetricMode": True}
+    factors = sp.linalg.splu(near.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    many = matrix.size - count > MOST_OTHERS
+
+    def by_heights(x: Flat) -> Flat:
+        return free * factors.solve(free * x)
+
+    if many:
+        draws = [matrix.gathered(matrix.drawn(seed))[count:] for seed in range(_PROBES)]
+        diagonal = np.maximum(np.mean(np.square(draws), axis=0), matrix.others_weight**2)
+        return lambda x: np.concatenate([by_heights(x[:count]), x[count:] / diagonal])
+    columns = [
+        matrix.product(row.astype(np.float64)) for row in (np.arange(matrix.size) == k for k in range(count, matrix.size))
+    ]
+    beside = np.stack([column[:count] for column in columns], axis=1) if columns else np.zeros((count, 0))
+    moved = np.stack([by_heights(column) for column in beside.T], axis=1) if columns else beside
+    schur = np.reshape([column[count:] for column in columns], (len(columns), len(columns))) - beside.T @ moved
+
+    def inverse(x: Flat) -> Flat:
+        heights = by_heights(x[:count])
+        others = np.linalg.solve(schur, x[count:] - beside.T @ heights)
+        return np.concatenate([heights - moved @ others, others])
+
+    return inverse
+
+
+def _polynomial(precision: Float[np.ndarray, "my mx"], field: Heightfield) -> Sparse:
+    """A matrix whose eigenvalues, along the modes of the surface, come near to these ones: a polynomial in the Laplacian.
+
+    Its coefficients are not negative, so that it is positive definite. (1 + length² · Laplacian)^n is met exactly.
+    """
+    _, frequency = slope_units(precision.shape, field.dx, field.dy)  # half periods in the longer side
+    steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) * ((n - 1) / np.pi) ** 2 for n in precision.shape]
+    weights = frequency[1, 0] ** 2, frequency[0, 1] ** 2
+    eigenvalue = (weights[0] * steps[0][:, None] + weights[1] * steps[1][None, :]).ravel()
+    largest = eigenvalue.max()
+    powers = (eigenvalue / largest)[:, None] ** np.arange(_DEGREE + 1)
+    # Modes evenly over their frequencies' logarithm: most of all modes have the highest.
+    chosen = np.searchsorted(np.sort(eigenvalue), np.geomspace(eigenvalue[eigenvalue > 0].min(), largest, 200))
+    chosen = np.r_[0, np.argsort(eigenvalue)[np.minimum(chosen, eigenvalue.size - 1)]]
+    relative = powers[chosen] / precision.ravel()[chosen, None]
+    size = relative.max(axis=0)
+    coefficients = scipy.optimize.nnls(relative / size, np.ones(len(chosen)))[0] / size
+    along = [
+        weight * ((n - 1) / np.pi) ** 2 / largest
+        * sp.diags_array([np.r_[1.0, np.full(n - 2, 2.0), 1.0], -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1])
+        for n, weight in zip(precision.shape, weights, strict=True)
+    ]  # fmt: skip
+    eyes = [sp.eye_array(n) for n in precision.shape]
+    laplacian = sp.kron(along[0], eyes[1]) + sp.kron(eyes[0], along[1])
+    result = coefficients[-1] * sp.eye_array(precision.size)
+    for coefficient in coefficients[-2::-1]:
+        result = result @ laplacian + coefficient * sp.eye_array(precision.size)
+    return result.tocsr()

@@ -1,0 +1,253 @@
+"""Recovers a terrain window by window, where it has more heights than one fit can hold."""
+
+import dataclasses
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ..core.errors import ArgumentError
+from ..core.precision import numbers
+from ..core.rules import Whole, require
+from ..core.settings import Settings
+from ..io.checkpoint import load_arrays, load_facts, save_checkpoint
+from ..io.errors import FileError
+from ..preparation.localise import localise
+from ..scene.scene import Scene
+from .cropped import Seen, Window, cropped
+from .fit import Fit, fit
+from .given import Checkpoint, Prior
+from .history import Draws, Step
+from .model.defaults import choose_edge_samples, choose_samples
+from .model.pictures import masked_targets, weights_of
+from .model.surface import make_heights
+
+_LEAST_EDGE_SAMPLES = 2048
+_LEAST_WINDOW, _LEAST_OVERLAP = 32, 8  # heights: the outermost four or so of a window are hardly told by its pictures
+
+
+class Fitted(NamedTuple):
+    """What became of a window.
+
+    Attributes:
+      y, x, ny, nx: which heights it has: ny rows from row y on, nx columns from column x on.
+      pictures: how many show it; without any its heights stay as they were.
+      result: why its fit stopped, see `Stop`; empty where there was none.
+      steps, seconds, chi2: of its fit.
+      seam: root mean square difference between its heights and those of the windows before, in the middle of where they
+        overlap and are seen; nan: nowhere.
+      warnings: of its fit.
+    """
+
+    y: int
+    x: int
+    ny: int
+    nx: int
+    pictures: int
+    result: str = ""
+    steps: int = 0
+    seconds: float = 0.0
+    chi2: float = math.nan
+    seam: float = math.nan
+    warnings: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Mosaic:
+    """What `fit_windows` found.
+
+    Attributes:
+      heights: shape (ny, nx), in the dtype of the scenes' heights.
+      std: standard deviation of each, as that of `Fit`; None where no draws were asked for.
+      seen: whether a change of the height would change any picture, shape (ny, nx).
+      windows: what became of each.
+    """
+
+    heights: Float[np.ndarray, "ny nx"]
+    std: Float[np.ndarray, "ny nx"] | None
+    seen: Bool[np.ndarray, "ny nx"]
+    windows: tuple[Fitted, ...]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Terrain:
+    """The terrain while it is found: float64, but for two masks; `done`: where a window was fitted."""
+
+    heights: Float[np.ndarray, "ny nx"]
+    std: Float[np.ndarray, "ny nx"]
+    seen: Bool[np.ndarray, "ny nx"]
+    done: Bool[np.ndarray, "ny nx"]
+
+
+def fit_windows(
+    scenes: Sequence[Scene],
+    targets: Sequence[Any],
+    *,
+    prior: Prior | None,
+    window: int,
+    overlap: int | None = None,
+    weights: Sequence[Any] | None = None,
+    start: Any = None,
+    noise: Any = None,
+    progress: Callable[[int, int, Step | Draws], None] | None = None,
+    checkpoint: Checkpoint | None = None,
+    **options: Any,
+) -> Mosaic:
+    """Recovers a terrain by fits of windows of it, one after the other, row by row from y = y0 on.
+
+    Each is fitted within the terrain that goes on around it, as it is known by then: that is seen and casts its shadows into
+    the window. The first row and column of each window, which lie in windows before, are held as these found them, and in their
+    overlap heights go over from the one to the other. Time grows as the number of windows, memory as the size of one,
+    besides terrain and pictures themselves.
+
+    What all windows share must be known: lights, cameras, exposures, albedo. `fit` finds them on coarser heights.
+
+    Args:
+      scenes, targets, weights, noise, start: as those of `fit`, of the whole terrain.
+      prior: see `Prior`; each window needs one.
+      window: heights along a window's sides; 64 to 256 are of use. Where the terrain has fewer along a side, all of these.
+      overlap: heights that neighbours share at least; None: a quarter of a window. Take two correlation lengths of the prior or
+        more: so far the rim is felt.
+      progress: called after each step and each draw with the number of windows that are done, how many there are, and a `Step`
+        or `Draws`.
+      checkpoint: a file for the terrain so far, written after each window, whatever its `every`.
+      options: of `fit`: draws, settings, max_steps, mesh.
+
+    Returns:
+      A `Mosaic`.
+
+    Raises:
+      ValueError: as by `fit`, and a checkpoint of another terrain.
+    """
+    scenes, targets = tuple(scenes), tuple(targets)
+    targets, weights = masked_targets(scenes, targets, weights), weights_of(scenes, targets, weights)
+    field = scenes[0].heightfields[0]
+    shape = field.heights.shape
+    if not isinstance(prior, Prior):
+        raise ArgumentError("fit_windows", "prior", f"must be a jaxhf.Prior, it is {prior!r}")
+    if options.get("unknown") is not None:
+        raise ArgumentError("fit_windows", "unknown", "must be left out: windows share no unknowns. Find them by `fit` first")
+    require("fit_windows", "window", window, Whole(_LEAST_WINDOW))
+    overlap = window // 4 if overlap is None else overlap
+    require("fit_windows", "overlap", overlap, Whole(_LEAST_OVERLAP, window // 2))
+    mean, std = (make_heights("Prior", name, getattr(prior, name), field) for name in ("heights", "std"))
+    begin = make_heights("fit", "start", field.heights if start is None else start, field)
+    state = _Terrain(np.where(std > 0, begin, mean), std.copy(), np.zeros(shape, bool), std == 0)
+    order, fitted = divided(shape, window, overlap), ()
+    options = {**options, "settings": _settings(scenes, options.get("settings") or Settings(), len(order))}
+    path = None if checkpoint is None else Path(checkpoint.path)
+    name = _hash((scenes, targets, weights, mean, std, begin, noise), (prior.length, window, overlap, sorted(options.items())))
+    if path is not None and path.exists():
+        state, fitted = _load(path, state, name)
+    for number in range(len(fitted), len(order)):
+        place = order[number]
+        seen = cropped(scenes, targets, weights, state.heights, 3 * float(std[place.place].max()), place)
+        found = None
+        if seen:
+            tell = None if progress is None else lambda done, number=number: progress(number, len(order), done)
+            found = _fit(seen, state, Prior(mean, std, prior.length), place, noise, tell or False, options)
+        done = Fitted(*place, len(seen))
+        if found is not None:
+            state, seam = _joined(state, found, place, overlap)
+            done = done._replace(
+                result=found.result.value,
+                steps=int(found.stats["steps"]),
+                seconds=float(found.stats["seconds"]),
+                chi2=float(found.stats["chi2"]),
+                seam=seam,
+                warnings=found.warnings,
+            )
+        fitted = (*fitted, done)
+        if path is not None:
+            _save(path, state, fitted, name)
+    deviations = state.std if options.get("draws") else None
+    return Mosaic(state.heights.astype(field.heights.dtype), deviations, state.seen, fitted)
+
+
+def _settings(scenes: Sequence[Scene], settings: Settings, count: int) -> Settings:
+    """With one number of points on edges for all windows, so that these share programs: of their boundaries' length, were all
+    that the whole pictures show evenly spread. Where these show none each window decides for itself."""
+    if settings.edge_samples is not None:
+        return settings
+    whole = choose_edge_samples(tuple(map(localise, scenes)), choose_samples(scenes, settings))
+    each = max(whole // 2 ** round(math.log2(count) / 2), _LEAST_EDGE_SAMPLES)
+    return dataclasses.replace(settings, edge_samples=each) if whole else settings
+
+
+def divided(shape: tuple[int, ...], side: int, overlap: int) -> list[Window]:
+    """Windows of one size that cover a terrain, neighbours sharing so many heights or more."""
+    along = []
+    for n in shape:
+        count = max(1, math.ceil((n - overlap) / (side - overlap)))
+        along.append([round(begin) for begin in np.linspace(0, max(n - side, 0), count)])
+    sizes = [min(side, n) for n in shape]
+    return [Window(y, x, *sizes) for y in along[0] for x in along[1]]
+
+
+def _fit(
+    seen: Sequence[Seen], state: _Terrain, prior: Prior, window: Window, noise: Any, progress: Any, options: dict[str, Any]
+) -> Fit | None:
+    """The fit of a window; None where all of its heights are held."""
+    here = window.place
+    held = prior.std[here] == 0
+    held[0] |= window.y > 0
+    held[:, 0] |= window.x > 0
+    if held.all():
+        return None
+    known = Prior(np.where(held, state.heights[here], prior.heights[here]), np.where(held, 0, prior.std[here]), prior.length)
+    if noise is not None and np.ndim(noise) == 1:
+        noise = numbers(noise)[[part.number for part in seen]]
+    return fit(
+        [part.scene for part in seen], [part.target for part in seen], weights=[part.weight for part in seen],
+        prior=known, noise=noise, progress=progress, **options,
+    )  # fmt: skip
+
+
+def _joined(state: _Terrain, found: Fit, window: Window, overlap: int) -> tuple[_Terrain, float]:
+    """The terrain with a window's heights, and the difference in its overlap with those before."""
+    here = window.place
+    done = state.done[here]
+    # From 0 at sides in windows before to 1, where these end; what is at the right was fitted in the row before.
+    rows = _ramp(window.y > 0, False, window.ny, overlap)
+    columns = _ramp(window.x > 0, window.x + window.nx < state.done.shape[1], window.nx, overlap)
+    share = np.where(done, rows[:, None] * columns, 1)
+    heights, std, seen, all_done = (part.copy() for part in (state.heights, state.std, state.seen, state.done))
+    new = np.asarray(found.heights, np.float64)
+    both = done & found.seen & state.seen[here] & (np.abs(share - 0.5) < 0.25)
+    seam = float(np.sqrt(np.mean((new - heights[here])[both] ** 2))) if both.any() else math.nan
+    heights[here] = (1 - share) * heights[here] + share * new
+    if found.std is not None:
+        std[here] = (1 - share) * std[here] + share * found.std
+    seen[here] |= found.seen
+    all_done[here] = True
+    return _Terrain(heights, std, seen, all_done), seam
+
+
+def _ramp(begins: bool, ends: bool, count: int, overlap: int) -> Float[np.ndarray, " n"]:
+    """Numbers from 0 to 1 within an overlap at each side that a terrain goes on beyond."""
+    low, high = (np.arange(count) if side else np.full(count, overlap) for side in (begins, ends))
+    return np.minimum(np.minimum(low, high[::-1]) / overlap, 1)
+
+
+def _hash(values: Any, choices: Any) -> str:
+    digest = hashlib.sha256(repr((choices, jax.tree.structure(values))).encode())
+    for leaf in map(np.asarray, jax.tree.leaves(values)):
+        digest.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
+    return digest.hexdigest()
+
+
+def _save(path: Path, state: _Terrain, fitted: Sequence[Fitted], name: str) -> None:
+    save_checkpoint(path, {"terrain": name, "windows": [list(done) for done in fitted]}, list(vars(state).values()))
+
+
+def _load(path: Path, like: _Terrain, name: str) -> tuple[_Terrain, tuple[Fitted, ...]]:
+    facts = load_facts(path)
+    if facts.get("terrain") != name:
+        raise FileError(f"{path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
+    windows = tuple(Fitted._make([*line[:-1], tuple(line[-1])]) for line in facts["windows"])
+    return _Terrain(*load_arrays(path, list(vars(like).values()))), windows
