@@ -35,7 +35,7 @@ def scene(heights: np.ndarray) -> jaxhf.Scene:
 
 def fitted(**options: Any) -> jaxhf.Fit:
     target = np.asarray(jaxhf.render(scene(TRUTH), SETTINGS))
-    return jaxhf.fit([scene(PRIOR)], [target], settings=SETTINGS, prior=jaxhf.Prior(PRIOR, 0.2), **options)
+    return jaxhf.fit([scene(PRIOR)], [target], settings=SETTINGS, **{"prior": jaxhf.Prior(PRIOR, 0.2), **options})
 
 
 def test_what_is_to_come_is_told_by_the_last_steps():
@@ -62,7 +62,8 @@ def test_lines_tell_what_is_to_come(capsys):
 @pytest.mark.deep
 def test_rejected_steps_are_damped_until_one_is_short_enough():
     """Where the loss is 1e5 standard deviations squared, a damping of 160 still lets steps through that are too long."""
-    found = fitted()
+    # Errors of one cell's length: of none the pictures are asked, and then losses before and after do not compare.
+    found = fitted(prior=jaxhf.Prior(PRIOR, 0.2, 1 / 15))
     assert found.result is not jaxhf.Stop.MAX_STEPS
     assert sum(step.accepted for step in found.history[1:]) > 3
     assert found.stats["loss"] < 0.3 * found.history[0].loss
