@@ -357,7 +357,7 @@ CASES = {
     "jacksboro": Definition("float32", jacksboro),
     "topobathy": Definition("float32", topobathy),
     "hfield": Definition("float32", hfield, UNEXPLAINED),
-    "evening": Definition("float32", evening, ("unseen", *UNEXPLAINED)),  # of the true heights one in a hundred is not
+    "evening": Definition("float32", evening, ("unseen", *UNEXPLAINED)),  # begun at the true heights it says so, too
     "photographs": Definition("float64", photographs),
     "orthophoto": Definition("float32", orthophoto),
     "aslant": Definition("float32", aslant),

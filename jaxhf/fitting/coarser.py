@@ -69,7 +69,7 @@ def _coarser_scene(scene: Scene, camera: Camera, shape: tuple[int, ...]) -> Scen
     ny, nx = old.heights.shape
     heights = _reduced(np.asarray(old.heights, np.float64), shape).astype(old.heights.dtype)
     field = Heightfield(heights, old.dx * (nx - 1) / (shape[1] - 1), old.dy * (ny - 1) / (shape[0] - 1), old.x0, old.y0)
-    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is old)
+    k = scene.first_heightfield
     return eqx.tree_at(lambda scene: scene.objects[k].shape, scene, field).with_camera(camera)
 
 

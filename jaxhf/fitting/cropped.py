@@ -69,7 +69,7 @@ def cropped(
     targets: Sequence[np.ndarray],
     weights: Sequence[np.ndarray],
     terrain: Float[np.ndarray, "my mx"],
-    reach: float,
+    deviation: float,
     window: Window,
 ) -> list[Seen]:
     """What the pictures show of a window of a terrain.
@@ -78,12 +78,12 @@ def cropped(
       scenes: of the whole terrain.
       targets, weights: of each, as `fit` takes them, a weight for each value.
       terrain: its heights as far as they are known.
-      reach: by how much heights may differ from these.
+      deviation: the largest standard deviation of these.
       window: which heights are sought.
     """
     fields = _fields(scenes[0].heightfields[0], terrain, window)
     parts = [_with_surroundings(scene, *fields, window) for scene in scenes]
-    places = [_in_sight(scene, terrain[window.place], reach) for scene in parts]
+    places = [_in_sight(scene, terrain[window.place], _REACH * deviation) for scene in parts]
     # Pictures of one size share a program, those of this window and of the next ones.
     height, width = (max([1, *(place[1][axis] - place[0][axis] for place in places if place is not None)]) for axis in (0, 1))
     found = []
@@ -118,7 +118,7 @@ def _with_surroundings(scene: Scene, part: Heightfield, around: Heightfield, win
     """The scene with the one in place of its terrain and the other as its last object."""
     old = scene.heightfields[0]
     objects = list(scene.objects)
-    k = next(k for k, obj in enumerate(objects) if obj.shape is old)
+    k = scene.first_heightfield
     material, world = objects[k].material, objects[k].world_from_object
     objects[k] = Object(part, _cropped_material(material, old.heights.shape, window), world)
     # Its place is given also where it is the world's: windows at the corner then share a program with the others.
@@ -147,8 +147,7 @@ Corners = tuple[tuple[int, int], tuple[int, int]]
 def _in_sight(scene: Scene, heights: Float[np.ndarray, "ny nx"], reach: float) -> Corners | None:
     """First and last row and column of the picture between which its first heightfield may be seen; None: it is not."""
     local, camera = localise(scene), scene.camera
-    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
-    field, world = scene.heightfields[0], local.objects[k].world_from_object
+    field, world = scene.heightfields[0], local.objects[scene.first_heightfield].world_from_object
     ny, nx = field.heights.shape
     sides = (0, (nx - 1) * field.dx), (0, (ny - 1) * field.dy), (heights.min() - reach, heights.max() + reach)
     corners = np.stack([part.ravel() for part in np.meshgrid(*sides)] + [np.ones(8)])
@@ -173,10 +172,9 @@ def _sight_of(scene: Scene, window: Window, shape: tuple[int, ...]) -> tuple[Boo
     """Which pixels show what is sought, and which may show the rim or what is beyond."""
     _, known = render(scene, Settings(samples=1, shadows=False), aovs=("object", "cell"))
     number, cell = np.asarray(known["object"]), np.asarray(known["cell"])
-    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
     rim = window.rim(shape, _MARGIN)
     rim = rim[:-1, :-1] | rim[1:, 1:]
-    sought = number == k
+    sought = number == scene.first_heightfield
     outer = sought & rim[np.where(sought, cell[..., 1], 0), np.where(sought, cell[..., 0], 0)]
     other = ndimage.binary_dilation(outer | (number == len(scene.objects) - 1), np.ones((3, 3)), _MARGIN)
     return sought & ~other, other

@@ -1,7 +1,6 @@
 """Recovers a terrain window by window, where it has more heights than one fit can hold."""
 
 import dataclasses
-import hashlib
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,19 +14,18 @@ from ..core.errors import ArgumentError
 from ..core.precision import numbers
 from ..core.rules import Whole, require
 from ..core.settings import Settings
-from ..io.checkpoint import load_arrays, load_facts, save_checkpoint
-from ..io.errors import FileError
+from ..io.checkpoint import load_arrays, load_facts_of, save_checkpoint
 from ..preparation.localise import localise
 from ..scene.scene import Scene
 from .cropped import Seen, Window, cropped
 from .fit import Fit, fit
 from .given import Checkpoint, Prior
 from .history import Draws, Step
-from .model.defaults import choose_edge_samples, choose_samples
+from .model.defaults import EDGE_SAMPLES, choose_edge_samples, choose_samples
 from .model.pictures import masked_targets, weights_of
 from .model.surface import make_heights
+from .solve.state import digest
 
-_LEAST_EDGE_SAMPLES = 2048
 _LEAST_WINDOW, _LEAST_OVERLAP = 32, 8  # heights: the outermost four or so of a window are hardly told by its pictures
 
 
@@ -136,21 +134,24 @@ def fit_windows(
     overlap = window // 4 if overlap is None else overlap
     require("fit_windows", "overlap", overlap, Whole(_LEAST_OVERLAP, window // 2))
     mean, std = (make_heights("Prior", name, getattr(prior, name), field) for name in ("heights", "std"))
+    known = Prior(mean, std, prior.length)
     begin = make_heights("fit", "start", field.heights if start is None else start, field)
     state = _Terrain(np.where(std > 0, begin, mean), std.copy(), np.zeros(shape, bool), std == 0)
     order, fitted = divided(shape, window, overlap), ()
     options = {**options, "settings": _settings(scenes, options.get("settings") or Settings(), len(order))}
     path = None if checkpoint is None else Path(checkpoint.path)
-    name = _hash((scenes, targets, weights, mean, std, begin, noise), (prior.length, window, overlap, sorted(options.items())))
+    values = scenes, targets, weights, mean, std, begin, noise
+    choices = prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)
+    name = digest(choices, values)
     if path is not None and path.exists():
         state, fitted = _load(path, state, name)
     for number in range(len(fitted), len(order)):
         place = order[number]
-        seen = cropped(scenes, targets, weights, state.heights, 3 * float(std[place.place].max()), place)
+        seen = cropped(scenes, targets, weights, state.heights, float(std[place.place].max()), place)
         found = None
         if seen:
             tell = None if progress is None else lambda done, number=number: progress(number, len(order), done)
-            found = _fit(seen, state, Prior(mean, std, prior.length), place, noise, tell or False, options)
+            found = _fit(seen, state, known, place, noise, tell or False, options)
         done = Fitted(*place, len(seen))
         if found is not None:
             state, seam = _joined(state, found, place, overlap)
@@ -175,7 +176,7 @@ def _settings(scenes: Sequence[Scene], settings: Settings, count: int) -> Settin
     if settings.edge_samples is not None:
         return settings
     whole = choose_edge_samples(tuple(map(localise, scenes)), choose_samples(scenes, settings))
-    each = max(whole // 2 ** round(math.log2(count) / 2), _LEAST_EDGE_SAMPLES)
+    each = max(whole // 2 ** round(math.log2(count) / 2), EDGE_SAMPLES[0])
     return dataclasses.replace(settings, edge_samples=each) if whole else settings
 
 
@@ -234,20 +235,11 @@ def _ramp(begins: bool, ends: bool, count: int, overlap: int) -> Float[np.ndarra
     return np.minimum(np.minimum(low, high[::-1]) / overlap, 1)
 
 
-def _hash(values: Any, choices: Any) -> str:
-    digest = hashlib.sha256(repr((choices, jax.tree.structure(values))).encode())
-    for leaf in map(np.asarray, jax.tree.leaves(values)):
-        digest.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
-    return digest.hexdigest()
-
-
 def _save(path: Path, state: _Terrain, fitted: Sequence[Fitted], name: str) -> None:
-    save_checkpoint(path, {"terrain": name, "windows": [list(done) for done in fitted]}, list(vars(state).values()))
+    save_checkpoint(path, {"fingerprint": name, "windows": [list(done) for done in fitted]}, list(vars(state).values()))
 
 
 def _load(path: Path, like: _Terrain, name: str) -> tuple[_Terrain, tuple[Fitted, ...]]:
-    facts = load_facts(path)
-    if facts.get("terrain") != name:
-        raise FileError(f"{path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
+    facts = load_facts_of(path, name)
     windows = tuple(Fitted._make([*line[:-1], tuple(line[-1])]) for line in facts["windows"])
     return _Terrain(*load_arrays(path, list(vars(like).values()))), windows

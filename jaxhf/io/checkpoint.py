@@ -32,6 +32,14 @@ def load_facts(path: PathLike) -> dict[str, Any]:
     return json.loads(_body(path).partition(b"\n")[0])
 
 
+def load_facts_of(path: PathLike, fingerprint: str) -> dict[str, Any]:
+    """Those besides its fingerprint; FileError where that is another one."""
+    facts = load_facts(path)
+    if facts.pop("fingerprint", None) != fingerprint:
+        raise FileError(f"{path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
+    return facts
+
+
 def load_arrays(path: PathLike, like: Any) -> Any:
     """The arrays of a checkpoint, in a pytree of the same structure, shapes and dtypes as `like`."""
     return eqx.tree_deserialise_leaves(io.BytesIO(_body(path).partition(b"\n")[2]), like)

@@ -104,6 +104,11 @@ class Scene(Record):
         return tuple(obj.shape for obj in self.objects if isinstance(obj.shape, Heightfield))
 
     @property
+    def first_heightfield(self) -> int:
+        """The number of the first heightfield among `objects`."""
+        return next(number for number, obj in enumerate(self.objects) if isinstance(obj.shape, Heightfield))
+
+    @property
     def heights(self) -> Float[AnyArray, "ny nx"]:
         """The heights of the first heightfield, shape (ny, nx); ValueError where the scene has none."""
         if not self.heightfields:

@@ -160,6 +160,8 @@ def test_windows_go_over_into_one_another(tmp_path, monkeypatch):
     np.testing.assert_array_equal(other.heights, found.heights)
     np.testing.assert_array_equal(other.std, found.std)
     assert repr(other.windows) == repr(found.windows)  # nan is a number there
+    with pytest.raises(ValueError, match="another fit"):
+        jaxhf.fit(scenes(TRUTH, ABOVE), targets, prior=known(), settings=PLAIN, checkpoint=again)
     options["overlap"] = 12
     with pytest.raises(ValueError, match="another fit"):
         fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=again, **options)

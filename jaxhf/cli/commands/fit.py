@@ -1,9 +1,11 @@
 """`jaxhf fit`: a file's pictures to files of heights, watched on a terminal and safe from interruption."""
 
 import argparse
+import contextlib
 import math
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,28 +89,34 @@ def _require_writable(options: argparse.Namespace, *heights: Path) -> None:
         import_extra("matplotlib", "a report needs", "plot")
 
 
-def _fit(case: "Case", checkpoint: Path, resume: bool) -> "Fit":
-    """Fits what the file asks for; KeyboardInterrupt says how to go on, an error of an argument in which line it stands."""
-    from ...fitting.fit import fit
-    from ...fitting.given import Checkpoint, Prior, Unknown
-    from ..progress import told
-
-    interruption.raise_from_now_on()
-    progress = _Progress(", then deviations" if case.options.get("draws") else "")
+@contextlib.contextmanager
+def _told_where(case: "Case", checkpoint: Path) -> Iterator[None]:
+    """KeyboardInterrupt says how to go on, an error of an argument in which line it stands."""
     try:
-        with told(progress.line) as tell:
-            return fit(
-                case.scenes, case.targets, prior=Prior(**case.prior) if case.prior else None,
-                unknown=Unknown(**case.unknown), noise=case.noise, weights=case.weights, settings=case.settings,
-                progress=lambda done: (progress.note(done), tell())[1], checkpoint=Checkpoint(checkpoint, resume=resume),
-                **case.options,
-            )  # fmt: skip
+        yield
     except KeyboardInterrupt:
         if not checkpoint.exists():
             raise
         raise KeyboardInterrupt(f"interrupted; the same command with --resume goes on from {checkpoint}") from None
     except ArgumentError as error:
         raise case.located(error) from error
+
+
+def _fit(case: "Case", checkpoint: Path, resume: bool) -> "Fit":
+    """Fits what the file asks for."""
+    from ...fitting.fit import fit
+    from ...fitting.given import Checkpoint, Prior, Unknown
+    from ..progress import told
+
+    interruption.raise_from_now_on()
+    progress = _Progress(", then deviations" if case.options.get("draws") else "")
+    with _told_where(case, checkpoint), told(progress.line) as tell:
+        return fit(
+            case.scenes, case.targets, prior=Prior(**case.prior) if case.prior else None,
+            unknown=Unknown(**case.unknown), noise=case.noise, weights=case.weights, settings=case.settings,
+            progress=lambda done: (progress.note(done), tell())[1], checkpoint=Checkpoint(checkpoint, resume=resume),
+            **case.options,
+        )  # fmt: skip
 
 
 def _in_windows(case: "Case", checkpoint: Path, options: argparse.Namespace, heights: Path, std: Path) -> None:
@@ -127,20 +135,13 @@ def _in_windows(case: "Case", checkpoint: Path, options: argparse.Namespace, hei
         tell()
 
     begin = time.monotonic()
-    try:
-        with told(lambda seconds: place + progress.line(seconds)) as tell:
-            found = fit_windows(
-                case.scenes, case.targets, prior=Prior(**case.prior) if case.prior else None,
-                unknown=Unknown(**case.unknown) if case.unknown else None, noise=case.noise, weights=case.weights,
-                settings=case.settings, window=options.window, overlap=options.overlap, progress=note,
-                checkpoint=Checkpoint(checkpoint, resume=options.resume), **case.options,
-            )  # fmt: skip
-    except KeyboardInterrupt:
-        if not checkpoint.exists():
-            raise
-        raise KeyboardInterrupt(f"interrupted; the same command with --resume goes on from {checkpoint}") from None
-    except ArgumentError as error:
-        raise case.located(error) from error
+    with _told_where(case, checkpoint), told(lambda seconds: place + progress.line(seconds)) as tell:
+        found = fit_windows(
+            case.scenes, case.targets, prior=Prior(**case.prior) if case.prior else None,
+            unknown=Unknown(**case.unknown) if case.unknown else None, noise=case.noise, weights=case.weights,
+            settings=case.settings, window=options.window, overlap=options.overlap, progress=note,
+            checkpoint=Checkpoint(checkpoint, resume=options.resume), **case.options,
+        )  # fmt: skip
     _save(case, found.heights, found.std, heights, std)
     checkpoint.unlink(missing_ok=True)
     ny, nx = found.heights.shape

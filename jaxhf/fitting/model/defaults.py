@@ -17,7 +17,7 @@ from ...xla.compilation import compiled
 from .linearise import can_be_linearised
 
 _SAMPLES = 4  # a pixel, at least
-_EDGE_SAMPLES = (2048, 32768)  # at least, at most
+EDGE_SAMPLES = (2048, 32768)  # at least, at most
 _EDGE_SAMPLES_PER_PIXEL = 8  # of a picture's boundaries
 
 
@@ -45,7 +45,7 @@ def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: boo
         return 0
     settings = dataclasses.replace(settings, edge_samples=None)  # so that a second call, when some are chosen, compiles nothing
     length = max(float(_boundary_length(view, settings)) for view in views)
-    least, most = _EDGE_SAMPLES
+    least, most = EDGE_SAMPLES
     if length == 0:
         return least if shadows else 0
     return min(max(2 ** round(math.log2(_EDGE_SAMPLES_PER_PIXEL * length)), least), most)

@@ -242,7 +242,7 @@ def completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"])
 
 def _with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
     """The scene with the albedo of its first heightfield multiplied."""
-    k = next(k for k, obj in enumerate(scene.objects) if obj.shape is scene.heightfields[0])
+    k = scene.first_heightfield
     material = scene.objects[k].material
     assert isinstance(material, Matte)
     old = material.albedo

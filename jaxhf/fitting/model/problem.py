@@ -237,7 +237,7 @@ def _first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, unkno
     """Those from which a fit starts: coefficients 0, the albedo, lights and cameras of the scenes, exposure 1 and offset 0."""
     shape, dtype, albedo = scene.heights.shape, scene.heights.dtype, None
     if unknown.albedo is not None:
-        material = next(obj.material for obj in scene.objects if obj.shape is scene.heightfields[0])
+        material = scene.objects[scene.first_heightfield].material
         if not isinstance(material, Matte):
             rule = f"is sought, so the heightfield's material must be Matte, it is {type(material).__name__}"
             raise ArgumentError("Unknown", "albedo", rule)

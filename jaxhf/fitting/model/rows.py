@@ -1,5 +1,6 @@
 """The derivative of linearised pictures in the heights as a sparse matrix on the host, of all or of a part of them."""
 
+import dataclasses
 import functools
 import itertools
 import os
@@ -106,7 +107,9 @@ def _rows_of(expansion: Expansion, place: Place | None) -> Part:
         n, h, w, c = group.targets.shape
         pixels = [np.arange(h * w) if core is None else _pixels_at(known, k, scene, problem, core) for k in range(n)]
         right = _vertices_by_heights(np.asarray(here, np.float64), scene, near)
-        blocks += _of_group(problem, group, known, scene, right, pixels)
+        blocks += _of_group(
+            problem, group, known if core is None else dataclasses.replace(known, edges=None), scene, right, pixels
+        )
         values += [first + (k * h * w + pixels[k]) * c + channel for k in range(n) for channel in range(c)]
         first += n * h * w * c
     exposures = expansion.unknowns.exposures
@@ -144,10 +147,7 @@ def _of_group(
     def product(which: tuple[int, int]) -> Sparse:
         k, channel = which
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[k], known)
-        whole = len(pixels[k]) == scene.camera.width * scene.camera.height
-        samples = PictureSamples(
-            scene.camera, problem.settings, one.edges.resampled if one.edges is not None and whole else None
-        )
+        samples = PictureSamples(scene.camera, problem.settings, None if one.edges is None else one.edges.resampled)
         return _picture_by_vertices(one, samples, channel, right.shape[0], pixels[k]) @ right
 
     # NumPy and SciPy let other threads run as they look up and multiply.
@@ -218,7 +218,7 @@ def _picture_by_vertices(
     known: Linearised, samples: PictureSamples, channel: int, columns: int, pixels: Int[np.ndarray, " pixels"]
 ) -> Sparse:
     """The derivative of a channel of these pixels of a picture in what stands at the vertices: a row for each, and so many
-    columns; all pixels, where boundaries are among the samples."""
+    columns; all pixels, where it has boundaries."""
     chunks, _, numbers, size = known.slopes.shape
     at_vertex = 4 if numbers == 12 else 1
     vertex, number = np.arange(3), np.zeros(3, int)
@@ -232,9 +232,9 @@ def _picture_by_vertices(
     def rows(samples: np.ndarray, share: Any, shape: tuple[int, int]) -> Sparse:
         return _rows(slopes[samples] * share, places[samples][..., vertex] * at_vertex + number, shape)
 
-    if samples.resampled is None or known.edges is None:
+    if known.edges is None:
         return rows(slots, share, shape)
-    resampled, pixel, edges = np.asarray(samples.resampled), np.asarray(known.edges.pixel), known.edges
+    resampled, pixel, edges = np.asarray(known.edges.resampled), np.asarray(known.edges.pixel), known.edges
     share[resampled] = 0
     tiling = Tiling(samples.camera, samples.settings)
     once_more = tiling.count * slots.shape[1] * size + np.arange(resampled.size * resampled_side(samples.settings) ** 2)

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...io.checkpoint import load_arrays, load_facts, save_checkpoint
-from ...io.errors import FileError
+from ...io.checkpoint import load_arrays, load_facts_of, save_checkpoint
 from ..given import Given
 from ..history import Step
 from ..model.problem import Problem
@@ -110,9 +109,7 @@ def save_state(path: Path, state: State, fingerprint: str) -> None:
 
 def load_state(path: Path, like: State, fingerprint: str) -> State:
     """The state of a checkpoint; FileError where it is another fit's. `like`: the state before the first stage."""
-    facts = load_facts(path)
-    if facts.pop("fingerprint") != fingerprint:
-        raise FileError(f"{path}: this is the checkpoint of another fit: its pictures, scenes or options differ")
+    facts = load_facts_of(path, fingerprint)
     leaves, structure = jax.tree.flatten([getattr(like, name) for name in _ARRAYS])
     shapes = zip(facts.pop("shapes"), leaves, strict=True)  # those of a finer level may be others
     blank = [(jnp if isinstance(leaf, jax.Array) else np).zeros(shape, leaf.dtype) for shape, leaf in shapes]
@@ -134,7 +131,12 @@ def fingerprint(problem: Problem, unknowns: Unknowns, given: Given) -> str:
     leaves, structure = jax.tree.flatten((parts, unknowns))
     # What is left open is chosen anew on the way, also where it begins with what another fit is given.
     choices = (settings, structure, given.noise is None, given.settings.edge_samples is None)
-    digest = hashlib.sha256(repr(choices).encode())
-    for leaf in map(np.asarray, leaves):
-        digest.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
-    return digest.hexdigest()
+    return digest(choices, leaves)
+
+
+def digest(choices: Any, values: Any) -> str:
+    """A hash of what `repr` tells of choices, and of the bits of a pytree's leaves."""
+    found = hashlib.sha256(repr(choices).encode())
+    for leaf in map(np.asarray, jax.tree.leaves(values)):
+        found.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
+    return found.hexdigest()
