@@ -34,7 +34,9 @@ PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 SLOW = {"docs/gallery.md", "docs/tutorials/photographs.md"}  # minutes; what the latter finds has a test of its own
 DEEP = {  # over four seconds of a processor
+    "README.md",
     "docs/coming-from/gdal.md",
+    "docs/coming-from/mitsuba.md",
     "docs/index.md",
     *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/sun-and-sky", "guides/view")),
     *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "picture", "robots")),

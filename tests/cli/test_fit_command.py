@@ -260,6 +260,7 @@ def slow(folder, minute, *more, **streams):
     return subprocess.Popen([sys.executable, "-c", SLOW, str(minute), *words], **streams)
 
 
+@pytest.mark.deep
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no pseudo-terminals")
 def test_a_terminal_is_told_what_is_to_come(folder):
     """Before the first step is done, while one is under way, and of the deviations."""

@@ -39,6 +39,7 @@ def test_skyview(run, tmp_path):
         np.testing.assert_array_equal(np.asarray(picture)[::-1], np.rint(255 * np.nan_to_num(expected)))
 
 
+@pytest.mark.deep  # by value in maps/test_skyview.py
 def test_skyview_by_each_weighting(run, tmp_path):
     """Of a plane that rises by 1.5 to the east for each 2, by 1.2 to the north for each 3: there horizons are known."""
     rows, columns = np.indices((5, 7))

@@ -29,6 +29,7 @@ def terrain(tmp_path_factory) -> str:
 
 
 @pytest.mark.filterwarnings("always:view. the heights go from")
+@pytest.mark.deep  # scene/test_framing.py has the camera
 def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, command):
     code, out, err = command("view", terrain, "-o", tmp_path / "out.png", "--water", "-9", *SMALL)
     assert (code, "48 x 32 pixels, heights x 1, " in out) == (0, True)
@@ -42,6 +43,7 @@ def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, comman
     assert len(np.unique(image[~background], axis=0)) > 100
 
 
+@pytest.mark.deep  # of the pictures that the next test has one of
 def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch, command):
     """Each film prepares its terrain once."""
     framing, views = jaxhf.Perspective.framing, []

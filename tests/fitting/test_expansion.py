@@ -142,14 +142,8 @@ ALBEDOS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("name", "channels"),
-    [
-        ("vertices", 1),
-        ("texels that repeat", 3),
-        *(pytest.param(name, 1, marks=pytest.mark.deep) for name in ALBEDOS if name not in ("vertices", "texels that repeat")),
-    ],
-)
+@pytest.mark.deep  # test_fit.py finds a map of it
+@pytest.mark.parametrize(("name", "channels"), [("texels that repeat", 3), *((name, 1) for name in ALBEDOS)])
 def test_the_derivative_in_an_albedo_is_a_difference_of_two_pictures(name, channels):
     """Light is proportional to it, so the difference is exact however far apart they are."""
     albedo, kind = ALBEDOS[name]

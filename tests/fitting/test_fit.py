@@ -122,6 +122,7 @@ def off_by_a_degree(scene: jaxhf.Scene, k: int) -> jaxhf.Scene:
     return scene.with_camera(camera).with_lights([jaxhf.Directional(towards)])
 
 
+@pytest.mark.deep  # their part of each product is in test_normal_matrix.py
 def test_lights_and_cameras_that_are_off_by_a_degree_are_found():
     """An eighth of the heights is surveyed: else terrain, cameras and lights could turn together by a degree.
 
@@ -177,6 +178,7 @@ def noisy_fit(rng: np.random.Generator, targets: list[np.ndarray], draws: int) -
     return jaxhf.fit(scenes(prior), noisy, settings=SETTINGS, noise=NOISE, prior=jaxhf.Prior(prior, PRIOR_STD), draws=draws)
 
 
+@pytest.mark.deep  # once, of another renderer's pictures, in test_fit_truth.py
 def test_draws_hold_the_truth_as_often_as_they_say(targets):
     """12 fits of 144 heights, with deviations by 50 draws: 68.3 % and 95.4 %, and by the covariance that NumPy finds.
 

@@ -94,6 +94,7 @@ def test_after_ctrl_c_it_goes_on_to_the_same_bits(tmp_path, whole, last):
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.deep  # steps go on to the same bits above
 def test_it_goes_on_among_rejected_steps(tmp_path, monkeypatch):
     """After one, and after two in a row, where λ grows faster: where hardly a step gains twice what was predicted."""
     monkeypatch.setattr(_steps, "_LEAST_GAIN", 2.0)
@@ -258,6 +259,7 @@ def run_python(program: str, *arguments: str) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, "-c", start + program, *arguments], stdout=subprocess.PIPE, text=True)
 
 
+@pytest.mark.deep  # what is kept on Ctrl-C is kept as it goes
 def test_a_killed_process_loses_at_most_one_interval(tmp_path, monkeypatch):
     path, options = tmp_path / "fit.checkpoint", {"max_steps": 12, "noise": 1.0}
     program = (

@@ -81,6 +81,7 @@ def test_noise_is_found_in_spite_of_shadows_that_stand_elsewhere(count):
     assert found.stats["chi2"] > 1.2
 
 
+@pytest.mark.deep  # test_fit_truth.py has it of common pictures
 def test_chi2_is_by_degree_of_freedom_where_the_noise_is_given():
     found = fitted(1, 0.6, 1, noise=NOISE)
     assert 0.8 < found.stats["chi2"] < 1.2  # of some 340 degrees of freedom: to 8 %
@@ -104,8 +105,9 @@ def test_a_noise_that_pictures_cannot_tell_is_asked_for():
     assert any("noise= tells the fit" in warning for warning in found.warnings)
 
 
+@pytest.mark.deep
 def test_a_surface_that_is_not_lamberts_is_a_suspect():
-    found = fitted(1, 0.6, 1, matte=False)
+    found = fitted(1, 0.6, 1, matte=False, prior=jaxhf.Prior(0.0, 0.6))
     assert any("does not reflect as Matte does" in warning for warning in found.warnings)
 
 
@@ -125,20 +127,24 @@ def test_a_part_of_the_pictures_tells_their_noise(monkeypatch):
     np.testing.assert_allclose(part.noise(True).noise, NOISE, rtol=0.15)  # of some 300 degrees of freedom: to 4 %
 
 
-def test_errors_of_a_map_are_asked_of_the_pictures(monkeypatch):
-    """A map of smooth errors, of which that is not known, is as good as where it is; taken for independent they cost most."""
+def fitted_to_a_map(length: float | None) -> float:
+    """By what heights are off that are fitted from a map with smooth errors, which is said to have this length."""
     heights, rng = terrain(1, 0.6)
     smooth = gaussian_filter(heights, 3.0)
-    std = float((smooth - heights).std())
     exact = np.asarray(jaxhf.render(scenes(heights, 1)[0], jaxhf.Settings(samples=16)))[..., 0]
     target = exact + NOISE * rng.standard_normal(exact.shape)
+    prior = jaxhf.Prior(smooth, float((smooth - heights).std()), length)
+    found = jaxhf.fit(scenes(smooth, 1), [target], settings=SETTINGS, prior=prior)
+    return float(np.std(np.asarray(found.heights) - heights))
 
-    def error(length: float | None) -> float:
-        found = jaxhf.fit(scenes(smooth, 1), [target], settings=SETTINGS, prior=jaxhf.Prior(smooth, std, length))
-        return float(np.std(np.asarray(found.heights) - heights))
 
-    asked, told = error(None), error(2.1)
+def test_errors_of_a_map_are_asked_of_the_pictures(monkeypatch):
+    """Where their length is not known; taken for independent they cost most."""
+    asked = fitted_to_a_map(None)
     monkeypatch.setattr(_run, "_MOST_WIDTH", 1.0)
-    independent = error(None)
-    assert asked < 1.1 * told
-    assert asked < 0.8 * independent
+    assert asked < 0.8 * fitted_to_a_map(None)
+
+
+@pytest.mark.deep
+def test_a_map_is_as_good_without_the_length_of_its_errors():
+    assert fitted_to_a_map(None) < 1.1 * fitted_to_a_map(2.1)

@@ -32,6 +32,10 @@ PRIORS = {
     "correlated": jaxhf.Prior(TRUTH, 0.05, 0.2),
     "correlated, some held": jaxhf.Prior(TRUTH, HELD, 0.2),
 }
+BOTH = "correlated, some held"  # of whose terms the others have a part
+EACH = pytest.mark.parametrize(
+    "prior", [*(pytest.param(name, marks=pytest.mark.deep) for name in PRIORS if name != BOTH), BOTH]
+)
 # What single precision leaves; double leaves no room for an error that it would hide.
 PRECISIONS = pytest.mark.parametrize(
     "rounding", [3e-4, pytest.param(1e-9, marks=[pytest.mark.x64, pytest.mark.deep])], ids=["single", "double"]
@@ -61,7 +65,7 @@ def dense(here: Expansion, roots: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
 
 
 @PRECISIONS
-@pytest.mark.parametrize("prior", PRIORS)
+@EACH
 def test_it_is_the_square_of_the_derivative(prior, rounding):
     """Of all residuals in all unknowns; so is the gradient of their squares. What holds heights gives them no row."""
     if prior == "none" and rounding < 1e-6:
@@ -112,7 +116,7 @@ def test_a_part_of_the_pictures_depends_on_a_part_of_the_heights(prior):
     np.testing.assert_allclose(matrix.product(matrix.solved(right, 1e-6)), right, rtol=0, atol=1e-5 * rms(right) * right.size)
 
 
-@pytest.mark.parametrize("prior", PRIORS)
+@EACH
 def test_its_near_inverse_is_near(prior):
     """Near enough for a few iterations.
 
@@ -139,7 +143,7 @@ DRAWS = {
 }
 
 
-@pytest.mark.parametrize("name", DRAWS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.deep) if "map" in name else name for name in DRAWS])
 def test_draws_have_its_inverse_as_their_covariance(name, monkeypatch):
     """x = H⁻¹ Jᵀz with z of covariance 1: as a dense matrix has them, with the weights of the robust loss.
 

@@ -62,29 +62,26 @@ def test_windows_cover_a_terrain_and_overlap(shape, side, overlap):
         assert len(begins) == max(1, -(-(shape[axis] - overlap) // (side - overlap)))
 
 
-@pytest.mark.parametrize("name", CAMERAS)
-def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name):
-    """Where it counts it is the whole picture's part, with shadows that come from outside; the rim does not count."""
-    whole = scenes(TRUTH, CAMERAS[name])
-    images = [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in whole]
+TEXELS = np.random.default_rng(3).uniform(0.3, 0.9, (SIDE, SIDE, 3)).astype(np.float32)
+PAINTED = jaxhf.ImageTexture(TEXELS, at_vertices=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "albedo"), [("perspective", PAINTED), pytest.param("orthographic", 0.7, marks=pytest.mark.deep)]
+)
+def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
+    """Where it counts it is the whole picture's part, with its texture and shadows from outside; the rim does not count."""
+    whole = scenes(TRUTH, CAMERAS[name], albedo)
+    images = [np.asarray(jaxhf.render(scene, SETTINGS)) for scene in whole]
     parts = cropped(whole, images, [np.ones_like(image) for image in images], TRUTH.astype(np.float64), 0.0, WINDOW)
     assert len(parts) == len(whole)
     for part in parts:
         assert part.scene.heightfields[0].heights.shape == (24, 24)
         shown, aovs = jaxhf.render(part.scene, SETTINGS, aovs=("object",))
-        counts, number = part.weight > 0, np.asarray(aovs["object"])
-        np.testing.assert_allclose(np.asarray(shown)[..., 0][counts], part.target[counts], rtol=0, atol=2e-5)
+        counts, number = part.weight[..., 0] > 0, np.asarray(aovs["object"])
+        np.testing.assert_allclose(np.asarray(shown)[counts], part.target[counts], rtol=0, atol=2e-5)
         assert 0.25 < (counts & (number == 0)).sum() / (number == 0).sum() < 1
         assert not (counts & (number == 1)).any()
-
-
-def test_a_texture_stays_where_it_is():
-    texels = np.random.default_rng(3).uniform(0.3, 0.9, (SIDE, SIDE, 3)).astype(np.float32)
-    painted, *_ = scenes(TRUTH, albedo=jaxhf.ImageTexture(texels, at_vertices=True))
-    image = np.asarray(jaxhf.render(painted, SETTINGS))
-    (part,) = cropped([painted], [image], [np.ones_like(image)], TRUTH.astype(np.float64), 0.0, WINDOW)
-    counts = part.weight > 0
-    np.testing.assert_allclose(np.asarray(jaxhf.render(part.scene, SETTINGS))[counts], part.target[counts], rtol=0, atol=2e-5)
 
 
 @pytest.mark.deep

@@ -109,6 +109,7 @@ np.savez(sys.argv[1], **maps)
 """
 
 
+@pytest.mark.deep  # rendering/test_devices.py has that of pictures
 def test_any_number_of_devices_gives_the_same_bits(tmp_path):
     """All four of a process, which is the default, and three by `mesh`, for twelve tiles."""
     path = tmp_path / "maps.npz"

@@ -219,6 +219,7 @@ def test_progress_gives_the_same_bits():
 # Samples and steps.
 
 
+@pytest.mark.deep  # test_references.py has means of samples by pbrt and Mitsuba
 def test_samples_are_those_of_a_larger_picture():
     """The picture, and its derivative."""
     large = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=2 * WIDTH, height=2 * HEIGHT)

@@ -20,6 +20,7 @@ def scene(heights, lights, world=None):
     return jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights, 1.0), jaxhf.Matte(1.0), world)], camera, lights)
 
 
+@pytest.mark.deep  # maps/test_skyview.py has its share of the sky against every crossing
 def test_a_hidden_sky_is_that_of_many_suns():
     """In as many azimuths, each for its part of the hemisphere.
 

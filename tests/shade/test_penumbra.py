@@ -198,6 +198,7 @@ def test_sheets_hide_the_sun_from_below_and_from_above():
         assert np.abs(found - expected).mean() < 0.002 * expected.max()
 
 
+@pytest.mark.deep  # 1024 suns say the same of other places
 def test_a_lid_hides_a_sun_overhead():
     """Up to the zenith and beyond: half of each chord lies there. A lid beneath the ground hides nothing."""
     (ground, place_of_ground), (lid, _) = sheet(GROUND, 3), sheet((-20, 26, -20, 26, 0, 0, 0), 2)

@@ -204,6 +204,7 @@ def test_a_light_on_the_ground_is_not_behind_it(place, dtype):
     assert dark(z - 1e-3).all()
 
 
+@DEEP  # boundary/test_edges.py has one, too
 def test_one_heightfield_shadows_another():
     # A tile over 3..5 by 1.5..2.5 at height 2; the light has slope 1 along x, so its shadow is 2 further west.
     tile = ground(np.full((5, 9), 2.0), dx=0.25, x0=3.0, y0=1.5)
@@ -295,6 +296,7 @@ def parallel_mirrors(camera):
     return jaxhf.Scene(mirrors, camera, [jaxhf.Sky(RADIANCE)])
 
 
+@DEEP  # of mirrors that show a wall, below
 def test_mirror_under_the_sky():
     for z, reflectance in ((2.0, UPPER), (-1.0, LOWER)):
         image = jaxhf.render(parallel_mirrors(perspective((4, 1, z), (4, 2, 0.5))[0]))

@@ -55,6 +55,7 @@ def test_picture_errors_by_hand(monkeypatch):
     assert picture.errors(reference)["p999"] < 2.5 * 0.01
 
 
+@pytest.mark.deep
 def test_centre_hits_are_those_of_the_aovs():
     """A terrain that fills the middle of the picture only; its triangles from the place in the cell."""
     heights = np.arange(12.0).reshape(3, 4) / 30
