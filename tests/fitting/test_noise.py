@@ -1,11 +1,15 @@
 """How large noise is where heights are as many as pixels, and so explain a part of it."""
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from small_fits import expanded, given
+from small_fits import SETTINGS as SMALL, SIZE, TRUTH, expanded, given, scenes as small_scenes
 
 import jaxhf
+from jaxhf.fitting.model.linearise import LinearisedEdges, changing_pixels
 from jaxhf.fitting.model.problem import make_problem
 from jaxhf.fitting.solve import noise as _noise, run as _run
 from jaxhf.fitting.solve.noise import Restricted
@@ -109,6 +113,21 @@ def test_a_noise_that_pictures_cannot_tell_is_asked_for():
 def test_a_surface_that_is_not_lamberts_is_a_suspect():
     found = fitted(1, 0.6, 1, matte=False, prior=jaxhf.Prior(0.0, 0.6))
     assert any("does not reflect as Matte does" in warning for warning in found.warnings)
+
+
+def test_pixels_tell_that_change_with_the_heights_that_are_sought():
+    """A lid over their north shows none of them; of a picture in which no shading does, those that a boundary crosses."""
+    (scene,) = small_scenes(TRUTH, others=[jaxhf.Object(jaxhf.Heightfield(np.full((2, 2), 0.3), dx=1.0, y0=0.5))])[:1]
+    _, aovs = jaxhf.render(scene, SMALL, aovs=("object",))
+    here = expanded([scene], [np.zeros((SIZE, SIZE))], settings=SMALL, noise=0.01)
+    (known,) = here.linearised
+    assert known is not None
+    np.testing.assert_array_equal(changing_pixels(known)[0], np.asarray(aovs["object"]) == 0)
+    assert 0.3 < changing_pixels(known).mean() < 0.7
+    none, pixel, kind = jnp.zeros((1, 1, 1, 5, 3)), jnp.array([[5, 7, 9]]), jnp.array([[0, 1, 2]])
+    edges = LinearisedEdges(none, jnp.zeros((1, 1, 5, 3), np.int32), pixel, kind, pixel)
+    told = changing_pixels(dataclasses.replace(known, depends=jnp.zeros_like(known.depends), edges=edges))
+    assert np.flatnonzero(told).tolist() == [7, 9]
 
 
 def test_a_part_of_the_pictures_tells_their_noise(monkeypatch):

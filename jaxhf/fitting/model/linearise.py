@@ -15,6 +15,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
@@ -54,7 +55,7 @@ class Linearised(eqx.Module):
     Attributes:
       image: shape (h, w, c). Pixels that are resampled have the mean of those samples: where a boundary crosses a pixel, few
         samples make a staircase, on which no step along the derivative leads down.
-      depends: whether any of a pixel's samples changes with the heights, shape (h, w).
+      depends: whether any of a pixel's samples changes with the heights of the first heightfield, shape (h, w).
       sampling: standard deviation of a pixel's error from its having so few samples, radiance, shape (h, w).
       slopes: derivatives of each sample, (chunks, c, 3 or 12, samples): in the three heights, then, vertex by vertex, in the
         normals.
@@ -106,6 +107,16 @@ class LinearisedEdges(eqx.Module):
     kind: Int[jax.Array, "*n points"]
     resampled: Int[jax.Array, "*n pixels"]
     view: View = KNOWN
+
+
+def changing_pixels(known: Linearised) -> Bool[np.ndarray, "n h w"]:
+    """Which pixels of pictures change with the heights; of one in which no shading does, those that a boundary crosses."""
+    found = np.array(known.depends)
+    if known.edges is not None:
+        for picture, pixel, kind in zip(found, np.asarray(known.edges.pixel), np.asarray(known.edges.kind), strict=True):
+            if not picture.any():
+                picture.ravel()[pixel[kind > 0]] = True
+    return found
 
 
 def can_be_linearised(scene: Scene, settings: Settings) -> bool:
@@ -226,7 +237,8 @@ def _linearise(
             known.reshape(-1, channels).at[drawn.resampled].set(new, unique_indices=True).reshape(image.shape)
             for known, new in ((image, finer.mean(1)), (sampling, error))
         )
-    moving = (slopes != 0).any(axis=(1, 2)).astype(light.dtype)[..., None]
+    sought = vertices[:, 0] < world.grids[0][1].rows.shape[0]
+    moving = ((slopes != 0).any(axis=(1, 2)) & sought).astype(light.dtype)[..., None]
     depends = samples.in_pixels(moving)[..., 0] > 0
     sampling = jnp.sqrt(jnp.mean(sampling * sampling, axis=-1))
     albedo = None if albedo is None else LinearisedAlbedo(*albedo)

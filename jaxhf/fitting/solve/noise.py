@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..model.expansion import Expansion
+from ..model.linearise import changing_pixels
 from ..model.near_inverse import near_inverse
 from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, PartMatrix, in_row
 from ..model.problem import Problem
@@ -251,10 +252,11 @@ def _values_that_tell(expansion: Expansion) -> Labels:
     problem, found = expansion.problem, []
     for group, known in zip(problem.groups, expansion.linearised, strict=True):
         labels = np.full(group.targets.shape, -1)
+        changing = None if known is None else changing_pixels(known)
         for position, k in enumerate(group.indices):
             counted = np.asarray(group.given)[position] > 0
-            if known is not None:
-                shown = counted & np.asarray(known.depends)[position][..., None]
+            if known is not None and changing is not None:
+                shown = counted & changing[position][..., None]
                 if shown.any():
                     error = np.broadcast_to(np.asarray(known.sampling)[position][..., None], shown.shape)
                     most = max(np.median(error[shown]), _FINE * problem.noise[k])

@@ -12,6 +12,7 @@ from ...trace.normals import vertex_normals
 from ...xla.compilation import compiled
 from ..given import Given
 from ..model.expansion import Expansion
+from ..model.linearise import changing_pixels
 from ..model.problem import Problem
 from ..model.robust import influence_function
 from ..solve.noise import Freedom, octaves
@@ -137,7 +138,7 @@ def informing_values(expansion: Expansion) -> list[Bool[np.ndarray, "h w c"]]:
     for group, known in zip(expansion.problem.groups, expansion.linearised, strict=True):
         informing = np.asarray(group.weights) > 0
         if known is not None:
-            informing &= np.asarray(known.depends)[..., None]
+            informing &= changing_pixels(known)[..., None]
         for k, values in zip(group.indices, informing, strict=True):
             found[k] = values
     return found
