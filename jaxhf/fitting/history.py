@@ -23,7 +23,7 @@ class Step(NamedTuple):
       level: how many DCT modes are varied along the longer side.
       loss: half the sum of squared residuals after it.
       accepted: whether the heights changed.
-      damping: Levenberg-Marquardt's λ.
+      damping: Levenberg-Marquardt's λ; 0 of the last steps, see docs/concepts/recovery.md.
       change: of the heights, root mean square, height units.
       seconds: since the fit began; a resumed one goes on counting.
       to_come: about how many steps will follow, by what fits take as a rule; None in `Fit.history`.

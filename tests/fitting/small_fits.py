@@ -4,12 +4,16 @@ import dataclasses
 import inspect
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 
 import jaxhf
 from jaxhf.fitting.given import Given
-from jaxhf.fitting.model.expansion import Expansion, expand
+from jaxhf.fitting.model.expansion import Expansion, expand, prior_residuals
+from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.model.problem import make_problem
 from jaxhf.fitting.model.units import balanced
 from jaxhf.scene.procedural import fractal
@@ -20,6 +24,7 @@ LIGHTS = ((0.5, -0.3, 0.6), (0.3, 0.5, 0.6), (-0.5, 0.3, 0.6))
 SIZE = 24
 CAMERA = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0), fov=18.6, width=SIZE, height=SIZE)
 HALF = jaxhf.Perspective.look_at((0.25, 0.5, 3), (0.25, 0.5, 0), up=(0, 1, 0), fov=7.6, width=SIZE, height=SIZE)
+EVERYTHING = jaxhf.Unknown(albedo="constant", exposures=True, offsets=True, light_std=1.0, camera_std=(0.01, 1.0))
 TRUTH = fractal([12, 12], seed=3, exponent=3.0, range=(0.0, 0.1))
 
 
@@ -48,6 +53,28 @@ def expanded(scenes: list[jaxhf.Scene], targets: list[np.ndarray], **options) ->
     here = expand(unknowns, problem)
     scale = jnp.asarray(balanced(here)[0], problem.basis.scale.dtype)
     return here.of(dataclasses.replace(problem, basis=dataclasses.replace(problem.basis, scale=scale)))
+
+
+def dense(here: Expansion, roots: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """J of the pictures, by their change with each unknown, J of the priors, by JAX, and which unknowns are not held."""
+    basis, dtype = here.problem.basis, here.unknowns.coefficients.dtype
+    others = here.unknowns.without_modes()
+    flat, unflat = jax.flatten_util.ravel_pytree((jnp.zeros_like(basis.base), others))
+    rows = [in_row(here.push(unflat(jnp.zeros_like(flat).at[k].set(1)))) for k in range(flat.size)]
+
+    def priors(x: jax.Array) -> jax.Array:
+        """Of unknowns that have moved by x; the base takes what a mode would, so that held heights move, too."""
+        surface, more = unflat(x)
+        problem = dataclasses.replace(here.problem, basis=dataclasses.replace(basis, base=basis.base + surface, free=None))
+        moved = jax.tree.map(lambda a, b: a + b, others, more)
+        unknowns = eqx.tree_at(lambda u: u.coefficients, moved, jnp.zeros_like(basis.base), is_leaf=lambda leaf: leaf is None)
+        return jax.flatten_util.ravel_pytree(prior_residuals(unknowns, problem))[0]
+
+    free = np.ones(flat.size)
+    if basis.free is not None:
+        free[: basis.base.size] = np.ravel(basis.free)
+    jacobian = np.asarray(jax.jit(jax.jacfwd(priors))(jnp.zeros(flat.size, dtype)), np.float64)
+    return roots[:, None] * np.stack(rows, axis=1) * free, jacobian * free, free > 0
 
 
 def rms(values: Any) -> float:

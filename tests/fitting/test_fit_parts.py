@@ -175,10 +175,17 @@ def problems_of(*shapes: tuple[int, int]) -> list[Problem]:
 
 
 def test_stages_double_from_eight_modes():
-    """Through the heights of each level, and all modes of the finest once more."""
-    assert stages(problems_of((64, 40))) == [(0, 0.125), (0, 0.25), (0, 0.5), (0, 1.0), *[(0, 1.0)] * 3]
-    assert stages(problems_of((12, 12))) == [(0, 1.0)] * 4
-    assert stages(problems_of((16, 16), (64, 64))) == [(0, 0.5), (0, 1.0), (1, 0.5), (1, 1.0), *[(1, 1.0)] * 3]
+    """Through the heights of each level, all modes of the finest once more, and in the end by factors."""
+
+    def shares(*shapes: tuple[int, int]) -> list[tuple[int, float]]:
+        *stepped, last = stages(problems_of(*shapes))
+        assert last == (len(shapes) - 1, 1.0, True)
+        assert not any(stage.by_factors for stage in stepped)
+        return [stage[:2] for stage in stepped]
+
+    assert shares((64, 40)) == [(0, 0.125), (0, 0.25), (0, 0.5), (0, 1.0), *[(0, 1.0)] * 3]
+    assert shares((12, 12)) == [(0, 1.0)] * 4
+    assert shares((16, 16), (64, 64)) == [(0, 0.5), (0, 1.0), (1, 0.5), (1, 1.0), *[(1, 1.0)] * 3]
 
 
 def test_coarser_pictures_are_means_of_the_pixels_that_count():

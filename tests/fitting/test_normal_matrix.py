@@ -4,27 +4,24 @@ import dataclasses
 import functools
 
 import equinox as eqx
-import jax
-import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse
-from small_fits import SETTINGS, SIZE, TRUTH, expanded, pictures, rms, scenes
+from small_fits import EVERYTHING, SETTINGS, SIZE, TRUTH, dense, expanded, pictures, rms, scenes
 
 import jaxhf
+from jaxhf.fitting.model import near_inverse as _near_inverse
 from jaxhf.fitting.model.expansion import Expansion, prior_residuals
 from jaxhf.fitting.model.linearise import LinearisedEdges
 from jaxhf.fitting.model.near_inverse import near_inverse
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, PartMatrix, in_row
 from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
-from jaxhf.fitting.trust import deviations as _deviations
 from jaxhf.fitting.trust.boundaries import Boundaries
 from jaxhf.fitting.trust.deviations import standard_deviations
 
 OPTIONS = {"settings": SETTINGS, "noise": 0.01}
 VALUES = 3 * SIZE * SIZE
-EVERYTHING = jaxhf.Unknown(albedo="constant", exposures=True, offsets=True, light_std=1.0, camera_std=(0.01, 1.0))
 HELD = np.where(np.indices(TRUTH.shape).sum(0) % 5 == 0, 0.0, 0.05)
 PRIORS = {
     "none": None,
@@ -40,28 +37,6 @@ EACH = pytest.mark.parametrize(
 PRECISIONS = pytest.mark.parametrize(
     "rounding", [3e-4, pytest.param(1e-9, marks=[pytest.mark.x64, pytest.mark.deep])], ids=["single", "double"]
 )
-
-
-def dense(here: Expansion, roots: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """J of the pictures, by their change with each unknown, J of the priors, by JAX, and which unknowns are not held."""
-    basis, dtype = here.problem.basis, here.unknowns.coefficients.dtype
-    others = here.unknowns.without_modes()
-    flat, unflat = jax.flatten_util.ravel_pytree((jnp.zeros_like(basis.base), others))
-    rows = [in_row(here.push(unflat(jnp.zeros_like(flat).at[k].set(1)))) for k in range(flat.size)]
-
-    def priors(x: jax.Array) -> jax.Array:
-        """Of unknowns that have moved by x; the base takes what a mode would, so that held heights move, too."""
-        surface, more = unflat(x)
-        problem = dataclasses.replace(here.problem, basis=dataclasses.replace(basis, base=basis.base + surface, free=None))
-        moved = jax.tree.map(lambda a, b: a + b, others, more)
-        unknowns = eqx.tree_at(lambda u: u.coefficients, moved, jnp.zeros_like(basis.base), is_leaf=lambda leaf: leaf is None)
-        return jax.flatten_util.ravel_pytree(prior_residuals(unknowns, problem))[0]
-
-    free = np.ones(flat.size)
-    if basis.free is not None:
-        free[: basis.base.size] = np.ravel(basis.free)
-    jacobian = np.asarray(jax.jit(jax.jacfwd(priors))(jnp.zeros(flat.size, dtype)), np.float64)
-    return roots[:, None] * np.stack(rows, axis=1) * free, jacobian * free, free > 0
 
 
 @PRECISIONS
@@ -156,7 +131,7 @@ def test_draws_have_its_inverse_as_their_covariance(name, monkeypatch):
     covariance = np.zeros((free.size, free.size))
     covariance[np.ix_(free, free)] = np.linalg.inv((by_pictures.T @ by_pictures + by_priors.T @ by_priors)[np.ix_(free, free)])
     if name == "by modes":
-        monkeypatch.setattr(_deviations, "pictures_by_heights", lambda _: None)
+        monkeypatch.setattr(_near_inverse, "pictures_by_heights", lambda _: None)
     found = standard_deviations(here, 3)
     assert (found.displacement, found.raised) == (0.0, 1.0)
     matrix = NormalMatrix(here, np.ones(VALUES))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 import scipy.sparse
@@ -10,13 +11,25 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from ...scene.heightfield import Heightfield
-from .normal_matrix import MOST_OTHERS, Flat, NormalMatrix
-from .rows import Sparse, scaled
+from .expansion import Expansion
+from .normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row
+from .robust import robust_weight
+from .rows import Sparse, pictures_by_heights, scaled
 from .surface import slope_units
 
 sp: Any = scipy.sparse  # whose stubs miss much
 _PROBES = 8  # of their curvature, where they are more
 _DEGREE = 3  # of the polynomial in the Laplacian that stands for a prior
+
+
+def robust_matrix(expansion: Expansion) -> NormalMatrix:
+    """The normal matrix, its residuals weighted as the robust loss weighs them; with its near inverse where it `has_rows`."""
+    roots = np.sqrt(np.asarray(robust_weight(jnp.asarray(in_row(expansion.left())), expansion.problem.loss_scale)))
+    rows = pictures_by_heights(expansion)
+    matrix = NormalMatrix(expansion, roots, rows)
+    if rows is not None:
+        matrix.inverse = near_inverse(matrix)
+    return matrix
 
 
 def near_inverse(matrix: NormalMatrix) -> Callable[[Flat], Flat]:

@@ -4,6 +4,7 @@ import copy
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from .expansion import Expansion, surface_of
+from .surface import Unknowns
 
 linalg: Any = scipy.sparse.linalg  # whose stubs miss much
 fft: Any = scipy.fft
@@ -74,7 +76,7 @@ class NormalMatrix:
 
     def product(self, x: Flat) -> Flat:
         """H x."""
-        surface, others = self._split(x)
+        surface, others = self.split(x)
         result = self._pulled(self.seen(x) * self.roots)
         result[: surface.size] += self._prior_pull(self._prior_push(surface)).ravel()
         result[surface.size :] += self.others_weight**2 * others
@@ -82,7 +84,7 @@ class NormalMatrix:
 
     def seen(self, x: Flat) -> Float[np.ndarray, " rows"]:
         """J x: the change of the pictures, in units of the noise, times the roots."""
-        surface, others = self._split(x)
+        surface, others = self.split(x)
         surface = self.free * surface
         if self.columns is None:
             return self._by_jax(surface, others) * self.roots
@@ -128,7 +130,7 @@ class NormalMatrix:
 
     def modes_of(self, x: Flat) -> Float[np.ndarray, "my mx"]:
         """The modes of the surface's prior by which it moves, in units of their deviations."""
-        return self._prior_push(self._split(x)[0])
+        return self._prior_push(self.split(x)[0])
 
     def modes_before(self) -> Float[np.ndarray, "my mx"]:
         """By which the surface differs from its prior."""
@@ -136,9 +138,18 @@ class NormalMatrix:
 
     def heights_of(self, x: Flat) -> Float[np.ndarray, "ny nx"]:
         """The change of the heights, without their padding."""
-        return self.expansion.problem.basis.crop(self.free * self._split(x)[0])
+        return self.expansion.problem.basis.crop(self.free * self.split(x)[0])
 
-    def _split(self, x: Flat) -> tuple[Float[np.ndarray, "my mx"], Float[np.ndarray, " k"]]:
+    def unknowns_of(self, x: Flat) -> Unknowns:
+        """The change of the unknowns."""
+        surface, others = self.split(x)
+        modes = fft.dctn(self.free * surface, norm="ortho") / np.asarray(self.expansion.problem.basis.scale, np.float64)
+        unknowns = self.unflat(jnp.asarray(others, self.dtype))
+        return eqx.tree_at(
+            lambda u: u.coefficients, unknowns, jnp.asarray(modes, self.dtype), is_leaf=lambda leaf: leaf is None
+        )
+
+    def split(self, x: Flat) -> tuple[Float[np.ndarray, "my mx"], Float[np.ndarray, " k"]]:
         count = int(np.prod(self.shape))
         return x[:count].reshape(self.shape), x[count:]
 
@@ -149,7 +160,7 @@ class NormalMatrix:
         return self.weight * fft.idctn(self.spectrum * modes, norm="ortho")
 
     def _by_modes(self, x: Flat) -> Flat:
-        surface, others = self._split(x)
+        surface, others = self.split(x)
         squares = np.asarray(self.expansion.problem.basis.scale, np.float64) ** 2
         return np.concatenate([fft.idctn(squares * fft.dctn(surface, norm="ortho"), norm="ortho").ravel(), others])
 

@@ -58,9 +58,12 @@ class Part(NamedTuple):
 def pictures_by_heights(expansion: Expansion) -> Sparse | None:
     """The derivative of the pictures in the heights, in units of the noise: a row for each value, in the order of `in_row`, a
     column for each height without padding. None: it is not known, or too large to be factorised."""
-    if expansion.problem.basis.base.size > MOST_HEIGHTS or not can_have_rows(expansion):
-        return None
-    return _rows_of(expansion, None).matrix
+    return _rows_of(expansion, None).matrix if has_rows(expansion) else None
+
+
+def has_rows(expansion: Expansion) -> bool:
+    """Whether `pictures_by_heights` has them."""
+    return expansion.problem.basis.base.size <= MOST_HEIGHTS and can_have_rows(expansion)
 
 
 def can_have_rows(expansion: Expansion) -> bool:

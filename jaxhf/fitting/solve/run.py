@@ -14,10 +14,12 @@ from ..given import Given
 from ..history import Step, Stop
 from ..model.expansion import Expansion, expand, place_of, surface_of
 from ..model.problem import LOSS_SCALE, Problem
+from ..model.rows import has_rows
 from ..model.surface import Unknowns, make_basis
 from ..model.units import balanced
+from .newton import RELAXED, SHORTER, WholeStep, relaxed, whole_step
 from .noise import Estimate, Restricted, explains_noise, spreads, widened
-from .stages import on_finer, stages, why_ended
+from .stages import on_finer, stages, varies_all, why_ended
 from .state import State
 from .steps import FIRST_DAMPING, Outcome, advance, first_position, position_at
 
@@ -44,6 +46,7 @@ class _Place(NamedTuple):
       expansion: at its unknowns.
       position: optimistix's state.
       first: that from which it is made anew, see `first_position`.
+      whole_step: from the expansion, where the stage's steps are by factors.
     """
 
     problem: Problem
@@ -51,6 +54,7 @@ class _Place(NamedTuple):
     expansion: Expansion
     position: Any
     first: Any
+    whole_step: WholeStep | None = None
 
 
 def run(problems: Sequence[Problem], state: State, given: Given, watch: Callable[[State], None]) -> Ended:
@@ -59,9 +63,10 @@ def run(problems: Sequence[Problem], state: State, given: Given, watch: Callable
     begin = time.perf_counter() - state.seconds
     place = _resumed(problems, state) if state.stage >= 0 else None
     while True:
-        stop = None if place is None else why_ended(state, problems, given.max_steps)
+        stop = None if place is None else why_ended(state, problems, given.max_steps, _ends_by_factors(place.expansion))
         if stop is None and place is not None:
-            state, place = _step(state, place, begin)
+            step = _step_by_factors if stages(problems)[state.stage].by_factors else _step
+            state, place = step(state, place, begin)
         else:
             following = None if stop in (Stop.MAX_STEPS, Stop.NON_FINITE) else _next_stage(problems, state, place, given)
             if following is None:
@@ -98,6 +103,31 @@ def _step(state: State, place: _Place, begin: float) -> tuple[State, _Place]:
     return state, place._replace(position=position, expansion=expansion if accepted else place.expansion)
 
 
+def _step_by_factors(state: State, place: _Place, begin: float) -> tuple[State, _Place]:
+    here = whole_step(place.expansion) if place.whole_step is None else place.whole_step
+    unknowns = relaxed(state.unknowns, here)
+    expansion = expand(unknowns, place.problem)
+    there = whole_step(expansion)
+    accepted = there.length <= SHORTER * here.length
+    if accepted:
+        state, place = dataclasses.replace(state, unknowns=unknowns), place._replace(expansion=expansion, whole_step=there)
+    else:
+        place = place._replace(whole_step=here)
+    kept = there if accepted else here
+    done = Step(
+        step=len(state.history) + 1,
+        level=max(place.problem.basis.base.shape),
+        loss=kept.loss,
+        accepted=accepted,
+        damping=0.0,
+        change=RELAXED * here.length if accepted else 0.0,
+        seconds=time.perf_counter() - begin,
+    )
+    history = (*state.history, done)
+    state = dataclasses.replace(state, loss=kept.loss, predicted=kept.predicted, seconds=done.seconds, history=history)
+    return state, place
+
+
 def _advanced(state: State, position: Any, expansion: Expansion, rejections: int) -> tuple[Unknowns, Any, Outcome]:
     return advance(state.unknowns, position, expansion, state.others, rejections, _TOLERANCE, _ITERATIONS)
 
@@ -114,11 +144,11 @@ def _known(unknowns: Any, problem: Problem, expansion: Expansion | None) -> Expa
 def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None, given: Given) -> tuple[State, _Place] | None:
     """Makes the last surface the base, and varies more modes about it, or sharpens the loss and estimates the noise again.
 
-    None where there is no such stage: after the last, and where it would repeat the one before.
+    None where there is no such stage: after the last, and where that would be by factors, but a fit does not end so.
     """
     order = stages(problems)
-    if state.stage + 1 == len(order):
-        return None
+    if state.stage + 2 >= len(order):
+        return _by_factors(state, place, len(order) - 1)
     stage, before = order[state.stage + 1], None if state.stage < 0 else order[state.stage]
     repeats = stage == before
     if place is not None and before is not None and before.level == stage.level:
@@ -129,16 +159,16 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
         here, first = expand(state.unknowns, state.posed(problems[stage.level], 1.0)), None
     posed = here.problem
     spread = spreads(here)
-    noise, widths = _estimated(here, spread, state, stage.share, stage == order[-1], repeats, given)
+    noise, widths = _estimated(here, spread, state, stage.share, stage == order[-2], repeats, given)
     scale = max(LOSS_SCALE, 3 * _rms(spread / noise))
-    if scale <= _LEAST_CHANGE * LOSS_SCALE or state.stage + 2 == len(order):
+    if scale <= _LEAST_CHANGE * LOSS_SCALE or state.stage + 3 == len(order):
         scale = LOSS_SCALE
     edge_samples = state.edge_samples
     if repeats:
         edge_samples = posed.edge_samples_for(here.heights, given.settings)
         same = np.array_equal(noise, state.noise) and np.array_equal(widths, state.widths) and scale == float(state.loss_scale)
         if same and edge_samples == state.edge_samples:
-            return None
+            return _by_factors(state, place, len(order) - 1)
     dtype, units, others = posed.field.heights.dtype, state.units, state.others
     if repeats:  # λ goes on from where it came to, or begins anew where rejections raised it: the loss is another one
         step_size = max(float(state.step_size), 1 / state.steps[0].damping) * float(np.mean((noise / state.noise) ** 2))
@@ -164,6 +194,20 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
     return following, _placed(problems, following, here, first)
 
 
+def _ends_by_factors(expansion: Expansion) -> bool:
+    """Whether there are factors, and points on edges: these alone make the loss so rough that other steps stop short."""
+    return has_rows(expansion) and any(known is not None and known.edges is not None for known in expansion.linearised)
+
+
+def _by_factors(state: State, place: _Place | None, last: int) -> tuple[State, _Place] | None:
+    """The last stage, about the same base; None after it, and where a fit does not end so."""
+    if state.stage == last or place is None or not _ends_by_factors(place.expansion):
+        return None
+    step = whole_step(place.expansion)
+    state = dataclasses.replace(state, stage=last, stage_start=len(state.history), predicted=step.predicted)
+    return state, place._replace(whole_step=step)
+
+
 def _placed(problems: Sequence[Problem], state: State, expansion: Expansion | None, first: Any) -> _Place:
     """Where a stage begins."""
     stage = stages(problems)[state.stage]
@@ -180,7 +224,7 @@ def _resumed(problems: Sequence[Problem], state: State) -> _Place:
     place = _placed(problems, state, None, None)
     here = _known(state.unknowns, place.problem, place.expansion)
     position = position_at(place.first, state.unknowns, state.step_size)
-    if state.steps:
+    if state.steps and not stages(problems)[state.stage].by_factors:
         _, position, _ = _advanced(state, position, here, 0)
     return place._replace(expansion=here, position=position)
 
@@ -215,13 +259,14 @@ def _estimated(
 
 def with_all_modes(ended: Ended, problems: Sequence[Problem], given: Given) -> Expansion:
     """The expansion at the end, with all modes of the finest heights varied about its surface, wherever the fit stopped."""
-    state, here, finest, order = ended.state, ended.expansion, problems[-1], stages(problems)
-    if order[state.stage].level < len(problems) - 1:
+    state, here, finest = ended.state, ended.expansion, problems[-1]
+    units = state.units if varies_all(state, problems) else None
+    if stages(problems)[state.stage].level < len(problems) - 1:
         state = on_finer(state, problems, len(problems) - 1, given)
         posed = state.posed(finest, 1.0)
         here = expand(state.unknowns, posed)
         here = here.of(posed.with_noise(state.noise, here.sampling))
-    units = state.units if order[state.stage] == order[-1] else balanced(here).modes
+    units = balanced(here).modes if units is None else units
     basis = make_basis(finest.field, np.asarray(surface_of(state.unknowns, here.problem.basis)), units, 1.0, finest.basis.free)
     return dataclasses.replace(here.of(dataclasses.replace(here.problem, basis=basis)), unknowns=state.unknowns.at_base())
 

@@ -19,36 +19,46 @@ from .state import State
 
 _REJECTIONS = 2  # in a row, at a coarse stage: the next one may do better
 _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviation that their noise leaves them with
+_LEFT_GAIN = 2e-4  # the same at the end, where steps are whole ones: by 0.02 of it
 _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
 _USUAL_STEPS, _USUAL_COARSE_STEPS = 5, 4  # of a stage, for what progress says is to come
 _LAST_STAGES = 3  # at most, over which the scale of the robust loss comes down to its own, and the noise is estimated
+_MOST_BY_FACTORS = 10  # steps; four to six are usual
 _COARSEST = 8  # modes a side
 
 
 class Stage(NamedTuple):
-    """Which of the problems, from coarse to fine, and up to what share of its highest frequency modes are varied."""
+    """Which of the problems, from coarse to fine, and up to what share of its highest frequency modes are varied; whether its
+    steps are those of `newton`."""
 
     level: int
     share: float
+    by_factors: bool = False
 
 
 def stages(problems: Sequence[Problem]) -> list[Stage]:
-    """From 8 modes a side on, twice as many each time, through coarse and then fine heights; and then all once more while the
-    loss is sharpened and the noise estimated."""
+    """From 8 modes a side on, twice as many each time, through coarse and then fine heights; then all once more while the loss
+    is sharpened and the noise estimated; and in the end by factors."""
     order, modes = [], _COARSEST
     for level, problem in enumerate(problems):
         most = max(problem.field.heights.shape)
         doublings = max(0, math.floor(math.log2(most / modes)))
         order += [Stage(level, 0.5**k) for k in range(doublings, -1, -1)]
         modes = 2 * most
-    return [*order, *[Stage(len(problems) - 1, 1.0)] * _LAST_STAGES]
+    last = Stage(len(problems) - 1, 1.0)
+    return [*order, *[last] * _LAST_STAGES, last._replace(by_factors=True)]
+
+
+def varies_all(state: State, problems: Sequence[Problem]) -> bool:
+    """Whether all modes of the finest heights are varied."""
+    return stages(problems)[state.stage][:2] == (len(problems) - 1, 1.0)
 
 
 def steps_to_come(state: State, problems: Sequence[Problem], given: Given) -> int:
     """About how many: as many as stages take as a rule."""
     most, done = given.max_steps - len(state.history), len(state.steps)
-    usual, *later = [_USUAL_STEPS if share == 1 else _USUAL_COARSE_STEPS for _, share in stages(problems)[state.stage :]]
+    usual, *later = [_USUAL_STEPS if stage.share == 1 else _USUAL_COARSE_STEPS for stage in stages(problems)[state.stage :]]
     return min(most, max(usual - done, 1 + done // 3) + sum(later))
 
 
@@ -75,24 +85,38 @@ def on_finer(state: State, problems: Sequence[Problem], level: int, given: Given
     )
 
 
-def why_ended(state: State, problems: Sequence[Problem], max_steps: int) -> Stop | None:
-    """Why the present stage is over, or None; one that another follows ends sooner."""
+def why_ended(state: State, problems: Sequence[Problem], max_steps: int, has_factors: bool) -> Stop | None:
+    """Why the present stage is over, or None; one that another follows ends sooner.
+
+    `has_factors`: whether the last stage is not left out.
+    """
     steps, order = state.steps, stages(problems)
+    if order[state.stage].by_factors:
+        return _why_factors_ended(state, problems, max_steps)
     if not steps:
         return None if len(state.history) < max_steps else Stop.MAX_STEPS
     loss, rejections = steps[-1].loss, state.rejections
     if not math.isfinite(loss):
         return Stop.NON_FINITE
     sharp = float(state.loss_scale) == LOSS_SCALE
-    fine = state.stage + 1 == len(order) or (order[state.stage] == order[-1] and sharp)
+    fine = varies_all(state, problems) and (sharp or state.stage + 2 == len(order))
     enough = _FLAT_GAIN * problems[-1].field.heights.size if fine else _COARSE_GAIN * loss
     if len(steps) > 1 and _is_flat(state, enough):  # the first only evaluates where the stage begins
         return Stop.CONVERGED
     # Damping that grows with each rejection leaves less and less to be gained, until that would not count.
-    if rejections and (not state.predicted >= enough or (rejections >= _REJECTIONS and not fine)):
+    if rejections and (not state.predicted >= enough or (rejections >= _REJECTIONS and (has_factors or not fine))):
         return Stop.CONVERGED if rejections == 1 else Stop.STALLED
     if not fine and len(steps) > _COARSE_STEPS:
         return Stop.CONVERGED
+    return Stop.MAX_STEPS if len(state.history) >= max_steps else None
+
+
+def _why_factors_ended(state: State, problems: Sequence[Problem], max_steps: int) -> Stop | None:
+    steps = state.steps
+    if state.predicted < _LEFT_GAIN * problems[-1].field.heights.size or len(steps) == _MOST_BY_FACTORS:
+        return Stop.CONVERGED
+    if steps and not steps[-1].accepted:
+        return Stop.CONVERGED if len(steps) > 1 else Stop.STALLED
     return Stop.MAX_STEPS if len(state.history) >= max_steps else None
 
 

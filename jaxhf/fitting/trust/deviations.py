@@ -11,10 +11,8 @@ from jaxtyping import Float
 
 from ..history import Draws
 from ..model.expansion import Expansion
-from ..model.near_inverse import near_inverse
-from ..model.normal_matrix import NormalMatrix, in_row
-from ..model.robust import influence_function, robust_weight
-from ..model.rows import pictures_by_heights
+from ..model.near_inverse import robust_matrix
+from ..model.robust import influence_function
 from .boundaries import Boundaries
 
 _TOLERANCE = 1e-5  # of a draw's linear problem; the draw is then right to a thousandth
@@ -62,12 +60,8 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
     Raises:
       KeyboardInterrupt: Ctrl-C before there were two draws, or one of displaced boundaries.
     """
-    roots = np.sqrt(np.asarray(robust_weight(jnp.asarray(in_row(expansion.left())), expansion.problem.loss_scale)))
-    rows = pictures_by_heights(expansion)
-    matrix = NormalMatrix(expansion, roots, rows)
-    if rows is not None:
-        matrix.inverse = near_inverse(matrix)
-    boundaries = None if rows is None else Boundaries(expansion, rows)
+    matrix = robust_matrix(expansion)
+    boundaries = None if matrix.rows is None else Boundaries(expansion, matrix.rows)
     changes, begin = [], time.perf_counter()
     try:
         while len(changes) < count:
@@ -89,9 +83,9 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
         def response(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             """What an error of the pictures, in units of their noise, makes of the heights, and what is left of it."""
             noise = matrix.drawn(0)
-            alone = noise._replace(pictures=roots * error, modes=0 * noise.modes, others=0 * noise.others)
+            alone = noise._replace(pictures=matrix.roots * error, modes=0 * noise.modes, others=0 * noise.others)
             change = matrix.solved(matrix.gathered(alone), _TOLERANCE)
-            return matrix.heights_of(change), error - matrix.seen(change) / roots
+            return matrix.heights_of(change), error - matrix.seen(change) / matrix.roots
 
         displacement, moved = boundaries.displacements(response)
         if moved:

@@ -12,7 +12,7 @@ from ..model.expansion import Expansion
 from ..model.problem import Problem
 from ..solve.noise import Freedom, Restricted, explains_noise
 from ..solve.run import Ended, with_all_modes
-from ..solve.stages import stages
+from ..solve.stages import varies_all
 from .deviations import standard_deviations, with_unexplained
 from .facts import (
     Left,
@@ -54,7 +54,7 @@ class Judgement(NamedTuple):
 @np.errstate(over="ignore")  # of a fit that ended as not finite
 def judged(ended: Ended, problems: Sequence[Problem], given: Given, report: Callable[..., None] | None) -> Judgement:
     """The judgement; `problems` are those of `run`. `report` is called after each draw."""
-    fitted = stages(problems)[ended.state.stage] == stages(problems)[-1] and bool(np.isfinite(ended.state.loss))
+    fitted = varies_all(ended.state, problems) and bool(np.isfinite(ended.state.loss))
     expansion, free = _restricted(with_all_modes(ended, problems, given), fitted, given)
     problem = expansion.problem
     left, residuals = _left(expansion)

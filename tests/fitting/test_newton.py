@@ -1,0 +1,67 @@
+"""Gauss-Newton steps by factors: each against a dense solution, and how they go on and end."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from small_fits import EVERYTHING, SETTINGS, TRUTH, dense, expanded, pictures, rms, scenes
+
+import jaxhf
+from jaxhf.fitting.model.expansion import residuals
+from jaxhf.fitting.model.normal_matrix import in_row
+from jaxhf.fitting.solve import run as _run
+from jaxhf.fitting.solve.newton import WholeStep, relaxed, whole_step
+from jaxhf.fitting.solve.state import first_state
+
+HELD = np.where(np.indices(TRUTH.shape).sum(0) % 5 == 0, 0.0, 0.05)
+
+
+def test_a_whole_step_solves_the_linear_problem():
+    """Of all unknowns, with the weights of the robust loss; heights that are held stay."""
+    measured = [picture.copy() for picture in pictures()]
+    measured[0][3:9] += 0.02
+    prior = jaxhf.Prior(TRUTH, HELD, 0.2)
+    here = expanded(scenes(TRUTH + 0.03), measured, prior=prior, unknown=EVERYTHING, settings=SETTINGS, noise=0.01)
+    step, left, basis = whole_step(here), in_row(here.left()), here.problem.basis
+    roots = 1 / (1 + (left / 3) ** 2)
+    by_pictures, by_priors, free = dense(here, roots)
+    images, priors = residuals(here.unknowns, (here.problem, here.linearised))[0]
+    off = np.concatenate([np.ravel(part) for part in priors])
+    gradient, matrix = by_pictures.T @ (roots * left) + by_priors.T @ off, by_pictures.T @ by_pictures + by_priors.T @ by_priors
+    expected = np.zeros(free.size)
+    expected[free] = -np.linalg.solve(matrix[np.ix_(free, free)], gradient[free])
+    moved = np.ravel(basis.surface(step.change.coefficients) - basis.base)
+    others = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(step.change.without_modes())])
+    count = moved.size
+    np.testing.assert_allclose(moved, expected[:count], atol=5e-3 * rms(expected[:count]))
+    np.testing.assert_allclose(others, expected[count:], atol=5e-3 * np.abs(expected[count:]).max())
+    assert not moved[~free[:count]].any()
+    assert step.length == pytest.approx(rms(basis.crop(expected[:count].reshape(basis.base.shape))), rel=5e-3)
+    assert step.predicted == pytest.approx(-gradient @ expected / 2, rel=5e-3)
+    assert step.loss == pytest.approx(sum(np.sum(np.square(part)) for part in (*images, *priors)) / 2, rel=1e-5)
+    half = relaxed(here.unknowns, step)
+    np.testing.assert_allclose(half.coefficients, step.change.coefficients / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize(("lengths", "accepted"), [((1.0, 0.5, 0.46), [True, False]), ((1.0, 2.0), [False])])
+def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, monkeypatch):
+    """Whatever becomes of the loss: else all stays as it was."""
+    here = expanded(scenes(), pictures(), settings=SETTINGS, noise=0.01)
+    ones = jax.tree.map(jnp.ones_like, here.unknowns)
+    steps = [WholeStep(ones, length, 10 * length, 7.0 + number) for number, length in enumerate(lengths)]
+    state = dataclasses.replace(first_state(here.problem, here.unknowns), stage=4)
+    place: Any = _run._Place(here.problem, 1.0, here, None, None, steps[0])
+    monkeypatch.setattr(_run, "expand", lambda unknowns, problem: dataclasses.replace(here, unknowns=unknowns))
+    for number, taken in enumerate(accepted, 1):
+        monkeypatch.setattr(_run, "whole_step", lambda _, number=number: steps[number])
+        before, there = state.unknowns, place.expansion
+        state, place = _run._step_by_factors(state, place, 0.0)
+        kept = steps[number if taken else number - 1]
+        assert (state.history[-1].accepted, state.history[-1].step) == (taken, number)
+        assert (state.loss, state.predicted, place.whole_step) == (kept.loss, kept.predicted, kept)
+        assert state.history[-1].change == (0.5 * lengths[number - 1] if taken else 0)
+        assert (place.expansion is there) != taken
+        np.testing.assert_allclose(state.unknowns.coefficients, before.coefficients + (0.5 if taken else 0))
