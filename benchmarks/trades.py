@@ -52,30 +52,30 @@ def without_bounds() -> None:
 
 
 def with_stored_triangles() -> None:
-    """Each cell's two triangles as six heights, one cell after the other: six numbers a cell in place of one a height."""
+    """Each cell's two triangles as six heights, one cell after the other: six numbers a cell in place of one a height.
+
+    Heights are the arrays of one axis: normals keep theirs a vertex. Scenes have one heightfield, whose first height is at 0.
+    """
     import equinox as eqx
     import jax
 
     from jaxhf.preparation import world as _world
     from jaxhf.trace import grid as _grid, intersect as _hit, triangle as _triangle, walk as _walk
 
-    class Triangles(eqx.Module):
-        heights: jax.Array
+    triangle_corners, make_grid = _triangle.triangle_corners, _world.make_grid
 
-    corners, triangle_corners, make_grid = _triangle.corners, _triangle.triangle_corners, _world.make_grid
+    def at(triangles: jax.Array, place: Any) -> jax.Array:
+        return triangles.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
-    def at(triangles: Triangles, place: Any) -> jax.Array:
-        return triangles.heights.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
-    def corners_of(values: Any, nx: int, ix: jax.Array, iy: jax.Array, grid: Any) -> tuple[jax.Array, ...]:
-        if not isinstance(values, Triangles):
-            return corners(values, nx, ix, iy, grid)
+    def corners_of(values: jax.Array, nx: int, ix: jax.Array, iy: jax.Array, grid: Any) -> tuple[jax.Array, ...]:
         first = 6 * (iy * (nx - 1) + ix)
         return tuple(at(values, first + further) for further in (0, 1, 4, 2))
 
-    def triangle_corners_of(values: Any, nx: int, ix: jax.Array, iy: jax.Array, upper: jax.Array) -> tuple[jax.Array, ...]:
-        if not isinstance(values, Triangles):
-            return triangle_corners(values, nx, ix, iy, upper)
+    def triangle_corners_of(
+        values: jax.Array, nx: int, ix: jax.Array, iy: jax.Array, upper: jax.Array, grid: Any = None
+    ) -> tuple[jax.Array, ...]:
+        if values.ndim > 1:
+            return triangle_corners(values, nx, ix, iy, upper, grid)
         first = 6 * (iy * (nx - 1) + ix) + 3 * upper.astype(ix.dtype)
         return tuple(at(values, first + further) for further in (0, 1, 2))
 
@@ -84,7 +84,7 @@ def with_stored_triangles() -> None:
         z = grid.z
         z00, z10, z01, z11 = z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]
         stored = jax.numpy.stack([z00, z10, z11, z00, z01, z11], -1).reshape(-1)
-        return eqx.tree_at(lambda grid: grid.rows, grid, Triangles(stored))
+        return eqx.tree_at(lambda grid: grid.rows, grid, stored)
 
     _triangle.corners = _walk.corners = corners_of
     _grid.triangle_corners = _hit.triangle_corners = triangle_corners_of

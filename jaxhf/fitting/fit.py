@@ -15,6 +15,7 @@ from ..core.errors import ArgumentError, kind_of
 from ..core.settings import Settings
 from ..core.types import AnyArray
 from ..scene.scene import Scene
+from ..xla.devices import automatic_axes, on_every_device
 from ..xla.transfers import takes_numbers
 from .coarser import coarser, factors
 from .given import Checkpoint, Given, Prior, Unknown
@@ -145,6 +146,15 @@ def fit(
         settings=Settings() if settings is None else settings, max_steps=max_steps, progress=progress, checkpoint=checkpoint,
         mesh=mesh,
     )  # fmt: skip
+    with automatic_axes("fit", given.mesh) as automatic:
+        found = _found(scenes, targets, dataclasses.replace(given, mesh=automatic))
+    if automatic is given.mesh:
+        return found
+    arrays = {name: getattr(found, name) for name in ("heights", "albedo", "exposures", "offsets", "scenes")}
+    return dataclasses.replace(found, **on_every_device(arrays, automatic))
+
+
+def _found(scenes: tuple[Scene, ...], targets: tuple[Any, ...], given: Given) -> Fit:
     targets = masked_targets(scenes, targets, given.weights)
     problem, unknowns = make_problem(scenes, targets, given)
     levels = factors(scenes, problem.settings.samples or 1)

@@ -1,8 +1,9 @@
 """Work dealt out to many devices."""
 
+import contextlib
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -64,6 +65,24 @@ def chosen_mesh(owner: str, mesh: Mesh | None, tree: Any = ()) -> Mesh:
     if mesh is None and is_traced():  # when JAX tells no more than the mesh's form, which is all that counts then
         return Mesh(np.array(jax.devices()[: around.size]).reshape(around.axis_sizes), around.axis_names, around.axis_types)
     return mesh or jax.sharding.get_mesh()
+
+
+@contextlib.contextmanager
+def automatic_axes(owner: str, mesh: Mesh | None) -> Iterator[Mesh | None]:
+    """Within `jax.set_mesh` of explicit axes: the same devices, with axes that XLA deals with; gives the mesh to go on with.
+
+    For libraries whose programs JAX does not take with explicit axes: optimistix's conditionals have branches of two shardings.
+
+    Raises:
+      ArgumentError: see `chosen_mesh`.
+    """
+    if AxisType.Explicit not in jax.sharding.get_abstract_mesh().axis_types:
+        yield mesh
+        return
+    explicit = chosen_mesh(owner, mesh)
+    automatic = Mesh(explicit.devices, explicit.axis_names)
+    with jax.set_mesh(automatic):
+        yield automatic
 
 
 def prepared_mesh(owner: str, prepared: Mesh, mesh: Mesh | None, tree: Any) -> Mesh:

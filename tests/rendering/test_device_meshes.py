@@ -42,7 +42,9 @@ slope = lambda h=jnp.asarray(heights), **how: jax.grad(lambda h: render(h, **how
 cast = lambda h=heights, **how: jaxhf.cast(jaxhf.Heightfield(h), np.array([0.5, 0.4, 3]), d).t
 horizon = lambda h=heights, **how: jaxhf.horizon(h, 4, dx=0.25, **how)
 short = dict(settings=settings, start=0.0, max_steps=2)
-fit = lambda **how: jaxhf.fit([scene(heights)], [target], **short, **how).heights
+found = lambda **how: jaxhf.fit([scene(heights)], [target], unknown=jaxhf.Unknown(exposures=True), **short, **how)
+fit = lambda **how: found(**how).heights
+bright = lambda fit: fit.exposures[0] * jaxhf.render(fit.scenes[0], settings)
 target = np.asarray(render())
 ready = jaxhf.prepare(scene(heights), settings)
 with jax.set_mesh(explicit):
@@ -81,6 +83,7 @@ SAME |= {
     "shards cast within explicit axes": (within(explicit, lambda: cast(rows)), lambda: cast(heights[:4])),
     "shards on explicit axes": (lambda: render(rows, mesh=explicit), lambda: render(heights[:4])),
     "a scene that is prepared outside": (mapped(lambda h: jaxhf.render(ready) + 0 * h[0, 0]), lambda: jax.jit(render)(heights)),
+    "what was found within explicit axes": (within(explicit, lambda: bright(found())), lambda: bright(found())),
     "a key": (within(explicit, lambda: render(key=jax.random.key(1))), render),
 }
 REFUSED = {
@@ -94,21 +97,21 @@ REFUSED = {
     "a checked preparation": (mapped(prepared, check=True), "prepare: the shard_map around it needs check_vma=False"),
     "a checked map": (mapped(horizon, check=True), "horizon: the shard_map around it needs check_vma=False"),
 }
-found = {}
+said = {}
 for name, (call, other) in SAME.items():
     try:
         one, two = np.asarray(call()), np.asarray(other())
         off = np.nanmax(np.abs(one - two)) / np.nanmax(np.abs(two))
-        found[name] = f"off by {off}" if off > 1e-4 or one.shape != two.shape else "as it should"
+        said[name] = f"off by {off}" if off > 1e-4 or one.shape != two.shape else "as it should"
     except Exception as error:
-        found[name] = f"{type(error).__name__}: {error}"[:300]
-for name, (call, said) in REFUSED.items():
+        said[name] = f"{type(error).__name__}: {error}"[:300]
+for name, (call, rule) in REFUSED.items():
     try:
         call()
-        found[name] = "not refused"
+        said[name] = "not refused"
     except ValueError as error:
-        found[name] = "as it should" if str(error).startswith(said) and "\\n" not in str(error) else f"{error}"
-print(json.dumps(found))
+        said[name] = "as it should" if str(error).startswith(rule) and "\\n" not in str(error) else f"{error}"
+print(json.dumps(said))
 """
 
 

@@ -107,6 +107,15 @@ def test_behind_a_straight_wall_the_sun_is_a_circular_segment():
     np.testing.assert_allclose(found, np.broadcast_to(expected, found.shape), atol=0.006 * expected.max())
 
 
+def test_a_sheet_hides_the_sun_from_the_ground_below_it():
+    camera = jaxhf.Perspective.look_at((0.5, -0.2, 0.3), (0.5, 0.5, 0), fov=30, width=16, height=16)
+    sheets = [jaxhf.Object(jaxhf.Heightfield(np.full((3, 3), z, np.float32), 0.5)) for z in (0.0, 0.4)]
+    suns = (light.from_angles(285, 60) for light in (jaxhf.Sun, jaxhf.Directional))
+    sun, point = (np.asarray(jaxhf.render(jaxhf.Scene(sheets, camera, [light]))) for light in suns)
+    assert 0.03 < (point > 0).mean() < 0.5  # lit from beside the sheet
+    np.testing.assert_allclose(sun.mean(), point.mean(), rtol=1e-3)
+
+
 WIDE, SUNWARDS = 6.0, np.asarray(jaxhf.Directional.from_angles(250, 25).towards)
 # x0, x1, y0, y1, and z at (0, 0) and its changes along x and y, of each sheet; of an open box z is that of its rim.
 GROUND, SHEET, BOX, FLOOR = (0, 6, 0, 6, 0, 0, 0), (1, 2, 1.2, 2.4, 2.5, -1, 0.1), (2.6, 3.4, 0.2, 0.8, 0.8, 0, 0), 0.3
