@@ -90,7 +90,7 @@ FLAT = dataclasses.replace(NO_EDGES, shading="flat", samples=4)
     ("settings", "channels", "precision"),
     [
         (NO_EDGES, (1,), "single"),
-        pytest.param(NO_EDGES, (1, 3), "double", marks=[pytest.mark.x64, pytest.mark.deep]),
+        pytest.param(NO_EDGES, (1, 3), "double", marks=[pytest.mark.x64, pytest.mark.slow]),
         pytest.param(EDGES, (3,), "double", marks=[pytest.mark.x64, pytest.mark.deep]),
         pytest.param(FLAT, (3,), "double", marks=[pytest.mark.x64, pytest.mark.deep]),
     ],

@@ -87,7 +87,7 @@ def test_the_plain_call_finds_the_terrain_and_how_sure_it_is(name, ratio):
     assert found.stats["chi2"] < 2  # 1.2 to 1.5
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_exposures_and_offsets_come_back_with_the_terrain():
     known = case("fit-small")
     exposures, offsets = np.array([1, 1.3, 0.8], np.float32), np.array([0, 0.02, -0.01], np.float32)
@@ -101,7 +101,7 @@ def test_exposures_and_offsets_come_back_with_the_terrain():
     np.testing.assert_allclose(np.asarray(found.offsets), offsets, atol=5e-4)
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_suns_and_cameras_come_back_with_the_terrain():
     """Suns that are off by 1 to 1.5 degrees, cameras by 50 m, half a cell.
 

@@ -51,12 +51,12 @@ def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, monkeypatch)
     """Whatever becomes of the loss: else all stays as it was."""
     here = expanded(scenes(), pictures(), settings=SETTINGS, noise=0.01)
     ones = jax.tree.map(jnp.ones_like, here.unknowns)
-    steps = [WholeStep(ones, length, 10 * length, 7.0 + number) for number, length in enumerate(lengths)]
+    steps = [WholeStep(ones, length, 10 * length, 7.0 + number, lambda x: x) for number, length in enumerate(lengths)]
     state = dataclasses.replace(first_state(here.problem, here.unknowns), stage=4)
     place: Any = _run._Place(here.problem, 1.0, here, None, None, steps[0])
     monkeypatch.setattr(_run, "expand", lambda unknowns, problem: dataclasses.replace(here, unknowns=unknowns))
     for number, taken in enumerate(accepted, 1):
-        monkeypatch.setattr(_run, "whole_step", lambda _, number=number: steps[number])
+        monkeypatch.setattr(_run, "whole_step", lambda *_, number=number: steps[number])
         before, there = state.unknowns, place.expansion
         state, place = _run._step_by_factors(state, place, 0.0)
         kept = steps[number if taken else number - 1]

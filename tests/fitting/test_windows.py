@@ -84,7 +84,7 @@ def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
         assert not (counts & (number == 1)).any()
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_windows_come_near_the_truth_without_seams():
     """As near as one fit of all; where windows join, steps in the error are those of the rest."""
     targets = pictures()

@@ -146,8 +146,8 @@ def brightness(scene: jaxhf.Scene, edge_samples: int = 0) -> jax.Array:
     return jnp.sum(image * jnp.asarray(weights(), image.dtype)) / 100
 
 
-@pytest.mark.deep  # the same rules as of rays below, in some thirty programs
-@pytest.mark.parametrize("kind", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
+@pytest.mark.slow  # the same rules as of rays below, in some thirty programs
+@pytest.mark.parametrize("kind", ["perspective", "orthographic"])
 def test_pictures(kind):
     for change in PICTURES.values():
         assert_right(brightness, change(scene_with(CAMERAS[kind])))
@@ -162,8 +162,8 @@ def test_pictures_of_rays_beside_an_axis_or_a_plane():
             assert_right(brightness, scene_with(level(across, z), 0 * HEIGHTS + 0.1))
 
 
-@pytest.mark.deep
-@pytest.mark.parametrize("edge_samples", [0, pytest.param(64, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("edge_samples", [0, 64])
 def test_pictures_of_what_no_precision_can_tell(edge_samples):
     """Finite, that is: with points on edges, and where a horizon cuts a sun that is smaller than its rounding."""
     seen = functools.partial(brightness, edge_samples=edge_samples)

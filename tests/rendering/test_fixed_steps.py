@@ -34,7 +34,7 @@ def mirrors(heights) -> jaxhf.Scene:
     [
         (terrain, AOVS, {"traversal": "pyramid"}),
         pytest.param(terrain, AOVS, {"traversal": "dda", "max_steps": 5}, marks=pytest.mark.deep),
-        pytest.param(mirrors, (), {"max_depth": 1}, marks=pytest.mark.deep),
+        pytest.param(mirrors, (), {"max_depth": 1}, marks=pytest.mark.slow),
     ],
 )
 def test_a_fixed_number_of_steps_gives_the_same_picture(scene, aovs, knobs):

@@ -173,7 +173,9 @@ DOUBLE = pytest.param(np.float64, 1e-6, 1e-10, marks=[pytest.mark.deep, pytest.m
 
 
 @pytest.mark.parametrize(("dtype", "rtol", "between"), [(np.float32, 5e-5, 1e-4), DOUBLE])
-@pytest.mark.parametrize("name", ["plain", *(pytest.param(name, marks=pytest.mark.deep) for name in ("reflected", "parallel"))])
+@pytest.mark.parametrize(
+    "name", ["plain", pytest.param("parallel", marks=pytest.mark.deep), pytest.param("reflected", marks=pytest.mark.slow)]
+)
 def test_every_leaf_pixel_by_pixel(name, dtype, rtol, between):
     """Against central differences, in forward and in reverse mode.
 

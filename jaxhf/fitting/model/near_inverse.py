@@ -22,13 +22,16 @@ _PROBES = 8  # of their curvature, where they are more
 _DEGREE = 3  # of the polynomial in the Laplacian that stands for a prior
 
 
-def robust_matrix(expansion: Expansion) -> NormalMatrix:
-    """The normal matrix, its residuals weighted as the robust loss weighs them; with its near inverse where it `has_rows`."""
+def robust_matrix(expansion: Expansion, inverse: Callable[[Flat], Flat] | None = None) -> NormalMatrix:
+    """The normal matrix, its residuals weighted as the robust loss weighs them.
+
+    `inverse`: of a matrix that is near to it; None: its own, where the expansion `has_rows`.
+    """
     roots = np.sqrt(np.asarray(robust_weight(jnp.asarray(in_row(expansion.left())), expansion.problem.loss_scale)))
     rows = pictures_by_heights(expansion)
     matrix = NormalMatrix(expansion, roots, rows)
     if rows is not None:
-        matrix.inverse = near_inverse(matrix)
+        matrix.inverse = near_inverse(matrix) if inverse is None else inverse
     return matrix
 
 

@@ -104,15 +104,14 @@ def _step(state: State, place: _Place, begin: float) -> tuple[State, _Place]:
 
 
 def _step_by_factors(state: State, place: _Place, begin: float) -> tuple[State, _Place]:
-    here = whole_step(place.expansion) if place.whole_step is None else place.whole_step
+    here = place.whole_step
+    assert here is not None
     unknowns = relaxed(state.unknowns, here)
     expansion = expand(unknowns, place.problem)
-    there = whole_step(expansion)
+    there = whole_step(expansion, here.inverse)
     accepted = there.length <= SHORTER * here.length
     if accepted:
         state, place = dataclasses.replace(state, unknowns=unknowns), place._replace(expansion=expansion, whole_step=there)
-    else:
-        place = place._replace(whole_step=here)
     kept = there if accepted else here
     done = Step(
         step=len(state.history) + 1,
@@ -148,7 +147,7 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
     """
     order = stages(problems)
     if state.stage + 2 >= len(order):
-        return _by_factors(state, place, len(order) - 1)
+        return _by_factors(problems, state, place)
     stage, before = order[state.stage + 1], None if state.stage < 0 else order[state.stage]
     repeats = stage == before
     if place is not None and before is not None and before.level == stage.level:
@@ -168,7 +167,7 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
         edge_samples = posed.edge_samples_for(here.heights, given.settings)
         same = np.array_equal(noise, state.noise) and np.array_equal(widths, state.widths) and scale == float(state.loss_scale)
         if same and edge_samples == state.edge_samples:
-            return _by_factors(state, place, len(order) - 1)
+            return _by_factors(problems, state, place)
     dtype, units, others = posed.field.heights.dtype, state.units, state.others
     if repeats:  # λ goes on from where it came to, or begins anew where rejections raised it: the loss is another one
         step_size = max(float(state.step_size), 1 / state.steps[0].damping) * float(np.mean((noise / state.noise) ** 2))
@@ -199,13 +198,15 @@ def _ends_by_factors(expansion: Expansion) -> bool:
     return has_rows(expansion) and any(known is not None and known.edges is not None for known in expansion.linearised)
 
 
-def _by_factors(state: State, place: _Place | None, last: int) -> tuple[State, _Place] | None:
+def _by_factors(problems: Sequence[Problem], state: State, place: _Place | None) -> tuple[State, _Place] | None:
     """The last stage, about the same base; None after it, and where a fit does not end so."""
+    last = len(stages(problems)) - 1
     if state.stage == last or place is None or not _ends_by_factors(place.expansion):
         return None
+    state = dataclasses.replace(state, stage=last, stage_start=len(state.history), begin=state.unknowns)
+    place = _placed(problems, state, place.expansion, place.first)
     step = whole_step(place.expansion)
-    state = dataclasses.replace(state, stage=last, stage_start=len(state.history), predicted=step.predicted)
-    return state, place._replace(whole_step=step)
+    return dataclasses.replace(state, predicted=step.predicted), place._replace(whole_step=step)
 
 
 def _placed(problems: Sequence[Problem], state: State, expansion: Expansion | None, first: Any) -> _Place:
@@ -223,8 +224,10 @@ def _placed(problems: Sequence[Problem], state: State, expansion: Expansion | No
 def _resumed(problems: Sequence[Problem], state: State) -> _Place:
     place = _placed(problems, state, None, None)
     here = _known(state.unknowns, place.problem, place.expansion)
+    if stages(problems)[state.stage].by_factors:
+        return place._replace(expansion=here, whole_step=whole_step(here, whole_step(place.expansion).inverse))
     position = position_at(place.first, state.unknowns, state.step_size)
-    if state.steps and not stages(problems)[state.stage].by_factors:
+    if state.steps:
         _, position, _ = _advanced(state, position, here, 0)
     return place._replace(expansion=here, position=position)
 

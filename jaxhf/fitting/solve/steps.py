@@ -122,26 +122,19 @@ _TAGS: frozenset[object] = frozenset()
 
 
 def first_position(expansion: Expansion) -> Any:
-    """optimistix's state of a fit before anything is evaluated.
+    """The form of optimistix's state of a fit, with `jax.ShapeDtypeStruct`s for its arrays.
 
     Call it once for each size of a problem: a state also holds compiled functions, which compare by identity, so that a step
-    that is given the state of another call would be compiled again. `position_at` makes later ones.
+    that is given the state of another call would be compiled again. `position_at` makes states of that form.
     """
-    return _first_position(on_every_device(expansion, expansion.problem.mesh))
 
+    def first(expansion: Expansion) -> Any:
+        others = expansion.unknowns.without_modes()
+        solver, about = LevenbergMarquardt(0, 0.0, 0, others), (expansion.problem, expansion.linearised)
+        shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, about)
+        return solver.init(residuals, expansion.unknowns, about, _OPTIONS, shape, None, _TAGS)
 
-@eqx.filter_jit
-def _first_position(expansion: Expansion) -> Any:
-    others = expansion.unknowns.without_modes()
-    solver, about = LevenbergMarquardt(0, 0.0, 0, others), (expansion.problem, expansion.linearised)
-    shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, about)
-    state = solver.init(residuals, expansion.unknowns, about, _OPTIONS, shape, None, _TAGS)
-    size = jnp.ones((), expansion.unknowns.coefficients.dtype)
-    return on_every_device(_with_step_size(state, size), expansion.problem.mesh)
-
-
-def _with_step_size(position: Any, step_size: Float[Array, ""]) -> Any:
-    return eqx.tree_at(lambda state: state.search_state.step_size, position, step_size)
+    return eqx.filter_eval_shape(first, expansion)
 
 
 def position_at(first: Any, unknowns: Unknowns, step_size: Float[Array, ""]) -> Any:
@@ -150,7 +143,9 @@ def position_at(first: Any, unknowns: Unknowns, step_size: Float[Array, ""]) -> 
     The next step evaluates there, and always accepts: the state is then, to the bit, what it was after the step that reached
     them, if 1 / λ is the same. So a checkpoint need not hold linearised pictures.
     """
-    return _with_step_size(eqx.tree_at(lambda state: state.y_eval, first, unknowns), step_size)
+    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if _is_shaped(leaf) else leaf, first)
+    begin = jnp.ones_like(empty.first_step), unknowns, step_size.astype(empty.search_state.step_size.dtype)
+    return eqx.tree_at(lambda state: (state.first_step, state.y_eval, state.search_state.step_size), empty, begin)
 
 
 def advance(
@@ -159,21 +154,26 @@ def advance(
     """One step: new unknowns, which are the old ones if the step is rejected, optimistix's new state, and what it did.
 
     Args:
-      unknowns, position: of the step before.
+      unknowns, position: of the step before. What the state holds of J makes room for that of the new one: it is gone.
       expansion: at `position.y_eval`.
       others: see `ConjugateGradients`.
       rejections: how many steps before were rejected in a row.
       tolerance, iterations: see `ConjugateGradients`.
     """
     solver = LevenbergMarquardt(rejections, tolerance, iterations, others)
-    return _advance(*on_every_device((solver, unknowns, position, expansion), expansion.problem.mesh))
+    parts = on_every_device((solver, unknowns, position, expansion), expansion.problem.mesh)
+    solver, unknowns, position, expansion = parts
+    of_j = eqx.tree_at(
+        lambda state: (state.f_info.jac, state.descent_state.jac), jax.tree.map(lambda _: False, position), (True, True)
+    )
+    of_j, rest = eqx.partition(position, of_j)
+    return _advance((solver, unknowns, rest, expansion), of_j)
 
 
-@eqx.filter_jit
-def _advance(
-    solver: LevenbergMarquardt, unknowns: Unknowns, position: Any, expansion: Expansion
-) -> tuple[Unknowns, Any, Outcome]:
-    problem = expansion.problem
+@eqx.filter_jit(donate="all-except-first")
+def _advance(kept: tuple[LevenbergMarquardt, Unknowns, Any, Expansion], of_j: Any) -> tuple[Unknowns, Any, Outcome]:
+    solver, unknowns, rest, expansion = kept
+    problem, position = expansion.problem, eqx.combine(of_j, rest)
     with jax.numpy_dtype_promotion("standard"):
         new, state, _ = solver.step(residuals, unknowns, (problem, expansion.linearised), _OPTIONS, position, _TAGS)
     step = jax.tree.map(lambda to, here: to - here, state.y_eval, new)
