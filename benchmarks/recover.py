@@ -353,7 +353,9 @@ def main() -> None:
     parser.add_argument(
         "--peers", type=Path, help="folder of common_work.py and targets_D_std.npz, for scale and cases common-4, common-1"
     )
-    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256], help="heights a side, for scale [64 128 256]")
+    parser.add_argument(
+        "--sizes", type=int, nargs="+", default=[64, 128, 256, 512], help="heights a side, for scale [64 128 256 512]"
+    )
     parser.add_argument("--edge-samples", type=int, help="a picture [shadow: 1000]")
     parser.add_argument("--max-steps", type=int, default=100)
     parser.add_argument("--draws", type=int, default=0, help="of the standard deviations")

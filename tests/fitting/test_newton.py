@@ -51,12 +51,12 @@ def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, monkeypatch)
     """Whatever becomes of the loss: else all stays as it was."""
     here = expanded(scenes(), pictures(), settings=SETTINGS, noise=0.01)
     ones = jax.tree.map(jnp.ones_like, here.unknowns)
-    steps = [WholeStep(ones, length, 10 * length, 7.0 + number, lambda x: x) for number, length in enumerate(lengths)]
+    steps = [WholeStep(ones, length, 10 * length, 7.0 + number) for number, length in enumerate(lengths)]
     state = dataclasses.replace(first_state(here.problem, here.unknowns), stage=4)
     place: Any = _run._Place(here.problem, 1.0, here, None, None, steps[0])
     monkeypatch.setattr(_run, "expand", lambda unknowns, problem: dataclasses.replace(here, unknowns=unknowns))
     for number, taken in enumerate(accepted, 1):
-        monkeypatch.setattr(_run, "whole_step", lambda *_, number=number: steps[number])
+        monkeypatch.setattr(_run, "whole_step", lambda _, number=number: steps[number])
         before, there = state.unknowns, place.expansion
         state, place = _run._step_by_factors(state, place, 0.0)
         kept = steps[number if taken else number - 1]
@@ -65,3 +65,12 @@ def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, monkeypatch)
         assert state.history[-1].change == (0.5 * lengths[number - 1] if taken else 0)
         assert (place.expansion is there) != taken
         np.testing.assert_allclose(state.unknowns.coefficients, before.coefficients + (0.5 if taken else 0))
+
+
+def test_fits_of_few_heights_with_points_on_edges_end_so(monkeypatch):
+    here = expanded(scenes(), pictures(), settings=dataclasses.replace(SETTINGS, edge_samples=100), noise=0.01)
+    assert _run._ends_by_factors(here)
+    without = tuple(dataclasses.replace(known, edges=None) for known in here.linearised)
+    assert not _run._ends_by_factors(dataclasses.replace(here, linearised=without))
+    monkeypatch.setattr(_run, "_FEW_HEIGHTS", here.problem.basis.base.size - 1)
+    assert not _run._ends_by_factors(here)

@@ -2,12 +2,13 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import scipy.sparse
+import scipy.sparse.linalg
 from small_fits import EVERYTHING, SETTINGS, SIZE, TRUTH, dense, expanded, pictures, rms, scenes
 
 import jaxhf
@@ -20,6 +21,7 @@ from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
 from jaxhf.fitting.trust.boundaries import Boundaries
 from jaxhf.fitting.trust.deviations import standard_deviations
 
+sp: Any = scipy.sparse  # whose stubs miss much
 OPTIONS = {"settings": SETTINGS, "noise": 0.01}
 VALUES = 3 * SIZE * SIZE
 HELD = np.where(np.indices(TRUTH.shape).sum(0) % 5 == 0, 0.0, 0.05)
@@ -108,6 +110,23 @@ def test_its_near_inverse_is_near(prior):
     matrix.product = lambda x: products.append(x) or NormalMatrix.product(matrix, x)
     matrix.solved(right, 1e-4)
     assert len(products) < 8  # without it 300 and more
+
+
+def test_blocks_solve_with_a_matrix_over_a_grid(monkeypatch):
+    """A Laplacian and little more, in which each value depends on all others."""
+    for name, value in (("_FACTORED", 0), ("_BLOCK", 16), ("_BEYOND", 4)):
+        monkeypatch.setattr(_near_inverse, name, value)
+    shape, rng = (70, 45), np.random.default_rng(0)
+    along = [sp.diags_array([-np.ones(n - 1), np.r_[1, 2 * np.ones(n - 2), 1], -np.ones(n - 1)], offsets=[-1, 0, 1])
+             for n in shape]  # fmt: skip
+    near = sp.kronsum(along[1], along[0], format="csr") + 1e-4 * sp.eye_array(70 * 45)
+    solve = _near_inverse._inverse(near, shape)
+    right, other, iterations = rng.standard_normal(70 * 45), rng.standard_normal(70 * 45), []
+    assert right @ solve(other) == pytest.approx(other @ solve(right), rel=1e-8)
+    inverse = sp.linalg.LinearOperator(near.shape, solve, dtype=np.float64)
+    found, _ = sp.linalg.cg(near, right, rtol=1e-6, M=inverse, callback=iterations.append)
+    np.testing.assert_allclose(near @ found, right, atol=1e-5 * rms(right))
+    assert len(iterations) < 13  # 318 without it
 
 
 DRAWS = {

@@ -33,9 +33,10 @@ sp: Any = scipy.sparse  # whose stubs miss much
 Sparse = Any
 """A `scipy.sparse.csr_array`."""
 
-MOST_HEIGHTS = 2**17
-"""With their padding. The factors of 512 x 512 take 5 GB."""
-_THREADS = min(4, os.cpu_count() or 1)  # each holds the rows of a picture's samples, of 100 bytes and more
+MOST_HEIGHTS = 2**21
+"""With their padding; the largest that was tried has half as many."""
+THREADS = min(4, os.cpu_count() or 1)
+"""Of a host's work on sparse matrices: each holds the rows of a picture's samples, of 100 bytes and more."""
 _REACH = 3  # A vertex's normal depends on heights one row and one column off: of each 3 x 3 heights on one.
 
 
@@ -154,7 +155,7 @@ def _of_group(
         return _picture_by_vertices(one, samples, channel, right.shape[0], pixels[k]) @ right
 
     # NumPy and SciPy let other threads run as they look up and multiply.
-    with ThreadPoolExecutor(_THREADS) as threads:
+    with ThreadPoolExecutor(THREADS) as threads:
         return list(threads.map(product, itertools.product(range(len(group.indices)), range(group.targets.shape[-1]))))
 
 

@@ -5,7 +5,6 @@ the jumps are lucky, short of the end along all that pictures tell little of. So
 must be shorter (Deuflhard's natural monotonicity test, Newton Methods for Nonlinear Problems, 2004, chapters 3 and 4).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -14,7 +13,7 @@ import numpy as np
 
 from ..model.expansion import Expansion
 from ..model.near_inverse import robust_matrix
-from ..model.normal_matrix import Flat, in_row
+from ..model.normal_matrix import in_row
 from ..model.robust import soften
 from ..model.surface import Unknowns
 
@@ -31,28 +30,23 @@ class WholeStep(NamedTuple):
       length: of the heights' change, root mean square.
       predicted: by how much it would lower the loss, were pictures linear.
       loss: where it begins.
-      inverse: with which it was found, the `near_inverse` of the matrix there or near to there.
     """
 
     change: Unknowns
     length: float
     predicted: float
     loss: float
-    inverse: Callable[[Flat], Flat]
 
 
-def whole_step(expansion: Expansion, inverse: Callable[[Flat], Flat] | None = None) -> WholeStep:
-    """The step from an expansion that `has_rows`, all of whose modes are varied.
-
-    `inverse`: that of a step from near to there: factors take ten times as long as the iterations that those save.
-    """
-    left, matrix = in_row(expansion.left()), robust_matrix(expansion, inverse)
+def whole_step(expansion: Expansion) -> WholeStep:
+    """`expansion`: one that `has_rows`, all of whose modes are varied."""
+    left, matrix = in_row(expansion.left()), robust_matrix(expansion)
     gradient = matrix.gradient(matrix.roots * left)
     change = matrix.solved(-gradient, _TOLERANCE)
     soft = np.asarray(soften(jnp.asarray(left), expansion.problem.loss_scale), np.float64)
     loss = (np.sum(soft**2) + np.sum(matrix.modes_before() ** 2) + np.sum(matrix.others_off**2)) / 2
     length = float(np.sqrt(np.mean(matrix.heights_of(change) ** 2)))
-    return WholeStep(matrix.unknowns_of(change), length, float(-(gradient @ change) / 2), float(loss), matrix.inverse)
+    return WholeStep(matrix.unknowns_of(change), length, float(-(gradient @ change) / 2), float(loss))
 
 
 def relaxed(unknowns: Unknowns, step: WholeStep) -> Unknowns:

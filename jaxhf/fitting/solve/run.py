@@ -27,6 +27,7 @@ _LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by les
 _MOST_WIDTH = 1e3  # times wider or narrower than they were said to be, as errors of an octave may be found
 _TOLERANCE = 0.1  # of a step's linear problem: solved to 0.01 steps took twice as long, and fits came no nearer
 _ITERATIONS = 120  # of conjugate gradients
+_FEW_HEIGHTS = 2**17  # of 512² steps by factors took as long again as all before, and came no nearer
 
 
 class Ended(NamedTuple):
@@ -108,7 +109,7 @@ def _step_by_factors(state: State, place: _Place, begin: float) -> tuple[State, 
     assert here is not None
     unknowns = relaxed(state.unknowns, here)
     expansion = expand(unknowns, place.problem)
-    there = whole_step(expansion, here.inverse)
+    there = whole_step(expansion)
     accepted = there.length <= SHORTER * here.length
     if accepted:
         state, place = dataclasses.replace(state, unknowns=unknowns), place._replace(expansion=expansion, whole_step=there)
@@ -195,7 +196,8 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
 
 def _ends_by_factors(expansion: Expansion) -> bool:
     """Whether there are factors, and points on edges: these alone make the loss so rough that other steps stop short."""
-    return has_rows(expansion) and any(known is not None and known.edges is not None for known in expansion.linearised)
+    few = expansion.problem.basis.base.size <= _FEW_HEIGHTS
+    return few and has_rows(expansion) and any(known is not None and known.edges is not None for known in expansion.linearised)
 
 
 def _by_factors(problems: Sequence[Problem], state: State, place: _Place | None) -> tuple[State, _Place] | None:
@@ -225,7 +227,7 @@ def _resumed(problems: Sequence[Problem], state: State) -> _Place:
     place = _placed(problems, state, None, None)
     here = _known(state.unknowns, place.problem, place.expansion)
     if stages(problems)[state.stage].by_factors:
-        return place._replace(expansion=here, whole_step=whole_step(here, whole_step(place.expansion).inverse))
+        return place._replace(expansion=here, whole_step=whole_step(here))
     position = position_at(place.first, state.unknowns, state.step_size)
     if state.steps:
         _, position, _ = _advanced(state, position, here, 0)

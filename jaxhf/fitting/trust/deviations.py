@@ -16,6 +16,7 @@ from ..model.robust import influence_function
 from .boundaries import Boundaries
 
 _TOLERANCE = 1e-5  # of a draw's linear problem; the draw is then right to a thousandth
+_NEAR_TOLERANCE = 1e-4  # the same, with an inverse that is near
 
 
 class Deviations(NamedTuple):
@@ -61,12 +62,12 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
       KeyboardInterrupt: Ctrl-C before there were two draws, or one of displaced boundaries.
     """
     matrix = robust_matrix(expansion)
-    boundaries = None if matrix.rows is None else Boundaries(expansion, matrix.rows)
+    boundaries, tolerance = (None, _TOLERANCE) if matrix.rows is None else (Boundaries(expansion, matrix.rows), _NEAR_TOLERANCE)
     changes, begin = [], time.perf_counter()
     try:
         while len(changes) < count:
             noise = matrix.drawn(len(changes))
-            change = matrix.solved(matrix.gathered(noise), _TOLERANCE)
+            change = matrix.solved(matrix.gathered(noise), tolerance)
             if boundaries is not None:
                 boundaries.keep(noise.pictures - matrix.seen(change))
             changes.append(matrix.heights_of(change))
@@ -84,7 +85,7 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
             """What an error of the pictures, in units of their noise, makes of the heights, and what is left of it."""
             noise = matrix.drawn(0)
             alone = noise._replace(pictures=matrix.roots * error, modes=0 * noise.modes, others=0 * noise.others)
-            change = matrix.solved(matrix.gathered(alone), _TOLERANCE)
+            change = matrix.solved(matrix.gathered(alone), tolerance)
             return matrix.heights_of(change), error - matrix.seen(change) / matrix.roots
 
         displacement, moved = boundaries.displacements(response)
