@@ -148,7 +148,7 @@ def fit(
     )  # fmt: skip
     with automatic_axes("fit", given.mesh) as automatic:
         found = _found(scenes, targets, dataclasses.replace(given, mesh=automatic))
-    if automatic is given.mesh:
+    if automatic is None or automatic is given.mesh:
         return found
     arrays = {name: getattr(found, name) for name in ("heights", "albedo", "exposures", "offsets", "scenes")}
     return dataclasses.replace(found, **on_every_device(arrays, automatic))
