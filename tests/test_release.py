@@ -27,7 +27,7 @@ def test_wheel_and_sdist(tmp_path):
         archive.extractall(tmp_path / "source", filter="data")
     subprocess.run([sys.executable, "-m", "build", "--outdir", tmp_path / "dist", tmp_path / "source"], check=True)
     (wheel,), (sdist,) = (tmp_path / "dist").glob("*.whl"), (tmp_path / "dist").glob("*.tar.gz")
-    assert wheel.stat().st_size < 500_000
+    assert wheel.stat().st_size < 450_000
     assert sdist.stat().st_size < 600_000
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "jaxhf").rglob("*.py*") if "__pycache__" not in path.parts}
     assert modules | {"jaxhf/py.typed"} == {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("jaxhf/")}

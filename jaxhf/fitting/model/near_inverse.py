@@ -28,8 +28,13 @@ _COARSER = 4  # times wider the cells of the coarse grid that joins the blocks
 
 
 def robust_matrix(expansion: Expansion) -> NormalMatrix:
-    """The normal matrix, its residuals weighted as the robust loss weighs them; with its near inverse where it `has_rows`."""
-    roots = np.sqrt(np.asarray(robust_weight(jnp.asarray(in_row(expansion.left())), expansion.problem.loss_scale)))
+    """`normal_matrix` with the weights of the robust loss."""
+    weights = robust_weight(jnp.asarray(in_row(expansion.left())), expansion.problem.loss_scale)
+    return normal_matrix(expansion, np.sqrt(np.asarray(weights)))
+
+
+def normal_matrix(expansion: Expansion, roots: Float[np.ndarray, " rows"]) -> NormalMatrix:
+    """The normal matrix with these roots of its residuals' weights, and with its near inverse where it `has_rows`."""
     rows = pictures_by_heights(expansion)
     matrix = NormalMatrix(expansion, roots, rows)
     if rows is not None:

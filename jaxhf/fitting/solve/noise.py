@@ -11,10 +11,10 @@ from jaxtyping import Bool, Float, Int
 
 from ..model.expansion import Expansion
 from ..model.linearise import changing_pixels
-from ..model.near_inverse import near_inverse
+from ..model.near_inverse import near_inverse, normal_matrix
 from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, PartMatrix, in_row
 from ..model.problem import Problem
-from ..model.rows import Place, can_have_rows, first_vertices, part_by_heights, pictures_by_heights
+from ..model.rows import Place, can_have_rows, first_vertices, part_by_heights
 
 _FAR = 6.0  # times the median: four standard deviations of normal errors; what is farther off is not explained
 _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
@@ -158,20 +158,15 @@ class Restricted:
 def _told(expansion: Expansion, labels: Labels) -> tuple[Int[np.ndarray, " values"], NormalMatrix]:
     """Which values are to tell the noise, and the normal matrix of their residuals, all of weight 1, with its inverse if there
     is one: of all values or, of many heights, of those that show a block of them, as a part of the data tells it as well."""
-    values, place = np.arange(labels.size), None
-    if not can_have_rows(expansion):
-        return values, NormalMatrix(expansion, np.ones(values.size))
-    shape = expansion.problem.basis.base.shape
-    if max(shape) > _MOST_SIDE and expansion.unknowns.count - math.prod(shape) <= MOST_OTHERS:
+    place, shape = None, expansion.problem.basis.base.shape
+    few_others = expansion.unknowns.count - math.prod(shape) <= MOST_OTHERS
+    if can_have_rows(expansion) and max(shape) > _MOST_SIDE and few_others:
         place = _block(expansion, labels)
     if place is None:
-        rows = pictures_by_heights(expansion)
-        matrix = NormalMatrix(expansion, np.ones(values.size), rows)
-    else:
-        rows, values = part_by_heights(expansion, place)
-        matrix = PartMatrix(expansion, np.ones(values.size), rows, place)
-    if rows is not None:
-        matrix.inverse = near_inverse(matrix)
+        return np.arange(labels.size), normal_matrix(expansion, np.ones(labels.size))
+    rows, values = part_by_heights(expansion, place)
+    matrix = PartMatrix(expansion, np.ones(values.size), rows, place)
+    matrix.inverse = near_inverse(matrix)
     return values, matrix
 
 

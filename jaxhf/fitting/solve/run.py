@@ -45,7 +45,7 @@ class _Place(NamedTuple):
       problem: of its stage.
       share: of the modes that this varies.
       expansion: at its unknowns.
-      position: optimistix's state.
+      position: optimistix's state; None where the stage's steps are by factors.
       first: that from which it is made anew, see `first_position`.
       whole_step: from the expansion, where the stage's steps are by factors.
     """
@@ -219,6 +219,8 @@ def _placed(problems: Sequence[Problem], state: State, expansion: Expansion | No
     if expansion is not None and expansion.problem.settings != posed.settings:
         first = None
     here = here.of(posed.with_noise(state.noise, here.sampling))
+    if stage.by_factors:
+        return _Place(here.problem, stage.share, here, None, None)
     first = first_position(here) if first is None else first
     return _Place(here.problem, stage.share, here, position_at(first, state.begin, state.step_size), first)
 

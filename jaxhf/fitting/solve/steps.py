@@ -41,7 +41,7 @@ class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
         self.tolerance, self.iterations, self.others = jnp.asarray(tolerance), jnp.asarray(iterations), others
 
     def init(self, y: Unknowns, f_info_struct: Any) -> Any:
-        return jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if _is_shaped(leaf) else leaf, f_info_struct)
+        return _empty(f_info_struct)
 
     def query(self, y: Unknowns, f_info: Any, state: Any) -> Any:
         return f_info
@@ -91,8 +91,9 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         self.verbose = _silent
 
 
-def _is_shaped(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array | jax.ShapeDtypeStruct)
+def _empty(form: Any) -> Any:
+    """The same with zeros for its arrays."""
+    return jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) else leaf, form)
 
 
 def _silent(**_: Any) -> None:
@@ -143,7 +144,7 @@ def position_at(first: Any, unknowns: Unknowns, step_size: Float[Array, ""]) -> 
     The next step evaluates there, and always accepts: the state is then, to the bit, what it was after the step that reached
     them, if 1 / λ is the same. So a checkpoint need not hold linearised pictures.
     """
-    empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype) if _is_shaped(leaf) else leaf, first)
+    empty = _empty(first)
     begin = jnp.ones_like(empty.first_step), unknowns, step_size.astype(empty.search_state.step_size.dtype)
     return eqx.tree_at(lambda state: (state.first_step, state.y_eval, state.search_state.step_size), empty, begin)
 
@@ -161,8 +162,7 @@ def advance(
       tolerance, iterations: see `ConjugateGradients`.
     """
     solver = LevenbergMarquardt(rejections, tolerance, iterations, others)
-    parts = on_every_device((solver, unknowns, position, expansion), expansion.problem.mesh)
-    solver, unknowns, position, expansion = parts
+    solver, unknowns, position, expansion = on_every_device((solver, unknowns, position, expansion), expansion.problem.mesh)
     of_j = eqx.tree_at(
         lambda state: (state.f_info.jac, state.descent_state.jac), jax.tree.map(lambda _: False, position), (True, True)
     )
