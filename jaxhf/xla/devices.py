@@ -6,11 +6,13 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import Tracer
+from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 
 from ..core.errors import ArgumentError, UserError, require_kind
@@ -19,6 +21,13 @@ from .machine import peak_mb
 
 # A device more of a CPU costs 7 ms a run, and so many rays take 10 (one terrain) to 300 ms (mirrors) to trace.
 _RAYS_A_DEVICE = 2**16
+_LEAST_DIVIDED = 2**14  # numbers of an array
+
+
+class Spread(eqx.Module):
+    """Arrays whose axis 1 is divided among the devices of a mesh, each of which holds its part alone."""
+
+    values: Any
 
 
 @functools.cache
@@ -98,25 +107,57 @@ def prepared_mesh(owner: str, prepared: Mesh, mesh: Mesh | None, tree: Any) -> M
 
 
 def on_every_device(tree: Any, mesh: Mesh) -> Any:
-    """Copies arrays to each device of a mesh, wherever the caller has put them.
+    """Copies arrays to each device of a mesh, wherever the caller has put them; what is `Spread` is divided among them.
 
     What is still NumPy is left to the compiled program, which copies it by itself. Over several processes each must have the
     same values.
     """
-    here, around = mesh.devices.ravel(), jax.sharding.get_abstract_mesh()
-    if around.manual_axes or (around.empty and len(here) == 1 and here[0] == jax.devices()[0]):
-        return tree
 
     def placed(leaf: Any) -> Any:
-        if not isinstance(leaf, jax.Array):
-            return leaf
-        if not mesh.is_multi_process:
-            return jax.device_put(leaf, NamedSharding(mesh, P())) if around.empty else jax.reshard(leaf, P())
-        # What belongs to one process can only be sent to another by way of the host, from which all start with the same.
-        at_home = isinstance(leaf, Tracer) or jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-        return leaf if at_home or leaf.sharding.device_set == set(here) else np.asarray(leaf)
+        if isinstance(leaf, Spread):
+            return jax.tree.map(lambda part: _placed(part, mesh, P(None, mesh.axis_names)), leaf)
+        return _placed(leaf, mesh, P())
 
-    return jax.tree.map(placed, tree)
+    return tree if _at_home(mesh) else jax.tree.map(placed, tree, is_leaf=lambda leaf: isinstance(leaf, Spread))
+
+
+def divided(tree: Any, mesh: Mesh) -> Any:
+    """Divides arrays along their first axis among the devices of a mesh; those that it does not divide, and small ones, are
+    copied to each."""
+
+    def placed(leaf: Any) -> Any:
+        small = not isinstance(leaf, jax.Array) or leaf.size < _LEAST_DIVIDED or leaf.shape[0] % mesh.devices.size
+        return _placed(leaf, mesh, P() if small else P(mesh.axis_names))
+
+    return tree if _at_home(mesh) else jax.tree.map(placed, tree)
+
+
+def _at_home(mesh: Mesh) -> bool:
+    """Whether arrays are where they belong, wherever JAX has put them."""
+    here, around = mesh.devices.ravel(), jax.sharding.get_abstract_mesh()
+    return bool(around.manual_axes) or (around.empty and len(here) == 1 and here[0] == jax.devices()[0])
+
+
+def _placed(leaf: Any, mesh: Mesh, place: P) -> Any:
+    around, there = jax.sharding.get_abstract_mesh(), NamedSharding(mesh, place)
+    if not isinstance(leaf, jax.Array):
+        return leaf
+    if not mesh.is_multi_process:
+        return jax.device_put(leaf, there) if around.empty else jax.reshard(leaf, place)
+    if isinstance(leaf, Tracer):
+        return leaf if place == P() else lax.with_sharding_constraint(leaf, there)
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) or leaf.sharding.device_set == set(mesh.devices.ravel()):
+        return leaf
+    # What belongs to one process can only be sent to another by way of the host, from which all start with the same.
+    values = np.asarray(leaf)
+    return values if place == P() else jax.make_array_from_callback(values.shape, there, lambda index: values[index])
+
+
+def on_host(tree: Any) -> Any:
+    """NumPy's arrays of all values, also of those that devices of other processes hold."""
+    return jax.tree.map(
+        lambda leaf: np.asarray(leaf if leaf.is_fully_addressable else multihost_utils.process_allgather(leaf, tiled=True)), tree
+    )
 
 
 def where_called(owner: str, tree: Any) -> Any:
@@ -139,6 +180,12 @@ def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any
       shared: a pytree of arrays.
       items: a pytree of arrays whose leading axis counts the items.
     """
+    return map_and_spread(mesh, lambda shared, item: (fun(shared, item), ()), shared, items)[0]
+
+
+def map_and_spread(mesh: Mesh, fun: Callable[[Any, Any], tuple[Any, Any]], shared: Any, items: Any) -> tuple[Any, Any]:
+    """`map_over` for the first of two results of `fun`. The second ones stay divided among the devices: in a row, to which so
+    many more of the last are added that each device has as many."""
 
     def one_after_the_other(shared: Any, items: Any) -> Any:
         return lax.map(lambda item: fun(shared, item), items)
@@ -148,7 +195,7 @@ def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any
         return one_after_the_other(shared, items)
     around = jax.sharding.get_abstract_mesh()
     if AxisType.Explicit in around.axis_types:
-        dealt_out: Any = jax.sharding.auto_axes(functools.partial(map_over, mesh, fun), out_sharding=P())
+        dealt_out: Any = jax.sharding.auto_axes(functools.partial(map_and_spread, mesh, fun), out_sharding=P())
         return dealt_out(shared, items)
     given = mesh if around.empty else around
     count = math.ceil(n / devices)
@@ -162,9 +209,29 @@ def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any
     )
 
     def in_order(values: jax.Array) -> jax.Array:
-        # Gathered before anything is made of it, or XLA would take sums in parts, in another order than on one device.
-        values = lax.with_sharding_constraint(values, NamedSharding(given, P()))
         tail = values.shape[1:]
-        return values.reshape(devices, count, *tail).swapaxes(0, 1).reshape(devices * count, *tail)[:n]
+        return values.reshape(devices, count, *tail).swapaxes(0, 1).reshape(devices * count, *tail)
 
-    return jax.tree.map(in_order, over(shared, jax.tree.map(lambda leaf: leaf[turns], items)))
+    def gathered(values: jax.Array) -> jax.Array:
+        # Before anything is made of it, or XLA would take sums in parts, in another order than on one device.
+        return in_order(lax.with_sharding_constraint(values, NamedSharding(given, P())))[:n]
+
+    def spread(values: jax.Array) -> jax.Array:
+        return lax.with_sharding_constraint(in_order(values), NamedSharding(given, P(mesh.axis_names)))
+
+    first, second = over(shared, jax.tree.map(lambda leaf: leaf[turns], items))
+    return jax.tree.map(gathered, first), jax.tree.map(spread, second)
+
+
+def over_spread(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Spread) -> Any:
+    """`fun(shared, part)` for the part that each device has. Results have parts along the same axis, and each device gets all.
+
+    Derivatives with respect to `shared` are sums over devices.
+    """
+    if mesh.devices.size == 1:
+        return fun(shared, items.values)
+    around = jax.sharding.get_abstract_mesh()
+    given, parts = mesh if around.empty else around, P(None, mesh.axis_names)
+    over = jax.shard_map(fun, mesh=given, in_specs=(P(), parts), out_specs=parts, check_vma=False)
+    whole = NamedSharding(given, P())
+    return jax.tree.map(lambda leaf: lax.with_sharding_constraint(leaf, whole), over(shared, items.values))

@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -36,7 +36,7 @@ from ...shade.radiance import direct, has_mirrors
 from ...trace.grid import Grid
 from ...trace.hit import Hit
 from ...trace.triangle import Corners, triangle_vertices
-from ...xla.devices import map_over, on_every_device
+from ...xla.devices import Spread, map_and_spread, map_over, on_every_device, over_spread
 from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
 from .view import KNOWN, View, motion, moved
@@ -57,27 +57,35 @@ class Linearised(eqx.Module):
         samples make a staircase, on which no step along the derivative leads down.
       depends: whether any of a pixel's samples changes with the heights of the first heightfield, shape (h, w).
       sampling: standard deviation of a pixel's error from its having so few samples, radiance, shape (h, w).
-      slopes: derivatives of each sample, (chunks, c, 3 or 12, samples): in the three heights, then, vertex by vertex, in the
-        normals.
-      vertices: the numbers of those three vertices over all grids, (chunks, 3, samples).
+      samples: a `SampleRows`, of which each device has a part.
       edges: of samples of moving boundaries; None where the settings ask for none.
-      view: derivatives of each sample in the numbers of the light and of the camera that are sought, see `moved`,
-        (chunks, c, 2 or 6, samples).
-      albedo: derivatives in the factors of the albedo that are sought; None where it is known.
     """
 
     image: Float[jax.Array, "*n h w c"]
     depends: Bool[jax.Array, "*n h w"]
     sampling: Float[jax.Array, "*n h w"]
+    samples: Spread
+    edges: "LinearisedEdges | None"
+
+
+class SampleRows(NamedTuple):
+    """The derivatives of the samples of a picture, chunk by chunk; the last chunk may be there several times.
+
+    Attributes:
+      slopes: of each sample, (chunks, c, 3 or 12, samples): in the three heights, then, vertex by vertex, in the normals.
+      vertices: the numbers of those three vertices over all grids, (chunks, 3, samples).
+      view: in the numbers of the light and of the camera that are sought, see `moved`, (chunks, c, 2 or 6, samples).
+      albedo: in the factors of the albedo that are sought; None where it is known.
+    """
+
     slopes: Float[jax.Array, "*n chunks c k samples"]
     vertices: Int[jax.Array, "*n chunks 3 samples"]
-    edges: "LinearisedEdges | None"
-    view: View = KNOWN
-    albedo: "LinearisedAlbedo | None" = None
+    view: View
+    albedo: "AlbedoRows | None"
 
 
-class LinearisedAlbedo(eqx.Module):
-    """The part of the factors of an albedo in a linearised picture.
+class AlbedoRows(NamedTuple):
+    """The part of the factors of an albedo.
 
     Attributes:
       slopes: derivatives of each sample in the factors' relative changes at four texels, channel by channel of these,
@@ -98,7 +106,7 @@ class LinearisedEdges(eqx.Module):
       pixel: which pixel each boundary sample is in; they are numbered row by row.
       kind: 0 where a sample does not count, 1 where its edge is seen where it stands, 2 where its shadow is.
       resampled: the pixels that are resampled, by samples after the picture's.
-      view: as that of `Linearised`, (chunks, c, 2 or 6, size).
+      view: as that of `SampleRows`, (chunks, c, 2 or 6, size).
     """
 
     slopes: Float[jax.Array, "*n chunks c 5 size"]
@@ -180,21 +188,20 @@ def picture_each(
         first = jnp.arange(each.shape[0])[:, None, None, None] * each.shape[1]
         at_vertices = each.reshape(-1, each.shape[-1])
     else:
-        at_vertices, first = _values(change(jax.tree.map(lambda leaf: leaf[0], scenes)), settings, mesh), 0
+        at_vertices, first = _values(change(jax.tree.map(lambda leaf: leaf[0], scenes)), settings, mesh), jnp.int32(0)
+    channels, still = known.image.shape[-1], known.samples.values.view
+    numbers = jax.vmap(lambda scene: motion(scene.lights, scene.camera, still))(scenes)
+    relative = None if factors is None else factors / _apart_from_zero(lax.stop_gradient(factors))
     # All pictures at once: a loop over them would copy what it reads of each.
-    (n, chunks, _, _, size), channels = known.slopes.shape, known.image.shape[-1]
-    joined = known.slopes.reshape(-1, *known.slopes.shape[2:]), (known.vertices + first).reshape(-1, 3, size)
-    of_samples = _product(mesh, at_vertices, *joined).reshape(n, chunks, size, channels)
-    numbers = jax.vmap(lambda scene: motion(scene.lights, scene.camera, known.view))(scenes)
-    if known.albedo is not None and factors is not None:
-        of_samples = of_samples + jax.vmap(lambda albedo: _by_albedo(albedo, factors, channels))(known.albedo)
+    of_samples = over_spread(mesh, _of_samples, (at_vertices, first, numbers, relative), known.samples)
     light = None
     if known.edges is not None:
         heights = at_vertices[:, 0].at[known.edges.vertices + first].get(mode="promise_in_bounds")
         light = jnp.moveaxis(jnp.sum(known.edges.slopes * heights[:, :, None], axis=3), 2, -1)
 
-    def one(known: Linearised, of_samples: jax.Array, light: jax.Array | None, numbers: View) -> Float[jax.Array, "h w c"]:
-        of_samples, edges = _with_view(of_samples, known.view, numbers), known.edges
+    def one(
+        image: jax.Array, edges: LinearisedEdges | None, of_samples: jax.Array, light: jax.Array | None, numbers: View
+    ) -> Float[jax.Array, "h w c"]:
         samples = PictureSamples(camera, settings, None if edges is None else edges.resampled)
         change = samples.in_pixels(of_samples)
         if edges is not None and light is not None:
@@ -202,10 +209,10 @@ def picture_each(
             finer = samples.of_resampled(of_samples).mean(1)
             flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, channels))
             change = flat.reshape(change.shape)
-        return with_tangent(known.image, change)
+        return with_tangent(image, change)
 
     camera, settings = scenes.camera, resolve_settings(settings, scenes)
-    return jax.vmap(one)(known, of_samples, light, numbers)
+    return jax.vmap(one)(known.image, known.edges, of_samples, light, numbers)
 
 
 def _values(scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "vertices n"]:
@@ -221,7 +228,7 @@ def _linearise(
     samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
     sampled = functools.partial(_samples, channels, None if factors is None else factors.shape)
     seen = world, camera, still
-    light, slopes, vertices, view, albedo = map_over(mesh, lambda *args: one_kernel(sampled, *args), seen, samples.positions())
+    (light, moving), rows = map_and_spread(mesh, lambda *args: one_kernel(sampled, *args), seen, samples.positions())
     image, edges = samples.in_pixels(light), None
     sampling = _sampling_error(samples.in_rows(light), math.isqrt(world.settings.samples or 1))
     if drawn is not None:
@@ -237,12 +244,9 @@ def _linearise(
             known.reshape(-1, channels).at[drawn.resampled].set(new, unique_indices=True).reshape(image.shape)
             for known, new in ((image, finer.mean(1)), (sampling, error))
         )
-    sought = vertices[:, 0] < world.grids[0][1].rows.shape[0]
-    moving = ((slopes != 0).any(axis=(1, 2)) & sought).astype(light.dtype)[..., None]
     depends = samples.in_pixels(moving)[..., 0] > 0
     sampling = jnp.sqrt(jnp.mean(sampling * sampling, axis=-1))
-    albedo = None if albedo is None else LinearisedAlbedo(*albedo)
-    return Linearised(image, depends, sampling, slopes, vertices, edges, view, albedo)
+    return Linearised(image, depends, sampling, Spread(rows), edges)
 
 
 def _sampling_error(samples: Float[jax.Array, "rows columns c"], side: int) -> Float[jax.Array, "h w c"]:
@@ -280,14 +284,6 @@ def _with_view(change: Float[jax.Array, "chunks n c"], slopes: View, numbers: Vi
     return change
 
 
-def _by_albedo(known: LinearisedAlbedo, factors: Float[jax.Array, "ty tx k"], channels: int) -> Float[jax.Array, "chunks n c"]:
-    """What samples change by with the factors of the albedo."""
-    relative = (factors / _apart_from_zero(lax.stop_gradient(factors))).reshape(-1, factors.shape[-1])
-    there = relative.at[known.texels].get(mode="promise_in_bounds")  # (chunks, 4, samples, k)
-    change = jnp.einsum("qkts,qtsk->qsk", known.slopes, there)
-    return change if channels == change.shape[-1] else jnp.sum(change, axis=-1, keepdims=True)
-
-
 def _apart_from_zero(factors: Float[jax.Array, "..."]) -> Float[jax.Array, "..."]:
     return jnp.where(jnp.abs(factors) < _LEAST_FACTOR, _LEAST_FACTOR, factors)
 
@@ -297,8 +293,8 @@ def _channels(light: Float[jax.Array, "*rest 3"], channels: int) -> Float[jax.Ar
 
 
 def _samples(channels: int, factors: tuple[int, ...] | None, seen: tuple[World, Camera, View], points: tuple[jax.Array, ...]):
-    """Radiance at points of the picture, (n, c), and its slopes, vertices, view and albedo, see `Linearised`; `factors` is the
-    shape of those that are sought."""
+    """Radiance at points of the picture, (n, c), whether it changes with the sought heights, (n, 1), and its `SampleRows`;
+    `factors` is the shape of those that are sought."""
     world, camera, still = seen
     x, y = points
     smooth = world.settings.shading == "smooth"
@@ -325,13 +321,14 @@ def _samples(channels: int, factors: tuple[int, ...] | None, seen: tuple[World, 
         slopes, view = jax.tree.map(lambda leaf: leaf[None], pull_back(each[0]))
     else:
         slopes, view = jax.vmap(pull_back)(each)
-    return light, slopes, vertices, view, albedo
+    moving = (slopes != 0).any(axis=(0, 1)) & (vertices[0] < world.grids[0][1].rows.shape[0])
+    return (light, moving.astype(light.dtype)[:, None]), SampleRows(slopes, vertices, view, albedo)
 
 
 def _texels(
     world: World, hit: Hit, light: jax.Array, channels: int, factors: tuple[int, ...]
-) -> tuple[Float[jax.Array, "k 4"], Int[jax.Array, "4"]]:
-    """How the light from a hit goes with the factors of the first heightfield's albedo: see `LinearisedAlbedo`."""
+) -> AlbedoRows:
+    """How the light from a hit goes with the factors of the first heightfield's albedo."""
     number = world.grids[0][0]
     material = world.materials[number]
     assert isinstance(material, Matte)
@@ -346,7 +343,7 @@ def _texels(
     slopes = jnp.where(hit.object == number, light, 0)[:, None] * shares
     if channels == 1:
         slopes = slopes / 3 if factors[2] == 3 else jnp.mean(slopes, axis=0, keepdims=True)
-    return slopes, places
+    return AlbedoRows(slopes, places)
 
 
 def _each(still: View, count: int) -> View:
@@ -391,21 +388,41 @@ def vertex_values(world: World) -> Float[jax.Array, "vertices n"]:
     return jnp.concatenate([heights, jnp.concatenate(normals)], axis=1) if normals else heights
 
 
-def _product(
-    mesh: Mesh,
-    at_vertices: Float[jax.Array, "vertices n"],
+def _of_samples(
+    shared: tuple[Float[jax.Array, "vertices m"], jax.Array, View, Float[jax.Array, "ty tx k"] | None], rows: SampleRows
+) -> Float[jax.Array, "n chunks samples c"]:
+    """What samples of n pictures change by: their rows times what stands at the vertices, moves light and camera, and is the
+    relative change of the albedo's factors.
+
+    Args:
+      shared: these; the second is the number of the first vertex of each picture.
+      rows: of these samples.
+    """
+    at_vertices, first, numbers, relative = shared
+    n, chunks, channels, k, size = rows.slopes.shape
+    joined = rows.slopes.reshape(-1, channels, k, size), (rows.vertices + first).reshape(-1, 3, size)
+    found = _by_vertices(at_vertices, *joined).reshape(n, chunks, channels, size)
+    if rows.albedo is not None and relative is not None:
+        factors = relative.reshape(-1, relative.shape[-1]).at[rows.albedo.texels].get(mode="promise_in_bounds")
+        change = jnp.einsum("nqkts,nqtsk->nqks", rows.albedo.slopes, factors)
+        found = found + (change if channels == change.shape[2] else jnp.sum(change, axis=2, keepdims=True))
+    return jax.vmap(_with_view)(jnp.moveaxis(found, 2, -1), rows.view, numbers)
+
+
+def _by_vertices(
+    at_vertices: Float[jax.Array, "vertices m"],
     slopes: Float[jax.Array, "chunks c k samples"],
     vertices: Int[jax.Array, "chunks 3 samples"],
-) -> Float[jax.Array, "chunks samples c"]:
-    """The matrix of all samples times what stands at the vertices."""
+) -> Float[jax.Array, "chunks c samples"]:
+    """The matrix of samples times what stands at the vertices."""
     chunks, channels, _, size = slopes.shape
-    parts = mesh.devices.size * math.ceil(chunks / (mesh.devices.size * _TOGETHER))
+    parts = math.ceil(chunks / _TOGETHER)
 
     def in_parts(values: jax.Array) -> jax.Array:
         padded = jnp.pad(values, ((0, -chunks % parts), *((0, 0) for _ in values.shape[1:]))) if chunks % parts else values
         return padded.reshape(parts, -1, *values.shape[1:])
 
-    def part(at_vertices: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+    def part(rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         slopes, vertices = rows
         total = jnp.zeros((slopes.shape[0], channels, size), slopes.dtype)
         # Looked up a row of four at a time and used number by number: 262144 samples took 0.8 ms, and 2.9 ms transposed. A
@@ -417,5 +434,4 @@ def _product(
                 total = total + slope * row[:, None, :, number]
         return total
 
-    moved = map_over(mesh, part, at_vertices, (in_parts(slopes), in_parts(vertices)))
-    return jnp.moveaxis(moved.reshape(-1, channels, size), 1, -1)[:chunks]
+    return lax.map(part, (in_parts(slopes), in_parts(vertices))).reshape(-1, channels, size)[:chunks]

@@ -22,9 +22,9 @@ from ...rendering.tiles import Tiling
 from ...scene.heightfield import Heightfield
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
-from ...xla.devices import on_every_device
+from ...xla.devices import on_every_device, on_host
 from .expansion import Expansion, completion, views
-from .linearise import Linearised, vertex_values
+from .linearise import Linearised, SampleRows, vertex_values
 from .pictures import Group
 from .problem import Problem
 from .surface import Unknowns
@@ -84,8 +84,9 @@ def first_vertices(expansion: Expansion) -> Int[np.ndarray, " rows"]:
     for group, known in zip(expansion.problem.groups, expansion.linearised, strict=True):
         assert known is not None
         slots = _slots(PictureSamples(group.scenes.camera, expansion.problem.settings))[:, 0]
-        chunk, sample = np.divmod(slots, known.vertices.shape[-1])
-        vertices = np.asarray(known.vertices)[:, chunk, 0, sample]
+        vertices = on_host(known.samples.values.vertices)
+        chunk, sample = np.divmod(slots, vertices.shape[-1])
+        vertices = vertices[:, chunk, 0, sample]
         shown = np.asarray(known.depends).reshape(vertices.shape) & (vertices < count)
         found.append(np.repeat(np.where(shown, vertices, -1), group.targets.shape[-1]))
     return np.concatenate([part.ravel() for part in found])
@@ -107,7 +108,7 @@ def _rows_of(expansion: Expansion, place: Place | None) -> Part:
     blocks, values, first = [], [], 0
     for group, known, here in zip(problem.groups, expansion.linearised, slopes, strict=True):
         assert known is not None
-        scene = group.complete(group.scenes, heights)
+        known, scene = on_host(known), group.complete(group.scenes, heights)
         n, h, w, c = group.targets.shape
         pixels = [np.arange(h * w) if core is None else _pixels_at(known, k, scene, problem, core) for k in range(n)]
         right = _vertices_by_heights(np.asarray(here, np.float64), scene, near)
@@ -133,11 +134,11 @@ def _pixels_at(
 ) -> Int[np.ndarray, " pixels"]:
     """Those of a picture all of whose samples show triangles of these vertices, but for those that a boundary crosses."""
     slots = _slots(PictureSamples(scene.camera, problem.settings))
-    vertices = np.moveaxis(np.asarray(known.vertices)[k], 1, 2).reshape(-1, 3)[slots]
+    vertices = np.moveaxis(known.samples.values.vertices[k], 1, 2).reshape(-1, 3)[slots]
     shown = np.append(core.ravel(), False)[np.minimum(vertices, core.size)].all(axis=(1, 2))
-    shown &= np.asarray(known.depends)[k].ravel()
+    shown &= known.depends[k].ravel()
     if known.edges is not None:
-        edges = jax.tree.map(lambda leaf: np.asarray(leaf)[k], known.edges)
+        edges = jax.tree.map(lambda leaf: leaf[k], known.edges)
         shown[edges.resampled] = False
         shown[edges.pixel[edges.kind > 0]] = False
     return np.flatnonzero(shown)
@@ -150,7 +151,7 @@ def _of_group(
 
     def product(which: tuple[int, int]) -> Sparse:
         k, channel = which
-        one = jax.tree.map(lambda leaf: np.asarray(leaf)[k], known)
+        one = jax.tree.map(lambda leaf: leaf[k], known)
         samples = PictureSamples(scene.camera, problem.settings, None if one.edges is None else one.edges.resampled)
         return _picture_by_vertices(one, samples, channel, right.shape[0], pixels[k]) @ right
 
@@ -223,13 +224,14 @@ def _picture_by_vertices(
 ) -> Sparse:
     """The derivative of a channel of these pixels of a picture in what stands at the vertices: a row for each, and so many
     columns; all pixels, where it has boundaries."""
-    chunks, _, numbers, size = known.slopes.shape
+    rows_of_samples: SampleRows = known.samples.values
+    chunks, _, numbers, size = rows_of_samples.slopes.shape
     at_vertex = 4 if numbers == 12 else 1
     vertex, number = np.arange(3), np.zeros(3, int)
     if numbers == 12:  # the three heights, then each vertex's normal
         vertex, number = np.concatenate([vertex, np.repeat(vertex, 3)]), np.concatenate([number, np.tile([1, 2, 3], 3)])
-    slopes = np.moveaxis(np.asarray(known.slopes)[:, channel], 1, 2).reshape(chunks * size, numbers)
-    places = np.moveaxis(np.asarray(known.vertices), 1, 2).reshape(chunks * size, 3)
+    slopes = np.moveaxis(rows_of_samples.slopes[:, channel], 1, 2).reshape(chunks * size, numbers)
+    places = np.moveaxis(rows_of_samples.vertices, 1, 2).reshape(chunks * size, 3)
     slots, shape = _slots(samples)[pixels], (pixels.size, columns)
     share = np.full((*slots.shape, 1), 1 / slots.shape[1])
 
@@ -238,13 +240,13 @@ def _picture_by_vertices(
 
     if known.edges is None:
         return rows(slots, share, shape)
-    resampled, pixel, edges = np.asarray(known.edges.resampled), np.asarray(known.edges.pixel), known.edges
+    resampled, pixel, edges = known.edges.resampled, known.edges.pixel, known.edges
     share[resampled] = 0
     tiling = Tiling(samples.camera, samples.settings)
     once_more = tiling.count * slots.shape[1] * size + np.arange(resampled.size * resampled_side(samples.settings) ** 2)
     once_more = once_more.reshape(resampled.size, -1)
-    moving = np.moveaxis(np.asarray(edges.slopes)[:, channel], 1, 2).reshape(-1, 5)
-    heights = np.moveaxis(np.asarray(edges.vertices), 1, 2).reshape(-1, 5) * at_vertex
+    moving = np.moveaxis(edges.slopes[:, channel], 1, 2).reshape(-1, 5)
+    heights = np.moveaxis(edges.vertices, 1, 2).reshape(-1, 5) * at_vertex
     moving = _rows(moving[:, None], heights[:, None], (len(pixel), columns))
     return (
         rows(slots, share, shape)

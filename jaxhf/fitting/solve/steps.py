@@ -10,7 +10,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from ...core.types import Flag, Scalar
-from ...xla.devices import on_every_device
+from ...xla.devices import divided, on_every_device
 from ..model.expansion import Expansion, residuals
 from ..model.surface import Unknowns
 
@@ -162,12 +162,17 @@ def advance(
       tolerance, iterations: see `ConjugateGradients`.
     """
     solver = LevenbergMarquardt(rejections, tolerance, iterations, others)
-    solver, unknowns, position, expansion = on_every_device((solver, unknowns, position, expansion), expansion.problem.mesh)
-    of_j = eqx.tree_at(
+    of_j, rest = _of_j(position)
+    kept = on_every_device((solver, unknowns, rest, expansion), expansion.problem.mesh)
+    return _advance(kept, divided(of_j, expansion.problem.mesh))
+
+
+def _of_j(position: Any) -> tuple[Any, Any]:
+    """What optimistix's state holds of J, and the rest."""
+    which = eqx.tree_at(
         lambda state: (state.f_info.jac, state.descent_state.jac), jax.tree.map(lambda _: False, position), (True, True)
     )
-    of_j, rest = eqx.partition(position, of_j)
-    return _advance((solver, unknowns, rest, expansion), of_j)
+    return eqx.partition(position, which)
 
 
 @eqx.filter_jit(donate="all-except-first")
@@ -185,4 +190,6 @@ def _advance(kept: tuple[LevenbergMarquardt, Unknowns, Any, Expansion], of_j: An
         step_size=state.search_state.step_size,
         change=jnp.sqrt(jnp.mean(moved * moved)),
     )
-    return on_every_device((new, state, outcome), problem.mesh)
+    of_j, rest = _of_j(state)
+    new, rest, outcome = on_every_device((new, rest, outcome), problem.mesh)
+    return new, eqx.combine(divided(of_j, problem.mesh), rest), outcome
