@@ -4,13 +4,16 @@ Each point is a process of its own, so that its peak of memory is its own. One q
 heights, 512 x 512 pixels, one sample, one picture, all cores, in the view of camera B of forward.py. All heights have as
 many cores as the largest terrain fits into memory for, once for each. The terrain is a sum of waves, from the whole side down
 to eight cells, which takes no memory beyond its heights. "frame" is from new heights to the picture, "prepared" has their
-normals and bounds at hand; several pictures are seen from several places. An exponent e says that a cost grows as
-quantity ** e: the slope of the logarithms over the upper half of the points.
+normals and bounds at hand; several pictures are seen from several places. "fits" are of square terrains by the plain call, in
+float32, with all compilation: three pictures from straight above with a pixel a height and 1 % noise, and a map of the terrain
+smoothed over eight cells. An exponent e says that a cost grows as quantity ** e: the slope of the logarithms over the upper
+half of the points.
 """
 
 import json
 import math
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +23,13 @@ import numpy as np
 from jaxhf.study.worker import Answers, MeasurementError, Worker, timed
 from jaxhf.xla.machine import available_bytes, peak_mb
 
-COSTS = ("frame", "prepared", "peak_mb")
+COSTS = ("frame", "prepared", "fit", "peak_mb")
 BASE = {"heights": 1024, "pixels": 512, "samples": 1, "images": 1}
-UNITS = {"heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores"}
+UNITS = {
+    "heights": "heights", "pixels": "pixels", "samples": "samples a pixel", "images": "pictures", "devices": "cores",
+    "fits": "heights of a fit",
+}  # fmt: skip
+SQUARE = ("heights", "pixels", "fits")
 # At the peak, for each device, which has the scene to itself: 54 to 63 measured with one, 107 with two.
 BYTES_A_HEIGHT = 66
 
@@ -86,19 +93,49 @@ def prepare(job: dict[str, Any]) -> Answers:
     return {"ready": first, "frame": lambda: timed(frame), "prepared": prepared}
 
 
+def fit(job: dict[str, Any]) -> Answers:
+    os.sched_setaffinity(0, job["cores"])
+    import jax
+    from cases import noisy, smoothed
+
+    import jaxhf
+
+    jax.config.update("jax_num_cpu_devices", job["devices"])
+    size = job["heights"]
+    truth = waves(size)
+    reference = smoothed(truth.astype(np.float64), 8)
+    camera = jaxhf.Orthographic.look_at((0.5, 0.5, 2), (0.5, 0.5, 0), up=(0, 1, 0), extent=1, width=size, height=size)
+    suns = [jaxhf.Directional.from_angles(azimuth, 35) for azimuth in (0, 120, 240)]
+
+    def scenes(heights: np.ndarray) -> list[jaxhf.Scene]:
+        return [jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Matte(0.5))], camera, [sun]) for sun in suns]
+
+    def ready() -> dict[str, float]:
+        exact = [np.asarray(jaxhf.render(scene, jaxhf.Settings(samples=16)))[..., 0] for scene in scenes(truth)]
+        targets, _ = noisy(np.stack(exact))
+        prior = jaxhf.Prior(reference, float(np.sqrt(np.mean((reference - truth) ** 2))))
+        begin = time.perf_counter()
+        found = jaxhf.fit(scenes(reference.astype(np.float32)), list(targets), prior=prior)
+        taken = time.perf_counter() - begin
+        after = float(np.sqrt(np.mean((np.asarray(found.heights, np.float64) - truth) ** 2)))
+        return {"fit": taken, "ratio": prior.std / after, "peak_mb": peak_mb()}
+
+    return {"ready": ready}
+
+
 def measure(quantity: str, value: int, cores: list[int], repeats: int) -> dict[str, Any]:
     job = BASE | {quantity: value} if quantity in BASE else dict(BASE)
     used = cores[:value] if quantity == "devices" else cores
+    about = {"quantity": quantity, "value": value, "count": value**2 if quantity in SQUARE else value, "devices": len(used)}
+    if quantity == "fits":
+        with Worker(fit, {"heights": value, "devices": len(used), "cores": used}) as worker:
+            return about | worker.answer()
     with Worker(prepare, job | {"devices": len(used), "cores": used}) as worker:
         peak = worker.answer()["peak_mb"]
         frames = [worker.ask("frame")["seconds"] for _ in range(repeats)]
         worker.ask("prepared")
         prepared = [worker.ask("prepared")["seconds"] for _ in range(repeats)]
-    count = value**2 if quantity in ("heights", "pixels") else value
-    return {
-        "quantity": quantity, "value": value, "count": count, "devices": len(used), "frame": float(np.median(frames)),
-        "prepared": float(np.median(prepared)), "peak_mb": peak,
-    }  # fmt: skip
+    return about | {"frame": float(np.median(frames)), "prepared": float(np.median(prepared)), "peak_mb": peak}
 
 
 def exponent(points: list[dict[str, Any]], cost: str) -> float:
@@ -119,13 +156,13 @@ def plot(points: list[dict[str, Any]], path: Path) -> None:
     for column, quantity in enumerate(quantities):
         mine = sorted((point for point in points if point["quantity"] == quantity), key=lambda point: point["count"])
         counts = [point["count"] for point in mine]
-        for row, costs in enumerate((("frame", "prepared"), ("peak_mb",))):
-            panel = axes[row][column]
+        for row, costs in enumerate((("frame", "prepared", "fit"), ("peak_mb",))):
+            panel, costs = axes[row][column], [cost for cost in costs if cost in mine[0]]
             for cost in costs:
                 label = cost.replace("peak_mb", "peak") + (f", exponent {exponent(mine, cost):.2f}" if len(mine) > 1 else "")
                 panel.plot(counts, [point[cost] for point in mine], "o-", label=label)
             panel.set(xscale="log", yscale="log", xlabel=UNITS[quantity], ylabel="MiB" if row else "seconds")
-            names = [f"{point['value']}²" if quantity in ("heights", "pixels") else str(point["value"]) for point in mine]
+            names = [f"{point['value']}²" if quantity in SQUARE else str(point["value"]) for point in mine]
             panel.set_xticks(counts, names, rotation=90 if len(names) > 5 else 0)
             panel.set_xticks([], minor=True)
             panel.set_ylim(*whole_decades([point[cost] for cost in costs for point in mine]))
@@ -156,6 +193,7 @@ def main() -> None:
         "samples": [n * n for n in (1, 2, 4, 8)],
         "images": [1, 2, 4, 8, 16],
         "devices": [n for n in (1, 2, 4, 8, 16) if n <= len(cores)],
+        "fits": [2**k for k in range(5, 10)],
     }
     print("about three minutes a quantity on two free cores", flush=True)
     options.output.mkdir(parents=True, exist_ok=True)
@@ -178,9 +216,9 @@ def main() -> None:
     for quantity in dict.fromkeys(point["quantity"] for point in points):
         mine = [point for point in points if point["quantity"] == quantity]
         for point in mine:
-            name = f"{point['value']}²" if quantity in ("heights", "pixels") else point["value"]
-            run.row(f"{name} {UNITS[quantity]}", {key: point[key] for key in ("devices", *COSTS)})
-        slopes = {cost: exponent(mine, cost) for cost in COSTS} if len(mine) > 1 else {}
+            name = f"{point['value']}²" if quantity in SQUARE else point["value"]
+            run.row(f"{name} {UNITS[quantity]}", {key: point[key] for key in ("devices", *COSTS, "ratio") if key in point})
+        slopes = {cost: exponent(mine, cost) for cost in COSTS if cost in mine[0]} if len(mine) > 1 else {}
         run.row(f"exponent of {UNITS[quantity]}", slopes)
         most = dict.fromkeys(COSTS, 1.2) | ({"prepared": 0.5} if quantity == "heights" else {})
         for cost, slope in slopes.items():

@@ -155,9 +155,11 @@ def _placed(leaf: Any, mesh: Mesh, place: P) -> Any:
 
 def on_host(tree: Any) -> Any:
     """NumPy's arrays of all values, also of those that devices of other processes hold."""
-    return jax.tree.map(
-        lambda leaf: np.asarray(leaf if leaf.is_fully_addressable else multihost_utils.process_allgather(leaf, tiled=True)), tree
-    )
+
+    def whole(leaf: jax.Array) -> np.ndarray:
+        return np.asarray(leaf if leaf.is_fully_addressable else multihost_utils.process_allgather(leaf, tiled=True))
+
+    return jax.tree.map(whole, tree)
 
 
 def where_called(owner: str, tree: Any) -> Any:

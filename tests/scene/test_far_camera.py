@@ -9,7 +9,7 @@ import oracle
 import pytest
 
 import jaxhf
-from jaxhf.fitting.model.view import View, motion, moved
+from jaxhf.fitting.model.view import View, moved
 from jaxhf.preparation.localise import localise
 from jaxhf.rendering.cast import cast_camera
 
@@ -123,7 +123,7 @@ def test_points_are_projected_to_where_they_are_seen(kind):
 @pytest.mark.deep
 @pytest.mark.x64  # to see motions of 1e-6 rad
 def test_a_fit_turns_a_far_camera_about_its_eye():
-    """As it turns one whose rays begin there; and reads the same motion from it."""
+    """As it turns one whose rays begin there."""
     local = localise(scene(jaxhf.Perspective, HEIGHTS.astype(np.float64))).camera
     pose = np.array(camera(jaxhf.Perspective).world_from_camera)
     pose[:3, 3] -= CORNER
@@ -137,16 +137,6 @@ def test_a_fit_turns_a_far_camera_about_its_eye():
         return x / w, y / w
 
     np.testing.assert_allclose(seen(local), seen(plain), atol=1e-4)
-
-    def read(given):
-        def pose(at):
-            turned = moved((), given, View(camera=at))[1]
-            return motion((), turned, view).camera
-
-        return jax.jacfwd(pose)(jnp.zeros(6))
-
-    np.testing.assert_allclose(read(local), read(plain), atol=1e-6)
-    np.testing.assert_allclose(read(local), np.eye(6), atol=1e-6)
 
 
 def test_other_cameras_stay_as_they_are():

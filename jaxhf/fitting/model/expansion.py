@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from ...rendering.render import render_each
@@ -26,7 +27,7 @@ from .pictures import Group
 from .problem import Problem
 from .robust import soften
 from .surface import Basis, Unknowns
-from .view import moved
+from .view import View, moved
 
 Rows = list[Float[Array, "_ _ _ _"]]
 """A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""
@@ -142,18 +143,16 @@ def _heights(unknowns: Unknowns, basis: Basis) -> Float[Array, "ny nx"]:
 
 @functools.partial(compiled, jit=eqx.filter_jit)
 def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
-    still = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0]), unknowns.view)
-
     def of(group: Group) -> Linearised | None:
         if not can_be_linearised(group.scenes, problem.settings):
             return None
         return linearise_each(
-            views(unknowns, problem, group),
+            group.scenes,
             completion(unknowns, group, heights),
             problem.settings,
             problem.mesh,
             group.targets.shape[-1],
-            still,
+            _moves(unknowns, problem, group),
             unknowns.albedo,
         )
 
@@ -198,11 +197,12 @@ def _simulate(
     """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
     images = []
     for group, known in zip(problem.groups, linearised, strict=True):
-        change, scenes = completion(unknowns, group, heights), views(unknowns, problem, group)
+        change = completion(unknowns, group, heights)
         if known is not None:
-            image = picture_each(known, scenes, change, problem.settings, problem.mesh, unknowns.albedo)
+            moves = _moves(unknowns, problem, group)
+            image = picture_each(known, group.scenes, change, problem.settings, problem.mesh, moves, unknowns.albedo)
         else:
-            image = render_each(scenes, change, problem.settings, problem.mesh)
+            image = render_each(_views(unknowns, problem, group), change, problem.settings, problem.mesh)
             if group.targets.shape[-1] == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
         if unknowns.exposures is not None:
@@ -217,17 +217,19 @@ def _each(values: Float[Array, " pictures"], group: Group) -> Float[Array, "n 1 
     return jnp.stack([values[k] for k in group.indices]).reshape(-1, 1, 1, 1)
 
 
-def views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
+def _moves(unknowns: Unknowns, problem: Problem, group: Group) -> View:
+    """By what the light and the camera of each picture of a group are `moved`."""
+    which = np.array(group.indices)
+    return jax.tree.map(lambda values, unit: values[which] * unit[None], unknowns.view, problem.view_unit)
+
+
+def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
     """`group.scenes` under the lights and from the cameras that are sought."""
-    given, found = (group.scenes.lights, group.scenes.camera), []
-    if not jax.tree.leaves(unknowns.view):
+    moves = _moves(unknowns, problem, group)
+    if not jax.tree.leaves(moves):
         return group.scenes
-    for n, k in enumerate(group.indices):
-        lights, camera = jax.tree.map(lambda leaf, n=n: leaf[n], given)
-        by = jax.tree.map(lambda values, unit, k=k: values[k] * unit, unknowns.view, problem.view_unit)
-        found.append(moved(lights, camera, by))
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
-    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, stacked)
+    found = lax.map(lambda seen: moved(*seen), (group.scenes.lights, group.scenes.camera, moves))
+    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, found)
 
 
 def completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
@@ -257,7 +259,7 @@ def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) 
     """The scenes as they were given, with all that was found; positions keep double precision."""
     heights, found = _heights(unknowns, problem.basis), list(scenes)
     for group in problem.groups:
-        new, old = ((part.lights, part.camera) for part in (views(unknowns, problem, group), group.scenes))
+        new, old = ((part.lights, part.camera) for part in (_views(unknowns, problem, group), group.scenes))
         change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)
         for n, k in enumerate(group.indices):
             scene = scenes[k].with_heights(heights)

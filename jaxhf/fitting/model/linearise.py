@@ -28,7 +28,7 @@ from ...core.settings import Settings
 from ...preparation.world import World, make_world, resolve_settings
 from ...rendering.samples import PictureSamples
 from ...scene.camera import Camera
-from ...scene.light import Sun
+from ...scene.light import Light, Sun
 from ...scene.material import Matte
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
@@ -39,7 +39,7 @@ from ...trace.triangle import Corners, triangle_vertices
 from ...xla.devices import Spread, map_and_spread, map_over, on_every_device, over_spread
 from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
-from .view import KNOWN, View, motion, moved
+from .view import KNOWN, View, moved
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
 _TOGETHER = 1024
@@ -144,11 +144,11 @@ def linearise_each(
     settings: Settings,
     mesh: Mesh,
     channels: int,
-    still: View = KNOWN,
+    view: View = KNOWN,
     factors: Float[jax.Array, "ty tx k"] | None = None,
 ) -> Linearised:
-    """Pictures of scenes that differ in numbers only, one after the other, and their derivatives in the heights, and in the
-    light and the camera that `still` names.
+    """Pictures of scenes that differ in numbers only, one after the other, and their derivatives in the heights, and in what
+    moves lights and cameras.
 
     Args:
       scenes: one `localise`d scene that `can_be_linearised`; its leaves have a leading axis of n scenes.
@@ -156,18 +156,42 @@ def linearise_each(
       settings: the knobs.
       mesh: the devices that share the work.
       channels: 3, or 1 for their mean.
-      still: zeros, (2,) for a light and (6,) for a camera in which the derivative is taken.
+      view: by what the light and the camera of each are `moved`, (n, 2) and (n, 6), if that is sought.
       factors: by which `change` multiplies the albedo of the first heightfield, if they are sought.
 
     Returns:
       Leaves with a leading axis of n pictures.
     """
 
-    def one(scene: Scene) -> Linearised:
-        scene = on_every_device(change(scene), mesh)
-        return _linearise(make_world(scene, settings), scene.camera, mesh, channels, still, factors)
+    def one(seen: tuple[Scene, View]) -> Linearised:
+        scene, view = on_every_device((change(seen[0]), seen[1]), mesh)
+        return _linearise(_Seen.of(scene, view, settings), mesh, channels, factors)
 
-    return lax.map(one, scenes)
+    return lax.map(one, (scenes, view))
+
+
+class _Seen(NamedTuple):
+    """What a picture shows, under the light and from the camera as they are moved; these as they were given, and by what."""
+
+    world: World
+    camera: Camera
+    given: tuple[tuple[Light, ...], Camera]
+    view: View
+
+    @classmethod
+    def of(cls, scene: Scene, view: View, settings: Settings) -> "_Seen":
+        lights, camera = moved(scene.lights, scene.camera, view)
+        world = make_world(scene.with_lights(lights), settings)
+        return cls(world, camera, (scene.lights, scene.camera), view)
+
+    def moved(self, view: View) -> tuple[World, Camera]:
+        """The world and its camera with other such numbers."""
+        lights, camera = moved(*self.given, view)
+        return dataclasses.replace(self.world, lights=lights), camera
+
+    def view_for(self, count: int) -> View:
+        """The same numbers for each of so many samples, which come last."""
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*leaf.shape, count)), self.view)
 
 
 def picture_each(
@@ -176,10 +200,11 @@ def picture_each(
     change: Callable[[Scene], Scene],
     settings: Settings,
     mesh: Mesh,
+    view: View = KNOWN,
     factors: Float[jax.Array, "ty tx k"] | None = None,
 ) -> Float[jax.Array, "n h w c"]:
-    """The pictures that are known, with their derivatives in the heights, light and camera that `change` gives to the scenes,
-    and in the albedo's factors.
+    """The pictures that are known, with their derivatives in the heights that `change` gives to the scenes, in what moves
+    their lights and cameras, and in the albedo's factors.
 
     Those must be the ones at which `linearise_each` was called.
     """
@@ -189,45 +214,43 @@ def picture_each(
         at_vertices = each.reshape(-1, each.shape[-1])
     else:
         at_vertices, first = _values(change(jax.tree.map(lambda leaf: leaf[0], scenes)), settings, mesh), jnp.int32(0)
-    channels, still = known.image.shape[-1], known.samples.values.view
-    numbers = jax.vmap(lambda scene: motion(scene.lights, scene.camera, still))(scenes)
     relative = None if factors is None else factors / _apart_from_zero(lax.stop_gradient(factors))
     # All pictures at once: a loop over them would copy what it reads of each.
-    of_samples = over_spread(mesh, _of_samples, (at_vertices, first, numbers, relative), known.samples)
+    of_samples = over_spread(mesh, _of_samples, (at_vertices, first, view, relative), known.samples)
     light = None
     if known.edges is not None:
         heights = at_vertices[:, 0].at[known.edges.vertices + first].get(mode="promise_in_bounds")
         light = jnp.moveaxis(jnp.sum(known.edges.slopes * heights[:, :, None], axis=3), 2, -1)
 
     def one(
-        image: jax.Array, edges: LinearisedEdges | None, of_samples: jax.Array, light: jax.Array | None, numbers: View
+        image: jax.Array, edges: LinearisedEdges | None, of_samples: jax.Array, light: jax.Array | None, view: View
     ) -> Float[jax.Array, "h w c"]:
         samples = PictureSamples(camera, settings, None if edges is None else edges.resampled)
         change = samples.in_pixels(of_samples)
         if edges is not None and light is not None:
-            light, flat = _with_view(light, edges.view, numbers), change.reshape(-1, channels)
+            light, flat = _with_view(light, edges.view, view), change.reshape(-1, image.shape[-1])
             finer = samples.of_resampled(of_samples).mean(1)
-            flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, channels))
+            flat = (
+                flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, image.shape[-1]))
+            )
             change = flat.reshape(change.shape)
         return with_tangent(image, change)
 
     camera, settings = scenes.camera, resolve_settings(settings, scenes)
-    return jax.vmap(one)(known.image, known.edges, of_samples, light, numbers)
+    return jax.vmap(one)(known.image, known.edges, of_samples, light, view)
 
 
 def _values(scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "vertices n"]:
     return vertex_values(make_world(on_every_device(scene, mesh), settings))
 
 
-def _linearise(
-    world: World, camera: Camera, mesh: Mesh, channels: int, still: View, factors: Float[jax.Array, "ty tx k"] | None
-) -> Linearised:
+def _linearise(seen: _Seen, mesh: Mesh, channels: int, factors: Float[jax.Array, "ty tx k"] | None) -> Linearised:
+    world, camera = seen.world, seen.camera
     drawn, edge_samples = None, world.settings.edge_samples or 0
     if has_edges(world):
         drawn = draw_boundaries(world, camera, None, mesh, math.ceil(edge_samples / _POINTS_PER_PIXEL))
     samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
     sampled = functools.partial(_samples, channels, None if factors is None else factors.shape)
-    seen = world, camera, still
     (light, moving), rows = map_and_spread(mesh, lambda *args: one_kernel(sampled, *args), seen, samples.positions())
     image, edges = samples.in_pixels(light), None
     sampling = _sampling_error(samples.in_rows(light), math.isqrt(world.settings.samples or 1))
@@ -292,11 +315,10 @@ def _channels(light: Float[jax.Array, "*rest 3"], channels: int) -> Float[jax.Ar
     return light if channels == 3 else jnp.mean(light, axis=-1, keepdims=True)
 
 
-def _samples(channels: int, factors: tuple[int, ...] | None, seen: tuple[World, Camera, View], points: tuple[jax.Array, ...]):
+def _samples(channels: int, factors: tuple[int, ...] | None, seen: _Seen, points: tuple[jax.Array, ...]):
     """Radiance at points of the picture, (n, c), whether it changes with the sought heights, (n, 1), and its `SampleRows`;
     `factors` is the shape of those that are sought."""
-    world, camera, still = seen
-    x, y = points
+    (x, y), world = points, seen.world
     smooth = world.settings.shading == "smooth"
 
     def one(x: jax.Array, y: jax.Array, perturbation: jax.Array, view: View) -> tuple[jax.Array, Any]:
@@ -305,9 +327,8 @@ def _samples(channels: int, factors: tuple[int, ...] | None, seen: tuple[World, 
             dataclasses.replace(surface, perturbation=corners) if isinstance(surface, Grid) else surface
             for surface in world.surfaces
         )
-        lights, eye = moved(world.lights, camera, view)
-        there = dataclasses.replace(world, surfaces=surfaces, lights=lights)
-        light, _, hit = direct(there, materialise(eye.ray(x, y)))
+        there, eye = seen.moved(view)
+        light, _, hit = direct(dataclasses.replace(there, surfaces=surfaces), materialise(eye.ray(x, y)))
         albedo = None if factors is None else _texels(world, hit, lax.stop_gradient(light), channels, factors)
         return _channels(light, channels), (_vertices(world, hit), albedo)
 
@@ -315,7 +336,7 @@ def _samples(channels: int, factors: tuple[int, ...] | None, seen: tuple[World, 
         return jax.vmap(one, in_axes=(0, 0, 1, 1), out_axes=(0, -1))(x, y, perturbations, view)
 
     none = jnp.zeros((12 if smooth else 3, x.shape[0]), x.dtype)
-    light, pull_back, (vertices, albedo) = jax.vjp(shade, none, _each(still, x.shape[0]), has_aux=True)
+    light, pull_back, (vertices, albedo) = jax.vjp(shade, none, seen.view_for(x.shape[0]), has_aux=True)
     each = jnp.broadcast_to(jnp.eye(channels, dtype=x.dtype)[:, None], (channels, *light.shape))
     if channels == 1:
         slopes, view = jax.tree.map(lambda leaf: leaf[None], pull_back(each[0]))
@@ -325,9 +346,7 @@ def _samples(channels: int, factors: tuple[int, ...] | None, seen: tuple[World, 
     return (light, moving.astype(light.dtype)[:, None]), SampleRows(slopes, vertices, view, albedo)
 
 
-def _texels(
-    world: World, hit: Hit, light: jax.Array, channels: int, factors: tuple[int, ...]
-) -> AlbedoRows:
+def _texels(world: World, hit: Hit, light: jax.Array, channels: int, factors: tuple[int, ...]) -> AlbedoRows:
     """How the light from a hit goes with the factors of the first heightfield's albedo."""
     number = world.grids[0][0]
     material = world.materials[number]
@@ -346,11 +365,6 @@ def _texels(
     return AlbedoRows(slopes, places)
 
 
-def _each(still: View, count: int) -> View:
-    """The same numbers for each of so many samples, which come last."""
-    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*leaf.shape, count)), still)
-
-
 def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
     """The numbers of the vertices of the triangle that was hit, over all grids; any that there are where there is no hit."""
     vertices, cell = jnp.zeros(3, jnp.int32), hit.cell
@@ -360,24 +374,21 @@ def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
     return vertices
 
 
-def _boundary_samples(channels: int, seen: tuple[World, Camera, View], drawn: Packed[tuple[BoundarySample, jax.Array]]):
+def _boundary_samples(channels: int, seen: _Seen, drawn: Packed[tuple[BoundarySample, jax.Array]]):
     """Slopes, vertices and view of boundary samples, see `LinearisedEdges`."""
-    world, camera, still = seen
     samples, flows = drawn.unpacked()
     flows = jnp.moveaxis(_channels(jnp.moveaxis(flows, 1, -1), channels), -1, 0)
 
     def position(sample: BoundarySample, perturbation: jax.Array, view: View) -> jax.Array:
-        lights, eye = moved(world.lights, camera, view)
-        there = dataclasses.replace(world, lights=lights)
-        return picture_point(there, eye, sample, sample.s, perturbation=perturbation)[0]
+        return picture_point(*seen.moved(view), sample, sample.s, perturbation=perturbation)[0]
 
     def positions(perturbations: jax.Array, view: View) -> jax.Array:
         return jax.vmap(position, in_axes=(0, 1, 1))(samples, perturbations, view)
 
     count = flows.shape[1]
-    _, pull_back = jax.vjp(positions, jnp.zeros((5, count), flows.dtype), _each(still, count))
+    _, pull_back = jax.vjp(positions, jnp.zeros((5, count), flows.dtype), seen.view_for(count))
     slopes, view = jax.vmap(pull_back)(flows)
-    return slopes, jax.vmap(functools.partial(deciding_vertices, world), out_axes=1)(samples), view
+    return slopes, jax.vmap(functools.partial(deciding_vertices, seen.world), out_axes=1)(samples), view
 
 
 def vertex_values(world: World) -> Float[jax.Array, "vertices n"]:
@@ -398,7 +409,7 @@ def _of_samples(
       shared: these; the second is the number of the first vertex of each picture.
       rows: of these samples.
     """
-    at_vertices, first, numbers, relative = shared
+    at_vertices, first, view, relative = shared
     n, chunks, channels, k, size = rows.slopes.shape
     joined = rows.slopes.reshape(-1, channels, k, size), (rows.vertices + first).reshape(-1, 3, size)
     found = _by_vertices(at_vertices, *joined).reshape(n, chunks, channels, size)
@@ -406,7 +417,7 @@ def _of_samples(
         factors = relative.reshape(-1, relative.shape[-1]).at[rows.albedo.texels].get(mode="promise_in_bounds")
         change = jnp.einsum("nqkts,nqtsk->nqks", rows.albedo.slopes, factors)
         found = found + (change if channels == change.shape[2] else jnp.sum(change, axis=2, keepdims=True))
-    return jax.vmap(_with_view)(jnp.moveaxis(found, 2, -1), rows.view, numbers)
+    return jax.vmap(_with_view)(jnp.moveaxis(found, 2, -1), rows.view, view)
 
 
 def _by_vertices(

@@ -23,8 +23,8 @@ from ...scene.heightfield import Heightfield
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, on_host
-from .expansion import Expansion, completion, views
-from .linearise import Linearised, SampleRows, vertex_values
+from .expansion import Expansion, completion
+from .linearise import vertex_values
 from .pictures import Group
 from .problem import Problem
 from .surface import Unknowns
@@ -32,6 +32,8 @@ from .surface import Unknowns
 sp: Any = scipy.sparse  # whose stubs miss much
 Sparse = Any
 """A `scipy.sparse.csr_array`."""
+OnHost = Any
+"""A `Linearised` of NumPy's arrays."""
 
 MOST_HEIGHTS = 2**21
 """With their padding; the largest that was tried has half as many."""
@@ -130,7 +132,7 @@ def _rows_of(expansion: Expansion, place: Place | None) -> Part:
 
 
 def _pixels_at(
-    known: Linearised, k: int, scene: Scene, problem: Problem, core: Bool[np.ndarray, "ny nx"]
+    known: OnHost, k: int, scene: Scene, problem: Problem, core: Bool[np.ndarray, "ny nx"]
 ) -> Int[np.ndarray, " pixels"]:
     """Those of a picture all of whose samples show triangles of these vertices, but for those that a boundary crosses."""
     slots = _slots(PictureSamples(scene.camera, problem.settings))
@@ -145,7 +147,7 @@ def _pixels_at(
 
 
 def _of_group(
-    problem: Problem, group: Group, known: Linearised, scene: Scene, right: Sparse, pixels: list[Int[np.ndarray, " pixels"]]
+    problem: Problem, group: Group, known: OnHost, scene: Scene, right: Sparse, pixels: list[Int[np.ndarray, " pixels"]]
 ) -> list[Sparse]:
     """The derivatives of these pixels of the pictures of a group: `_picture_by_vertices` times a matrix."""
 
@@ -168,7 +170,7 @@ def _slopes(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem
     phase = row % _REACH * _REACH + column % _REACH
     slopes = []
     for group in problem.groups:
-        first = jax.tree.map(lambda leaf: leaf[0], views(unknowns, problem, group))
+        first = jax.tree.map(lambda leaf: leaf[0], group.scenes)
 
         def values(heights: Array, group: Group = group, scene: Scene = first) -> Array:
             return vertex_values(make_world(completion(unknowns, group, heights)(scene), problem.settings))
@@ -220,18 +222,18 @@ def _slots(samples: PictureSamples) -> Int[np.ndarray, "pixels each"]:
 
 
 def _picture_by_vertices(
-    known: Linearised, samples: PictureSamples, channel: int, columns: int, pixels: Int[np.ndarray, " pixels"]
+    known: OnHost, samples: PictureSamples, channel: int, columns: int, pixels: Int[np.ndarray, " pixels"]
 ) -> Sparse:
     """The derivative of a channel of these pixels of a picture in what stands at the vertices: a row for each, and so many
     columns; all pixels, where it has boundaries."""
-    rows_of_samples: SampleRows = known.samples.values
-    chunks, _, numbers, size = rows_of_samples.slopes.shape
+    of_samples = known.samples.values
+    chunks, _, numbers, size = of_samples.slopes.shape
     at_vertex = 4 if numbers == 12 else 1
     vertex, number = np.arange(3), np.zeros(3, int)
     if numbers == 12:  # the three heights, then each vertex's normal
         vertex, number = np.concatenate([vertex, np.repeat(vertex, 3)]), np.concatenate([number, np.tile([1, 2, 3], 3)])
-    slopes = np.moveaxis(rows_of_samples.slopes[:, channel], 1, 2).reshape(chunks * size, numbers)
-    places = np.moveaxis(rows_of_samples.vertices, 1, 2).reshape(chunks * size, 3)
+    slopes = np.moveaxis(of_samples.slopes[:, channel], 1, 2).reshape(chunks * size, numbers)
+    places = np.moveaxis(of_samples.vertices, 1, 2).reshape(chunks * size, 3)
     slots, shape = _slots(samples)[pixels], (pixels.size, columns)
     share = np.full((*slots.shape, 1), 1 / slots.shape[1])
 

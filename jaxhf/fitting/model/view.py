@@ -8,10 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Float
 
-from ...core.affine import Affine, affine
+from ...core.affine import affine
 from ...core.types import Vector
 from ...core.vector import dot, unit
 from ...scene.camera import Camera
@@ -66,24 +65,6 @@ def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[
     return lights, camera
 
 
-def motion(lights: tuple[Light, ...], camera: Camera, like: View) -> View:
-    """Numbers that mean nothing, but whose tangents are those of a view by which `moved` would bring lights and camera from
-    where they are to where their own tangents do; `like` says of which."""
-    light = pose = None
-    if like.light is not None:
-        given = sun(lights)
-        assert given is not None
-        light = jnp.stack([dot(axis, given.towards) / dot(axis, axis) for axis in _across(given.towards)])
-    if like.camera is not None:
-        world = affine(jnp.asarray(camera.world_from_camera))
-        back = Affine(lax.stop_gradient(world.linear), jnp.zeros_like(world.offset)).inverse()
-        turn = [world.vector(back.linear[:, k]) for k in range(3)]  # columns; their tangents are the cross products
-        rotation = [turn[1][2] - turn[2][1], turn[2][0] - turn[0][2], turn[0][1] - turn[1][0]]
-        eye = world.offset if camera._ahead is None else world.offset - camera._ahead * world.linear[:, 2]
-        pose = jnp.concatenate([eye, jnp.stack(rotation) / 2])
-    return View(light, pose)
-
-
 def differences(scene: Scene, other: Scene) -> tuple[float, float, float]:
     """Between two scenes: the angle of their first directional lights, degrees (nan where there is none); the distance of
     their cameras, world units, and the angle by which these are turned, degrees."""
@@ -99,8 +80,8 @@ def differences(scene: Scene, other: Scene) -> tuple[float, float, float]:
 
 
 def _across(towards: Any) -> tuple[Vector, Vector]:
-    """Two vectors across `towards` and each other, of its length; constants."""
-    towards = lax.stop_gradient(jnp.asarray(towards))
+    """Two vectors across `towards` and each other, of its length."""
+    towards = jnp.asarray(towards)
     axis = jnp.where(jnp.abs(towards[0]) < jnp.abs(towards[1]), jnp.array([1, 0, 0]), jnp.array([0, 1, 0]))
     first = unit(jnp.cross(towards, axis.astype(towards.dtype)))
     size = jnp.sqrt(dot(towards, towards))
