@@ -250,10 +250,34 @@ def scaled(options: argparse.Namespace) -> dict[str, float | str]:
     coarse = smoothed(truth, CELLS)
     before = float(np.sqrt(np.mean((coarse - truth) ** 2)))
     prior, scenes = jaxhf.Prior(coarse, before), _common_scenes(common_work(options.peers), coarse)
+    if options.window is not None:
+        return windowed(scenes, list(targets), prior, truth, options)
     found, seconds = timed(scenes, list(targets), prior=prior, draws=options.draws, progress=options.verbose)
     after = float(np.sqrt(np.mean((np.asarray(found.heights, np.float64) - truth) ** 2)))
     numbers = {"seconds": seconds, "peak MB": peak_mb(), "steps": found.stats["steps"], "ratio": before / after}
     return numbers | {"chi2": found.stats["chi2"], "end": found.result.value, "warns of": "; ".join(names_of(found.warnings))}
+
+
+def windowed(
+    scenes: list[jaxhf.Scene], targets: list[np.ndarray], prior: jaxhf.Prior, truth: np.ndarray, options: argparse.Namespace
+) -> dict[str, float | str]:
+    """The same by `fit_windows`; seams as shares of the map's error."""
+    begin = time.perf_counter()
+
+    def tell(done: int, count: int, _: object) -> None:
+        if options.verbose:
+            print(f"{done} of {count} windows, {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
+
+    found = jaxhf.fit_windows(scenes, targets, prior=prior, window=options.window, draws=options.draws, progress=tell)
+    seconds, before = time.perf_counter() - begin, prior.std
+    after = float(np.sqrt(np.mean((np.asarray(found.heights, np.float64) - truth) ** 2)))
+    seams = np.array([window.seam for window in found.windows]) / before
+    return {
+        "seconds": seconds, "peak MB": peak_mb(), "windows": len(found.windows), "ratio": before / after,
+        "median chi2": float(np.nanmedian([window.chi2 for window in found.windows])),
+        "median seam": float(np.nanmedian(seams)), "largest seam": float(np.nanmax(seams)),
+        "warns of": "; ".join(sorted({name for window in found.windows for name in names_of(window.warnings)})),
+    }  # fmt: skip
 
 
 def judged(run: benchmark.Run, options: argparse.Namespace) -> None:
@@ -356,6 +380,7 @@ def main() -> None:
     parser.add_argument(
         "--sizes", type=int, nargs="+", default=[64, 128, 256, 512], help="heights a side, for scale [64 128 256 512]"
     )
+    parser.add_argument("--window", type=int, help="heights a side of the windows in which scale fits its terrain")
     parser.add_argument("--edge-samples", type=int, help="a picture [shadow: 1000]")
     parser.add_argument("--max-steps", type=int, default=100)
     parser.add_argument("--draws", type=int, default=0, help="of the standard deviations")
