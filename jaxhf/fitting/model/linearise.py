@@ -206,7 +206,7 @@ def picture_each(
     """The pictures that are known, with their derivatives in the heights that `change` gives to the scenes, in what moves
     their lights and cameras, and in the albedo's factors.
 
-    Those must be the ones at which `linearise_each` was called.
+    Values of all these must be the ones at which `linearise_each` was called.
     """
     if jax.tree.leaves(scenes.objects):  # each picture has vertices of its own
         each = lax.map(lambda scene: _values(change(scene), settings, mesh), scenes)
@@ -228,11 +228,9 @@ def picture_each(
         samples = PictureSamples(camera, settings, None if edges is None else edges.resampled)
         change = samples.in_pixels(of_samples)
         if edges is not None and light is not None:
-            light, flat = _with_view(light, edges.view, view), change.reshape(-1, image.shape[-1])
-            finer = samples.of_resampled(of_samples).mean(1)
-            flat = (
-                flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light.reshape(-1, image.shape[-1]))
-            )
+            light = _with_view(light, edges.view, view).reshape(-1, image.shape[-1])
+            finer, flat = samples.of_resampled(of_samples).mean(1), change.reshape(-1, image.shape[-1])
+            flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light)
             change = flat.reshape(change.shape)
         return with_tangent(image, change)
 
