@@ -1,11 +1,9 @@
 """`jaxhf fit`: a file's pictures to files of heights, watched on a terminal and safe from interruption."""
 
 import argparse
-import contextlib
 import math
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +16,7 @@ from ..overwriting import require_no_input
 if TYPE_CHECKING:
     from ...fitting.fit import Fit
     from ...fitting.history import Draws, Step
+    from ...fitting.windows import Mosaic
     from ...io.scenes.toml.fit import Case
 
 _USUAL_STEPS = 30  # of a fit, until it says what is to come
@@ -43,37 +42,39 @@ def run(options: argparse.Namespace) -> None:
     import jax
     import numpy as np
 
+    from ...fitting.windows import Mosaic
     from ...io.files import save_text
     from ...io.pictures.images import save_image
     from ...io.scenes.toml.fit import load_case
-    from ..fit_report import facts, report
+    from ...io.terrain.save import save_heights
+    from ...io.terrain.terrain import Terrain
+    from ..fit_report import report
     from ..limits import require_memory
     from ..scene_warnings import warn
 
     case = load_case(options.case, np.dtype(options.precision))
     warn(case.scenes)
     require_memory(case.scenes[0], jax.local_device_count())
-    if options.window is not None:
-        _in_windows(case, checkpoint, options, heights, std)
-        return
-    found = _fit(case, checkpoint, options.resume)
-    _save(case, found.heights, found.std, heights, std)
+    begin = time.monotonic()
+    found = _fit(case, checkpoint, options)
+    field = case.scenes[0].heightfields[0]
+    for path, values in ((heights, found.heights), (std, found.std)):
+        if values is not None:
+            terrain = Terrain(np.asarray(values), float(field.dx), float(field.dy), float(field.x0), float(field.y0))
+            save_heights(path, terrain, case.like)
+    ny, nx = found.heights.shape
+    made = f"{heights}: {ny} x {nx} heights from {counted(len(case.targets), 'picture')}"
+    if isinstance(found, Mosaic):
+        checkpoint.unlink(missing_ok=True)
+        print(f"{made} in {counted(len(found.windows), 'window')}, {time.monotonic() - begin:.3g} s")
+        return _tell_of_windows(found)
     if found.albedo is not None:
         factors = np.asarray(found.albedo)[::-1]  # a texture begins at v = 0, an image at its top
         save_image(albedo, factors if factors.shape[-1] == 3 else factors[..., 0])
     if options.report:
         save_text(options.report, report(f"Heights from {options.case}", case, found))
     checkpoint.unlink(missing_ok=True)
-    for name, text in facts(case, found):
-        print(f"{name}: {text}")
-    ny, nx = found.heights.shape
-    print(
-        f"{heights}: {ny} x {nx} heights from {counted(len(case.targets), 'picture')}, {found.result.value}; "
-        f"{counted(int(found.stats['steps']), 'step')}, {found.stats['seconds']:.3g} s, loss {found.stats['loss']:.6g}, "
-        f"chi2 {found.stats['chi2']:.4g}"
-    )
-    for warning in found.warnings:
-        print(f"jaxhf: warning: {warning}", file=sys.stderr)
+    _tell_of_fit(made, case, found)
 
 
 def _require_writable(options: argparse.Namespace, *heights: Path) -> None:
@@ -89,11 +90,30 @@ def _require_writable(options: argparse.Namespace, *heights: Path) -> None:
         import_extra("matplotlib", "a report needs", "plot")
 
 
-@contextlib.contextmanager
-def _told_where(case: "Case", checkpoint: Path) -> Iterator[None]:
-    """KeyboardInterrupt says how to go on, an error of an argument in which line it stands."""
+def _fit(case: "Case", checkpoint: Path, options: argparse.Namespace) -> "Fit | Mosaic":
+    """What the file asks for. KeyboardInterrupt says how to go on, an error of an argument in which line it stands."""
+    from ...fitting.fit import fit
+    from ...fitting.given import Checkpoint, Prior, Unknown
+    from ...fitting.windows import fit_windows
+    from ..progress import told
+
+    interruption.raise_from_now_on()
+    windows = options.window is not None
+    progress = _Progress(", then deviations" if case.options.get("draws") and not windows else "")
     try:
-        yield
+        given: dict[str, Any] = {
+            "prior": Prior(**case.prior) if case.prior else None,
+            "unknown": Unknown(**case.unknown) if case.unknown else None,
+            "noise": case.noise, "weights": case.weights, "settings": case.settings,
+            "checkpoint": Checkpoint(checkpoint, resume=options.resume), **case.options,
+        }  # fmt: skip
+        with told(progress.line):
+            if not windows:
+                return fit(case.scenes, case.targets, progress=progress.note, **given)
+            return fit_windows(
+                case.scenes, case.targets, window=options.window, overlap=options.overlap, **given,
+                progress=lambda number, count, done: progress.note(done, f"window {number + 1} of {count}: "),
+            )  # fmt: skip
     except KeyboardInterrupt:
         if not checkpoint.exists():
             raise
@@ -102,72 +122,26 @@ def _told_where(case: "Case", checkpoint: Path) -> Iterator[None]:
         raise case.located(error) from error
 
 
-def _fit(case: "Case", checkpoint: Path, resume: bool) -> "Fit":
-    """Fits what the file asks for."""
-    from ...fitting.fit import fit
-    from ...fitting.given import Checkpoint, Prior, Unknown
-    from ..progress import told
+def _tell_of_fit(made: str, case: "Case", found: "Fit") -> None:
+    from ..fit_report import facts
 
-    interruption.raise_from_now_on()
-    progress = _Progress(", then deviations" if case.options.get("draws") else "")
-    with _told_where(case, checkpoint), told(progress.line) as tell:
-        return fit(
-            case.scenes, case.targets, prior=Prior(**case.prior) if case.prior else None,
-            unknown=Unknown(**case.unknown), noise=case.noise, weights=case.weights, settings=case.settings,
-            progress=lambda done: (progress.note(done), tell())[1], checkpoint=Checkpoint(checkpoint, resume=resume),
-            **case.options,
-        )  # fmt: skip
-
-
-def _in_windows(case: "Case", checkpoint: Path, options: argparse.Namespace, heights: Path, std: Path) -> None:
-    """The same for a terrain that is fitted window by window."""
-    from ...fitting.given import Checkpoint, Prior, Unknown
-    from ...fitting.windows import fit_windows
-    from ..progress import told
-
-    interruption.raise_from_now_on()
-    progress, place = _Progress(""), ""
-
-    def note(number: int, count: int, done: "Step | Draws") -> None:
-        nonlocal place
-        place = f"window {number + 1} of {count}: "
-        progress.note(done)
-        tell()
-
-    begin = time.monotonic()
-    with _told_where(case, checkpoint), told(lambda seconds: place + progress.line(seconds)) as tell:
-        found = fit_windows(
-            case.scenes, case.targets, prior=Prior(**case.prior) if case.prior else None,
-            unknown=Unknown(**case.unknown) if case.unknown else None, noise=case.noise, weights=case.weights,
-            settings=case.settings, window=options.window, overlap=options.overlap, progress=note,
-            checkpoint=Checkpoint(checkpoint, resume=options.resume), **case.options,
-        )  # fmt: skip
-    _save(case, found.heights, found.std, heights, std)
-    checkpoint.unlink(missing_ok=True)
-    ny, nx = found.heights.shape
+    for name, text in facts(case, found):
+        print(f"{name}: {text}")
     print(
-        f"{heights}: {ny} x {nx} heights from {counted(len(case.targets), 'picture')} in "
-        f"{counted(len(found.windows), 'window')}, {time.monotonic() - begin:.3g} s"
+        f"{made}, {found.result.value}; {counted(int(found.stats['steps']), 'step')}, {found.stats['seconds']:.3g} s, "
+        f"loss {found.stats['loss']:.6g}, chi2 {found.stats['chi2']:.4g}"
     )
+    for warning in found.warnings:
+        print(f"jaxhf: warning: {warning}", file=sys.stderr)
+
+
+def _tell_of_windows(found: "Mosaic") -> None:
     for done in found.windows:
         where = f"rows {done.y}-{done.y + done.ny - 1} columns {done.x}-{done.x + done.nx - 1}"
         seam = "" if math.isnan(done.seam) else f", {done.seam:.3g} off its neighbours"
         print(f"{where}: {done.result or 'in no picture'}; {counted(done.steps, 'step')}, chi2 {done.chi2:.4g}{seam}")
         for warning in done.warnings:
             print(f"jaxhf: warning: {where}: {warning}", file=sys.stderr)
-
-
-def _save(case: "Case", heights: Any, std: Any, *paths: Path) -> None:
-    import numpy as np
-
-    from ...io.terrain.save import save_heights
-    from ...io.terrain.terrain import Terrain
-
-    field = case.scenes[0].heightfields[0]
-    for path, values in zip(paths, (heights, std), strict=True):
-        if values is not None:
-            terrain = Terrain(np.asarray(values), float(field.dx), float(field.dy), float(field.x0), float(field.y0))
-            save_heights(path, terrain, case.like)
 
 
 class _Progress:
@@ -180,21 +154,21 @@ class _Progress:
         self._compiling, self._begin, self._pace, self._later = CompileTime(), time.monotonic(), Pace(0.0), later
         self._done, self._details, self._remaining, self._noted = "first step", "", None, 0.0
 
-    def note(self, done: "Step | Draws") -> None:
+    def note(self, done: "Step | Draws", place: str = "") -> None:
         from ...fitting.history import Draws
 
         self._noted = time.monotonic() - self._begin
         if isinstance(done, Draws):
-            self._done, self._details = f"deviations: sample {done.drawn} of {done.wanted}", " (Ctrl-C: enough)"
+            self._done, self._details = f"{place}deviations: sample {done.drawn} of {done.wanted}", " (Ctrl-C: enough)"
             self._remaining, self._later = done.remaining, ""
         else:
-            self._done, self._details = f"step {done.step}", f"; {done.level} DCT modes a side, loss {done.loss:.6g}"
+            self._done, self._details = f"{place}step {done.step}", f"; {done.level} DCT modes a side, loss {done.loss:.6g}"
             self._remaining = self._pace.remaining(self._noted - self._compiling.seconds, done.to_come)
 
-    def line(self, seconds: float) -> str:
+    def line(self) -> str:
         from ..progress import duration
 
-        remaining = self._remaining
+        seconds, remaining = time.monotonic() - self._begin, self._remaining
         if self._noted == 0.0:  # the step that is under way takes this long at least
             remaining = _USUAL_STEPS * (seconds - self._compiling.seconds)
             if seconds < _EARLY or remaining < seconds:
