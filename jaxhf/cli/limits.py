@@ -1,12 +1,8 @@
 """What this machine can do: too many devices are refused, and pictures that do not fit into its memory."""
 
-from typing import TYPE_CHECKING
-
 from ..core.errors import UserError, counted
+from ..scene.scene import Scene
 from ..xla.machine import available_bytes, default_devices, usable_cores
-
-if TYPE_CHECKING:
-    from ..scene.scene import Scene
 
 # Bytes in single precision. Measured at the peak: 57 for each height and device, 50 for each pixel, 116 while a .png is written
 # (docs/guides/devices.md). Less than that is asked for, so that what might fit is tried.
@@ -23,7 +19,7 @@ def require_devices(devices: int | None) -> None:
         )
 
 
-def require_memory(scene: "Scene", devices: int) -> None:
+def require_memory(scene: Scene, devices: int) -> None:
     """UserError where a picture of this scene certainly needs more memory than there is."""
     width, height = scene.camera.width, scene.camera.height
     heights = sum(field.heights.size for field in scene.heightfields)

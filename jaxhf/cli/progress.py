@@ -5,10 +5,9 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from tqdm import tqdm
+from tqdm import tqdm
 
 _EACH_SECOND, _EACH_MINUTE = 1.0, 60.0
 
@@ -25,10 +24,8 @@ def is_quiet() -> bool:
     return getattr(sys.stdout, "name", None) == os.devnull
 
 
-def bar(**options: Any) -> "tqdm[Any]":
+def bar(**options: Any) -> tqdm:
     """A bar on standard error, as `tqdm` with these options; in a pipe it shows nothing."""
-    from tqdm import tqdm
-
     window: dict[str, Any] = {"dynamic_ncols": True}
     with contextlib.suppress(OSError, ValueError):  # which is what a stream without a descriptor raises
         if os.get_terminal_size(sys.stderr.fileno()).columns == 0:  # of a terminal that has no window, as one in a container

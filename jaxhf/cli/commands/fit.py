@@ -5,19 +5,29 @@ import math
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import jax
+import numpy as np
 
 from ...core.errors import ArgumentError, UserError, counted
+from ...core.extras import import_extra
+from ...fitting.fit import Fit, fit
+from ...fitting.given import Checkpoint, Prior, Unknown
+from ...fitting.history import Draws, Pace, Step
+from ...fitting.windows import Mosaic, fit_windows
+from ...io.errors import FileError
+from ...io.files import require_writable_text, save_text
+from ...io.pictures.images import save_image
+from ...io.scenes.toml.fit import Case, load_case
+from ...io.terrain.save import require_writable_heights, save_heights
+from ...io.terrain.terrain import Terrain
 from .. import arguments, interruption
-from ..arguments import flag, option, output, whole
-from ..command import Command
+from ..fit_report import facts, report
+from ..limits import require_memory
 from ..overwriting import require_no_input
-
-if TYPE_CHECKING:
-    from ...fitting.fit import Fit
-    from ...fitting.history import Draws, Step
-    from ...fitting.windows import Mosaic
-    from ...io.scenes.toml.fit import Case
+from ..progress import CompileTime, duration, told
+from ..scene_warnings import warn
 
 _USUAL_STEPS = 30  # of a fit, until it says what is to come
 _EARLY = 50.0  # seconds: most fits compile no longer, and JAX reports a compilation only when it is done
@@ -30,28 +40,17 @@ def run(options: argparse.Namespace) -> None:
         raise UserError("--report must stand without --window: it shows one fit")
     heights, checkpoint = Path(options.output), Path(f"{options.output}.checkpoint")
     std, albedo = heights.with_stem(f"{heights.stem}_std"), heights.with_name(f"{heights.stem}_albedo.npy")
-    _require_writable(options, heights, std)
+    for path in (heights, std):  # before the fit, not after it
+        require_writable_heights(path, (".npy", ".npz", ".tif", ".tiff"))  # which hold any heights, and holes
+    if options.report:
+        require_writable_text(options.report, ".html")
+        import_extra("matplotlib", "a report needs", "plot")
     if checkpoint.exists() and not options.resume:
-        from ...io.errors import FileError
-
         raise FileError(
             f"{checkpoint}: an interrupted fit left this checkpoint; --resume goes on from it, to begin anew remove it"
         )
     require_no_input(options, std, albedo)
     arguments.set_up_jax(options)
-    import jax
-    import numpy as np
-
-    from ...fitting.windows import Mosaic
-    from ...io.files import save_text
-    from ...io.pictures.images import save_image
-    from ...io.scenes.toml.fit import load_case
-    from ...io.terrain.save import save_heights
-    from ...io.terrain.terrain import Terrain
-    from ..fit_report import report
-    from ..limits import require_memory
-    from ..scene_warnings import warn
-
     case = load_case(options.case, np.dtype(options.precision))
     warn(case.scenes)
     require_memory(case.scenes[0], jax.local_device_count())
@@ -77,26 +76,8 @@ def run(options: argparse.Namespace) -> None:
     _tell_of_fit(made, case, found)
 
 
-def _require_writable(options: argparse.Namespace, *heights: Path) -> None:
-    """Refuses before the fit what could not be written after it."""
-    from ...core.extras import import_extra
-    from ...io.files import require_writable_text
-    from ...io.terrain.save import require_writable_heights
-
-    for path in heights:
-        require_writable_heights(path, (".npy", ".npz", ".tif", ".tiff"))  # which hold any heights, and holes
-    if options.report:
-        require_writable_text(options.report, ".html")
-        import_extra("matplotlib", "a report needs", "plot")
-
-
-def _fit(case: "Case", checkpoint: Path, options: argparse.Namespace) -> "Fit | Mosaic":
+def _fit(case: Case, checkpoint: Path, options: argparse.Namespace) -> Fit | Mosaic:
     """What the file asks for. KeyboardInterrupt says how to go on, an error of an argument in which line it stands."""
-    from ...fitting.fit import fit
-    from ...fitting.given import Checkpoint, Prior, Unknown
-    from ...fitting.windows import fit_windows
-    from ..progress import told
-
     interruption.raise_from_now_on()
     windows = options.window is not None
     progress = _Progress(", then deviations" if case.options.get("draws") and not windows else "")
@@ -122,9 +103,7 @@ def _fit(case: "Case", checkpoint: Path, options: argparse.Namespace) -> "Fit | 
         raise case.located(error) from error
 
 
-def _tell_of_fit(made: str, case: "Case", found: "Fit") -> None:
-    from ..fit_report import facts
-
+def _tell_of_fit(made: str, case: Case, found: Fit) -> None:
     for name, text in facts(case, found):
         print(f"{name}: {text}")
     print(
@@ -135,7 +114,7 @@ def _tell_of_fit(made: str, case: "Case", found: "Fit") -> None:
         print(f"jaxhf: warning: {warning}", file=sys.stderr)
 
 
-def _tell_of_windows(found: "Mosaic") -> None:
+def _tell_of_windows(found: Mosaic) -> None:
     for done in found.windows:
         where = f"rows {done.y}-{done.y + done.ny - 1} columns {done.x}-{done.x + done.nx - 1}"
         seam = "" if math.isnan(done.seam) else f", {done.seam:.3g} off its neighbours"
@@ -148,15 +127,10 @@ class _Progress:
     """What a fit is doing, in a line: how far it is, since when, and what is to come."""
 
     def __init__(self, later: str):
-        from ...fitting.history import Pace
-        from ..progress import CompileTime
-
         self._compiling, self._begin, self._pace, self._later = CompileTime(), time.monotonic(), Pace(0.0), later
         self._done, self._details, self._remaining, self._noted = "first step", "", None, 0.0
 
-    def note(self, done: "Step | Draws", place: str = "") -> None:
-        from ...fitting.history import Draws
-
+    def note(self, done: Step | Draws, place: str = "") -> None:
         self._noted = time.monotonic() - self._begin
         if isinstance(done, Draws):
             self._done, self._details = f"{place}deviations: sample {done.drawn} of {done.wanted}", " (Ctrl-C: enough)"
@@ -166,8 +140,6 @@ class _Progress:
             self._remaining = self._pace.remaining(self._noted - self._compiling.seconds, done.to_come)
 
     def line(self) -> str:
-        from ..progress import duration
-
         seconds, remaining = time.monotonic() - self._begin, self._remaining
         if self._noted == 0.0:  # the step that is under way takes this long at least
             remaining = _USUAL_STEPS * (seconds - self._compiling.seconds)
@@ -177,23 +149,3 @@ class _Progress:
             remaining -= seconds - self._noted
         to_come = "" if remaining is None else f", about {duration(max(remaining, 1))} to come{self._later}"
         return f"{self._done}, {duration(seconds)} so far{to_come}{self._details}"
-
-
-COMMAND = Command(
-    "fit",
-    "recover heights from pictures",
-    examples=("case.toml -o heights.tif --report report.html", "case.toml -o heights.tif --resume"),
-    options={
-        "": (
-            option("case", metavar="CASE", help="a .toml file: a scene, its pictures, and what is known"),
-            output("the heights: .npy, .npz or .tif"),
-            option("--report", metavar="PAGE", help="an .html page with plots of heights, pictures and convergence"),
-            flag("--resume", "go on from OUT.checkpoint, if it is there"),
-            whole("--window", "N", "fit windows of N x N heights one after the other: it takes the memory of one", least=32),
-            whole("--overlap", "M", "heights that neighbouring windows share [a quarter of N]", least=8),
-        ),
-        **arguments.MACHINE,
-    },
-    run=run,
-    about="Beside OUT stand OUT_std and OUT_albedo.npy, where they are asked for.",
-)
