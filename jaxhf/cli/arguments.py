@@ -127,17 +127,3 @@ def refuse(options: argparse.Namespace, *names: str, because: str) -> None:
     """UserError where one of these options was given that would change nothing."""
     for name in given(options, *names):
         raise UserError(f"--{name.replace('_', '-')} would change nothing: {because}")
-
-
-def set_up_jax(options: argparse.Namespace) -> None:
-    """Configures JAX by the options of the machine, which can only be done before its first use."""
-    import jax
-
-    from ..xla.machine import default_devices
-    from .cache import keep_programs
-    from .limits import require_devices
-
-    require_devices(options.devices)
-    jax.config.update("jax_enable_x64", options.precision == "float64")
-    jax.config.update("jax_num_cpu_devices", options.devices or default_devices())
-    keep_programs(options.cache)

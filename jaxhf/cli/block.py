@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..rendering.render import Prepared, render
-from ..scene.camera import Perspective
+from ..scene.camera import Perspective, cropped
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Light, Sky
 from ..scene.material import Matte
@@ -134,7 +134,8 @@ def photograph(
     total = np.zeros((camera.height, camera.width, 3))
     for k in range(side * side):
         dx, dy = ((k % side + 0.5) / side - 0.5, (k // side + 0.5) / side - 0.5)
-        image, aovs = render(ready.with_camera(_moved(camera, dx, dy)), aovs=("depth",))
+        moved = cropped(camera, dx, dy, camera.width, camera.height)
+        image, aovs = render(ready.with_camera(moved), aovs=("depth",))
         total += _in_haze(np.asarray(image, np.float64), np.asarray(aovs["depth"], np.float64), size, look.haze)
         if progress is not None:
             progress()
@@ -148,11 +149,3 @@ def _in_haze(image: np.ndarray, depth: np.ndarray, size: float, haze: float) -> 
     near = depth[met].min(initial=np.inf)
     share = (1 - haze) ** (np.where(met, depth - near, 0) / size)
     return np.where(met[..., None], image * share[..., None] + np.array(_HAZE) * (1 - share[..., None]), behind)
-
-
-def _moved(camera: Perspective, dx: float, dy: float) -> Perspective:
-    """The camera whose pixels are seen where those of `camera` are after so many pixels to the right and down."""
-    pose = np.array(camera.world_from_camera)
-    scale = 2 * math.tan(math.radians(float(camera.fov)) / 2) / min(camera.width, camera.height)
-    pose[:, 2] += scale * (dx * pose[:, 0] - dy * pose[:, 1])
-    return dataclasses.replace(camera, world_from_camera=pose)

@@ -22,9 +22,8 @@ from ...io.pictures.images import save_image
 from ...io.scenes.toml.fit import Case, load_case
 from ...io.terrain.save import require_writable_heights, save_heights
 from ...io.terrain.terrain import Terrain
-from .. import arguments, interruption
+from .. import interruption, limits
 from ..fit_report import facts, report
-from ..limits import require_memory
 from ..overwriting import require_no_input
 from ..progress import CompileTime, duration, told
 from ..scene_warnings import warn
@@ -50,10 +49,10 @@ def run(options: argparse.Namespace) -> None:
             f"{checkpoint}: an interrupted fit left this checkpoint; --resume goes on from it, to begin anew remove it"
         )
     require_no_input(options, std, albedo)
-    arguments.set_up_jax(options)
+    limits.set_up_jax(options)
     case = load_case(options.case, np.dtype(options.precision))
     warn(case.scenes)
-    require_memory(case.scenes[0], jax.local_device_count())
+    limits.require_memory(case.scenes[0], jax.local_device_count())
     begin = time.monotonic()
     found = _fit(case, checkpoint, options)
     field = case.scenes[0].heightfields[0]

@@ -15,8 +15,7 @@ from ...rendering.aovs import known_aovs
 from ...rendering.render import render
 from ...scene.views import resized
 from ...xla.devices import local_mesh, worthwhile_mesh
-from .. import arguments
-from ..limits import require_memory
+from .. import arguments, limits
 from ..progress import CompileTime, compiled_bar
 from ..scene_warnings import warn
 
@@ -28,14 +27,14 @@ def run(options: argparse.Namespace) -> None:
         raise UserError("--normals would change nothing: --shading flat takes those of the triangles")
     require_writable(options.output)
     settings = arguments.settings(options)
-    arguments.set_up_jax(options)
+    limits.set_up_jax(options)
     aovs = known_aovs("render", options.aovs)
     scene = resized(load_scene(options.scene, np.dtype(options.precision)), options.width, options.height)
     warn([scene])
     samples = resolve_settings(settings, scene).samples or 1
     rays = scene.camera.width * scene.camera.height * samples
     mesh = worthwhile_mesh(rays) if options.devices is None else local_mesh()
-    require_memory(scene, mesh.size)
+    limits.require_memory(scene, mesh.size)
     compiling, begin = CompileTime(), time.perf_counter()
     with compiled_bar(unit=" pixels", unit_scale=True) as advance:
         image, found = render(scene, settings, aovs=tuple(dict.fromkeys(("exhausted", *aovs))), progress=advance, mesh=mesh)

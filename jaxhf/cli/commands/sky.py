@@ -15,7 +15,7 @@ from ...io.terrain.rasters import geotiff, require_writable_raster, save_raster
 from ...io.terrain.terrain import Terrain
 from ...maps.skyview import horizon, sky_view
 from ...preparation.horizon import even_azimuths
-from .. import arguments
+from .. import arguments, limits
 from ..progress import compiled_bar
 from .maps import report_spacing, require_numbers
 
@@ -37,7 +37,7 @@ def run(options: argparse.Namespace) -> None:
         terrain = stored.in_metres(**arguments.given(options, "dx", "dy"))
     except FileError as error:
         raise FileError(f"{options.terrain}: {error}") from error
-    arguments.set_up_jax(options)
+    limits.set_up_jax(options)
     begin = time.perf_counter()
     said, count = make(options, path, stored, terrain)
     print(f"{path}: {said}, {counted(count, 'azimuth')}, {time.perf_counter() - begin:.1f} s")

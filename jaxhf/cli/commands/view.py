@@ -22,10 +22,9 @@ from ...scene.camera import Perspective
 from ...scene.heightfield import Heightfield
 from ...scene.sun import sun
 from ...xla.devices import local_mesh
-from .. import arguments
+from .. import arguments, limits
 from ..block import Look, block, exaggeration, lights, photograph, with_water
 from ..catalogue import PRESETS
-from ..limits import require_memory
 from ..overwriting import require_no_input
 from ..progress import bar
 
@@ -94,12 +93,12 @@ def run(options: argparse.Namespace) -> None:
     path = _sun_path(options, terrain)
     factor = options.exaggeration or exaggeration(terrain.heights, terrain.dx, terrain.dy)
     z, colours, base = _solid(options, terrain, factor)
-    arguments.set_up_jax(options)
+    limits.set_up_jax(options)
     field = Heightfield(z, terrain.dx, terrain.dy)
     frames = _frames(options, field, base, path, film)
     camera, look = frames[0]
     scene = block(field, colours, camera, look, base)
-    require_memory(scene, local_mesh().size)
+    limits.require_memory(scene, local_mesh().size)
     ready, said = prepare(scene), "{} x {} pixels".format(*options.size)
     if film:
         _film(output, ready, frames)
