@@ -70,13 +70,7 @@ def exaggeration(heights: Float[np.ndarray, "ny nx"], dx: float, dy: float) -> f
 def with_water(
     heights: Float[np.ndarray, "ny nx"], colours: Float[np.ndarray, "h w 3"], level: float
 ) -> tuple[Float[np.ndarray, "ny nx"], Float[np.ndarray, "h w 3"]]:
-    """Heights with a level sheet of water where they lie below it, and colours that darken with its depth.
-
-    Args:
-      heights: of a terrain.
-      colours: linear, one for each vertex, or those of a picture that spans the terrain.
-      level: of the water.
-    """
+    """Heights with a level sheet of water where they lie below it; colours, as those of `block`, that darken with its depth."""
     under = np.maximum(level - heights, 0)
     deep = under / max(float(np.nanmax(under)), np.finfo(float).tiny)
     rows = np.round(np.linspace(0, len(heights) - 1, len(colours))).astype(int)
@@ -92,10 +86,7 @@ def block(
     """A terrain with walls and a floor, under the sun and a sky.
 
     Args:
-      field: the terrain.
       colours: linear, 0 to 1: of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
-      camera: that is to see it.
-      look: the sun.
       base: the level of the floor; None: neither walls nor a floor.
     """
     at_vertices = colours.shape[:2] == field.heights.shape
@@ -123,8 +114,6 @@ def photograph(
 
     Args:
       ready: the block, in the lights of this look.
-      camera: that sees it.
-      look: the haze and the samples.
       progress: called after each sample.
     """
     side = math.isqrt(look.samples)
