@@ -113,7 +113,7 @@ def reader(tmp_path, monkeypatch) -> Iterator[None]:
     """A folder that holds nothing but `scenes`, and JAX as it begins."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)  # this process is set up
+    monkeypatch.setattr("jaxhf.cli.limits.set_up_jax", lambda options: None)  # this process is set up
     shutil.copytree(ROOT / "scenes", "scenes")
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield

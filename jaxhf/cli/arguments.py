@@ -1,7 +1,9 @@
-"""Options as tables, those that several commands share, and what a command makes of them."""
+"""Options as tables, what stands behind them on the command line, and what a command makes of them."""
 
 import argparse
+import contextlib
 import dataclasses
+import datetime
 import math
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
@@ -69,25 +71,31 @@ def whole_number(text: str) -> int:
     raise argparse.ArgumentTypeError(f"must be a whole number, it is {text!r}")
 
 
-TERRAIN = ".tif and others that GDAL reads, .npz, .npy, .asc, .hgt, .png (grey), .exr, .pfm or .hfield (MuJoCo)"
-IN = option("terrain", metavar="IN", help=f"heights: {TERRAIN}")
-NODATA = number("--nodata", "V", "a stored value that means no height [as the file says]")
-RASTER = {"heights as they are stored": (number("--z-scale", "S", "heights are multiplied by it [1]", default=1.0), NODATA)}
-MACHINE = {
-    "machine": (
-        whole("--devices", "N", "cores that share the work, each with a copy [all, at most 16, fewer for a small picture]"),
-        choice("--precision", ("float32", "float64"), "of heights and rays [float32]", default="float32"),
-        option(
-            "--no-cache", dest="cache", action="store_false",
-            help="keep no compiled programs for the next run [kept in the folder JAXHF_CACHE, by default one in the user's "
-            "cache folder; JAXHF_CACHE=off: keep none]",
-        ),
-    )
-}  # fmt: skip
+def size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(word) for word in text.lower().split("x"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be two numbers of pixels, as 1280x800, it is {text!r}") from None
+    if min(width, height) < 1:
+        raise argparse.ArgumentTypeError(f"must be positive, it is {text}")
+    return width, height
 
 
-def output(help: str) -> Option:
-    return option("-o", "--output", required=True, metavar="OUT", help=help)
+def sun(text: str) -> tuple[float, float] | datetime.datetime:
+    """Azimuth and altitude, or a time with its offset from UTC."""
+    with contextlib.suppress(ValueError):
+        if "," in text:
+            azimuth, altitude = text.split(",")
+            return float(azimuth), float(altitude)
+        time = datetime.datetime.fromisoformat(text)
+        if time.tzinfo is not None:
+            return time
+    rule = "must be an azimuth and an altitude, as 90,10, or a time with its offset from UTC, as 2026-06-21T07:00-05:00"
+    raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
+
+
+def names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(","))
 
 
 def settings_options(names: Collection[str]) -> Sequence[Option]:
@@ -119,17 +127,3 @@ def refuse(options: argparse.Namespace, *names: str, because: str) -> None:
     """UserError where one of these options was given that would change nothing."""
     for name in given(options, *names):
         raise UserError(f"--{name.replace('_', '-')} would change nothing: {because}")
-
-
-def set_up_jax(options: argparse.Namespace) -> None:
-    """Configures JAX by the options of `MACHINE`, which can only be done before its first use."""
-    import jax
-
-    from ..xla.machine import default_devices
-    from .cache import keep_programs
-    from .limits import require_devices
-
-    require_devices(options.devices)
-    jax.config.update("jax_enable_x64", options.precision == "float64")
-    jax.config.update("jax_num_cpu_devices", options.devices or default_devices())
-    keep_programs(options.cache)

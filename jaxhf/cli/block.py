@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..rendering.render import Prepared, render
-from ..scene.camera import Perspective
+from ..scene.camera import Perspective, cropped
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Light, Sky
 from ..scene.material import Matte
@@ -70,13 +70,7 @@ def exaggeration(heights: Float[np.ndarray, "ny nx"], dx: float, dy: float) -> f
 def with_water(
     heights: Float[np.ndarray, "ny nx"], colours: Float[np.ndarray, "h w 3"], level: float
 ) -> tuple[Float[np.ndarray, "ny nx"], Float[np.ndarray, "h w 3"]]:
-    """Heights with a level sheet of water where they lie below it, and colours that darken with its depth.
-
-    Args:
-      heights: of a terrain.
-      colours: linear, one for each vertex, or those of a picture that spans the terrain.
-      level: of the water.
-    """
+    """Heights with a level sheet of water where they lie below it; colours, as those of `block`, that darken with its depth."""
     under = np.maximum(level - heights, 0)
     deep = under / max(float(np.nanmax(under)), np.finfo(float).tiny)
     rows = np.round(np.linspace(0, len(heights) - 1, len(colours))).astype(int)
@@ -92,10 +86,7 @@ def block(
     """A terrain with walls and a floor, under the sun and a sky.
 
     Args:
-      field: the terrain.
       colours: linear, 0 to 1: of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
-      camera: that is to see it.
-      look: the sun.
       base: the level of the floor; None: neither walls nor a floor.
     """
     at_vertices = colours.shape[:2] == field.heights.shape
@@ -123,8 +114,6 @@ def photograph(
 
     Args:
       ready: the block, in the lights of this look.
-      camera: that sees it.
-      look: the haze and the samples.
       progress: called after each sample.
     """
     side = math.isqrt(look.samples)
@@ -134,7 +123,8 @@ def photograph(
     total = np.zeros((camera.height, camera.width, 3))
     for k in range(side * side):
         dx, dy = ((k % side + 0.5) / side - 0.5, (k // side + 0.5) / side - 0.5)
-        image, aovs = render(ready.with_camera(_moved(camera, dx, dy)), aovs=("depth",))
+        moved = cropped(camera, dx, dy, camera.width, camera.height)
+        image, aovs = render(ready.with_camera(moved), aovs=("depth",))
         total += _in_haze(np.asarray(image, np.float64), np.asarray(aovs["depth"], np.float64), size, look.haze)
         if progress is not None:
             progress()
@@ -148,11 +138,3 @@ def _in_haze(image: np.ndarray, depth: np.ndarray, size: float, haze: float) -> 
     near = depth[met].min(initial=np.inf)
     share = (1 - haze) ** (np.where(met, depth - near, 0) / size)
     return np.where(met[..., None], image * share[..., None] + np.array(_HAZE) * (1 - share[..., None]), behind)
-
-
-def _moved(camera: Perspective, dx: float, dy: float) -> Perspective:
-    """The camera whose pixels are seen where those of `camera` are after so many pixels to the right and down."""
-    pose = np.array(camera.world_from_camera)
-    scale = 2 * math.tan(math.radians(float(camera.fov)) / 2) / min(camera.width, camera.height)
-    pose[:, 2] += scale * (dx * pose[:, 0] - dy * pose[:, 1])
-    return dataclasses.replace(camera, world_from_camera=pose)

@@ -13,6 +13,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import jax
+
+from ..xla import kept
+from ..xla.plain import is_asked_for
+
 _MOST = 500_000_000  # bytes; a picture's programs take 0.3 million
 
 
@@ -24,11 +29,6 @@ def keep_programs(wanted: bool) -> None:
     Args:
       wanted: whether to keep any; if not, a folder that the user has named to JAX is not used either.
     """
-    import jax
-
-    from ..xla.kept import keep_in
-    from ..xla.plain import is_asked_for
-
     if is_asked_for():
         return
     if not wanted:
@@ -49,7 +49,7 @@ def keep_programs(wanted: bool) -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    keep_in(folder)
+    kept.keep_in(folder)
     _mend(folder)
 
 

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import counted
+from ..io.terrain.georeference import Georeference, coordinate_system
+from ..io.terrain.terrain import Terrain
 
 if TYPE_CHECKING:
-    from ..io.terrain.terrain import Terrain
     from ..scene.heightfield import Heightfield
     from ..scene.scene import Scene
 
@@ -28,10 +29,8 @@ def scene_lines(scene: "Scene") -> Iterator[str]:
         yield f"light {k}: {type(light).__name__}, {values}"
 
 
-def terrain_lines(path: str, terrain: "Terrain") -> Iterator[str]:
+def terrain_lines(path: str, terrain: Terrain) -> Iterator[str]:
     """Size, spacing, place, reference system and range of a terrain in its file's own coordinates."""
-    from ..io.terrain.georeference import Georeference, coordinate_system
-
     ny, nx = terrain.heights.shape
     yield f"{path}: {ny} rows, {nx} columns of {terrain.heights.dtype}"
     place = terrain.georeference or Georeference()

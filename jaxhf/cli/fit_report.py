@@ -4,16 +4,14 @@ import base64
 import html
 import io
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..fitting.fit import Fit
 from ..fitting.model.view import differences, sun
+from ..io.scenes.toml.fit import Case
 from ..scene.heightfield import Heightfield
-
-if TYPE_CHECKING:
-    from ..io.scenes.toml.fit import Case
 
 _FAR = 4  # standard deviations at which the colours of residuals end
 _PAGE = """<!doctype html>
@@ -26,7 +24,7 @@ img {{ max-width: 100% }} th {{ text-align: left; padding-right: 2em; font-weigh
 """
 
 
-def report(title: str, case: "Case", found: Fit) -> str:
+def report(title: str, case: Case, found: Fit) -> str:
     """An HTML page that needs no other file; its plots are matplotlib's."""
     rows = [*_summary(case, found), *facts(case, found)]
     table = "".join(f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in rows)
@@ -39,7 +37,7 @@ def report(title: str, case: "Case", found: Fit) -> str:
     return _PAGE.format(title=html.escape(title), facts=table, figures=shown)
 
 
-def facts(case: "Case", found: Fit) -> Iterator[tuple[str, str]]:
+def facts(case: Case, found: Fit) -> Iterator[tuple[str, str]]:
     """What was sought beside the heights, by its name: noise, exposure, light and camera of each picture."""
     if case.noise is None:
         yield "noise, estimated", _listed(found.noise, 3)
@@ -61,7 +59,7 @@ def facts(case: "Case", found: Fit) -> Iterator[tuple[str, str]]:
             yield name, ", ".join(texts)
 
 
-def _summary(case: "Case", found: Fit) -> Iterator[tuple[str, str]]:
+def _summary(case: Case, found: Fit) -> Iterator[tuple[str, str]]:
     ny, nx = found.heights.shape
     heights, stats = np.asarray(found.heights), found.stats
     yield "result", found.result.value

@@ -1,17 +1,26 @@
 """What this machine can do: too many devices are refused, and pictures that do not fit into its memory."""
 
-from typing import TYPE_CHECKING
+import argparse
+
+import jax
 
 from ..core.errors import UserError, counted
+from ..scene.scene import Scene
 from ..xla.machine import available_bytes, default_devices, usable_cores
-
-if TYPE_CHECKING:
-    from ..scene.scene import Scene
+from .cache import keep_programs
 
 # Bytes in single precision. Measured at the peak: 57 for each height and device, 50 for each pixel, 116 while a .png is written
 # (docs/guides/devices.md). Less than that is asked for, so that what might fit is tried.
 _BYTES_A_HEIGHT = 45
 _BYTES_A_PIXEL = 40
+
+
+def set_up_jax(options: argparse.Namespace) -> None:
+    """Configures JAX by the options of the machine, which can only be done before its first use."""
+    require_devices(options.devices)
+    jax.config.update("jax_enable_x64", options.precision == "float64")
+    jax.config.update("jax_num_cpu_devices", options.devices or default_devices())
+    keep_programs(options.cache)
 
 
 def require_devices(devices: int | None) -> None:
@@ -23,7 +32,7 @@ def require_devices(devices: int | None) -> None:
         )
 
 
-def require_memory(scene: "Scene", devices: int) -> None:
+def require_memory(scene: Scene, devices: int) -> None:
     """UserError where a picture of this scene certainly needs more memory than there is."""
     width, height = scene.camera.width, scene.camera.height
     heights = sum(field.heights.size for field in scene.heightfields)

@@ -7,6 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
 
 from . import interruption
 
@@ -21,12 +22,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         interruption.end_at_once()
         gc.set_threshold(50_000, 50, 100)  # tracing makes many objects that live on, and so do imports
         _show_any_name()
-    from ..core.errors import UserError
-    from .overwriting import require_no_input
     from .parser import parse
-    from .progress import quiet
 
     options = parse(arguments)
+    from ..core.errors import UserError
+    from .overwriting import require_no_input
+    from .progress import quiet
+
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides
@@ -35,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             )
             require_no_input(options)
             with quiet(options.quiet):
-                options.run(options)
+                import_module(f".commands.{options.command.module or options.command.name}", __package__).run(options)
                 sys.stdout.flush()
     except KeyboardInterrupt as stopped:
         print(f"\njaxhf: {str(stopped) or 'interrupted'}", file=sys.stderr)

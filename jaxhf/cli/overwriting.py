@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ..core.errors import UserError
+from ..io.files import file_path
 
 _SCENES = (".toml", ".pbrt")
 # Files of the same name that say where one of this ending lies: read with a terrain, and those of a map are written with it.
@@ -18,19 +19,17 @@ def require_no_input(options: argparse.Namespace, *others: Path) -> None:
 
     Args:
       options: of the command: `output` and `report` are written; every other string that names a file counts as read.
-        `placed`: files beside the output will say where it lies.
+        `command.placed`: files beside the output will say where it lies.
       others: what the command writes besides.
 
     Raises:
       FileError: an option is an address on the network.
     """
-    from ..io.files import file_path
-
     values = {name: value for name, value in vars(options).items() if isinstance(value, str)}
     for value in values.values():  # as it was written: a path would lose one of its slashes
         file_path("", value)
     outputs = [Path(values.pop(name)) for name in ("output", "report") if name in values] + list(others)
-    if options.placed:
+    if options.command.placed:
         outputs += [beside for path in outputs if path.suffix.lower() in _PLACED for beside in _beside(path)]
     outputs = [path for path in outputs if path.is_file()]
     if not outputs:

@@ -8,16 +8,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core.version import __version__
-from .command import Command
-from .commands import convert, fit, info, maps, render, sky, tradeoff, view
+from .catalogue import COMMANDS, GROUPS, Command
 
-GROUPS = {
-    "terrain maps": (*maps.COMMANDS, *sky.COMMANDS),
-    "pictures": (view.COMMAND, render.COMMAND),
-    "recovery": (fit.COMMAND, tradeoff.COMMAND),
-    "files": (convert.COMMAND, info.COMMAND),
-}
-COMMANDS = {command.name: command for group in GROUPS.values() for command in group}
 _EXAMPLES = """
 examples:
   jaxhf view terrain.tif -o terrain.png         a look at a terrain
@@ -66,12 +58,12 @@ def parser_of(command: Command) -> _Parser:
         group = parser.add_argument_group(title) if title else parser
         for names, keywords in options:
             group.add_argument(*names, **keywords)
-    parser.set_defaults(run=command.run, placed=command.placed)
+    parser.set_defaults(command=command)
     return parser
 
 
 def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options of the command that these words name, with its `run`; see `_Parser.read`.
+    """The options of the command that these words name, with itself as `command`; see `_Parser.read`.
 
     Args:
       words: None: those of this process.

@@ -4,40 +4,28 @@ import contextlib
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
-from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from tqdm import tqdm
+from tqdm import tqdm
 
-_QUIET = ContextVar("_QUIET", default=False)
 _EACH_SECOND, _EACH_MINUTE = 1.0, 60.0
 
 
 @contextlib.contextmanager
 def quiet(wanted: bool) -> Iterator[None]:
     """Within, standard output is dropped and no bar is shown, if that is wanted; warnings and errors are as ever."""
-    if not wanted:
+    with open(os.devnull, "w", errors="replace") as nowhere, contextlib.redirect_stdout(nowhere if wanted else sys.stdout):
         yield
-        return
-    token = _QUIET.set(True)
-    try:
-        with open(os.devnull, "w", errors="replace") as nowhere, contextlib.redirect_stdout(nowhere):
-            yield
-    finally:
-        _QUIET.reset(token)
 
 
 def is_quiet() -> bool:
-    return _QUIET.get()
+    """Whether standard output leads to where `quiet` has opened."""
+    return getattr(sys.stdout, "name", None) == os.devnull
 
 
-def bar(**options: Any) -> "tqdm[Any]":
+def bar(**options: Any) -> tqdm:
     """A bar on standard error, as `tqdm` with these options; in a pipe it shows nothing."""
-    from tqdm import tqdm
-
     window: dict[str, Any] = {"dynamic_ncols": True}
     with contextlib.suppress(OSError, ValueError):  # which is what a stream without a descriptor raises
         if os.get_terminal_size(sys.stderr.fileno()).columns == 0:  # of a terminal that has no window, as one in a container
@@ -72,38 +60,29 @@ def compiled_bar(**options: Any) -> Iterator[Callable[[int, int], None]]:
 
 
 @contextlib.contextmanager
-def told(line: Callable[[float], str]) -> Iterator[Callable[[], None]]:
+def told(line: Callable[[], str]) -> Iterator[None]:
     """Says what work of unknown length has come to: each second on a terminal, elsewhere once a minute on standard error.
 
     Args:
-      line: what is to be said; it is given the seconds since the work began, in a thread of its own.
-
-    Yields:
-      What says it at once on a terminal.
+      line: what is to be said, asked for in a thread of its own.
     """
-    begin, ended = time.monotonic(), threading.Event()
-    with bar(bar_format="{desc}") as shown:
-
-        def tell() -> None:
-            if not shown.disable:
-                shown.set_description_str(line(time.monotonic() - begin))
+    ended = threading.Event()
+    with bar(bar_format="{desc}", desc=line()) as shown:
 
         def keep_telling() -> None:
             while not ended.wait(_EACH_MINUTE if shown.disable else _EACH_SECOND):
-                if shown.disable:
-                    print(f"jaxhf: {line(time.monotonic() - begin)}", file=sys.stderr, flush=True)
-                tell()
+                if not shown.disable:
+                    shown.set_description_str(line())
+                elif not is_quiet():
+                    print(f"jaxhf: {line()}", file=sys.stderr, flush=True)
 
-        tell()
         thread = threading.Thread(target=keep_telling, daemon=True)
-        if not is_quiet():
-            thread.start()
+        thread.start()
         try:
-            yield tell
+            yield
         finally:
             ended.set()
-            if thread.is_alive():
-                thread.join()
+            thread.join()
 
 
 def duration(seconds: float) -> str:

@@ -2,34 +2,29 @@
 
 import sys
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-if TYPE_CHECKING:
-    from ..scene.camera import Camera
-    from ..scene.heightfield import Heightfield
-    from ..scene.scene import Object, Scene
+from ..scene.camera import Camera, Perspective
+from ..scene.heightfield import Heightfield
+from ..scene.light import Directional
+from ..scene.material import Matte
+from ..scene.scene import Object, Scene
 
 _NARROW = 1.0  # degrees
 _WIDE = 170.0
 _MOST_HEIGHT = 1e18
 
 
-def warn(scenes: "Iterable[Scene]") -> None:
+def warn(scenes: Iterable[Scene]) -> None:
     """Prints what speaks against these scenes on standard error, each line once."""
     for line in dict.fromkeys(line for scene in scenes for line in scene_warnings(scene)):
         print(f"jaxhf: warning: {line}", file=sys.stderr)
 
 
-def scene_warnings(scene: "Scene") -> Iterator[str]:
+def scene_warnings(scene: Scene) -> Iterator[str]:
     """A line for each thing that makes a picture black or odd without being an error."""
-    from ..scene.camera import Perspective
-    from ..scene.heightfield import Heightfield
-    from ..scene.light import Directional
-    from ..scene.material import Matte
-
     if not scene.lights:
         yield "the scene has no lights: the picture is black"
     camera = scene.camera
@@ -71,7 +66,7 @@ def scene_warnings(scene: "Scene") -> Iterator[str]:
         yield f"camera: none of the terrain is in the picture, it spans {spans}"
 
 
-def _height_at(field: "Heightfield", heights: np.ndarray, x: float, y: float) -> float:
+def _height_at(field: Heightfield, heights: np.ndarray, x: float, y: float) -> float:
     """The height of the triangle over (x, y); -inf beside the footprint, nan in a hole."""
     column, row = (x - field.x0) / field.dx, (y - field.y0) / field.dy
     ny, nx = heights.shape
@@ -83,7 +78,7 @@ def _height_at(field: "Heightfield", heights: np.ndarray, x: float, y: float) ->
     return float(z00 + (fx * (z10 - z00) + fy * (z11 - z10) if fx >= fy else fy * (z01 - z00) + fx * (z11 - z01)))
 
 
-def _box(item: "Object", field: "Heightfield", lowest: float, highest: float) -> Float[np.ndarray, "8 3"]:
+def _box(item: Object, field: Heightfield, lowest: float, highest: float) -> Float[np.ndarray, "8 3"]:
     """The corners of a heightfield's bounding box, in the world."""
     ny, nx = field.heights.shape
     xs, ys = (field.x0, field.x0 + (nx - 1) * field.dx), (field.y0, field.y0 + (ny - 1) * field.dy)
@@ -94,10 +89,8 @@ def _box(item: "Object", field: "Heightfield", lowest: float, highest: float) ->
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _out_of_view(camera: "Camera", points: Float[np.ndarray, "n 3"]) -> bool:
+def _out_of_view(camera: Camera, points: Float[np.ndarray, "n 3"]) -> bool:
     """Whether all points lie beyond one and the same side of what a camera sees: then so does their convex hull."""
-    from ..scene.camera import Perspective
-
     matrix = np.asarray(camera.world_from_camera, np.float64)
     x, y, z = np.linalg.inv(matrix[:3, :3]) @ (points - matrix[:3, 3]).T
     short = min(camera.width, camera.height)

@@ -5,9 +5,14 @@ import dataclasses
 from .scene import Scene
 
 
-def resized(scene: Scene, width: int, height: int) -> Scene:
-    """The same view in a picture of width x height pixels."""
-    return dataclasses.replace(scene, camera=dataclasses.replace(scene.camera, width=width, height=height))
+def resized(scene: Scene, width: int | None, height: int | None) -> Scene:
+    """The same view in a picture of width x height pixels; one of them that is None follows from the proportions."""
+    old = scene.camera
+    if width is None:
+        width = old.width if height is None else max(1, round(height * old.width / old.height))
+    if height is None:
+        height = max(1, round(width * old.height / old.width))
+    return dataclasses.replace(scene, camera=dataclasses.replace(old, width=width, height=height))
 
 
 def shrunk(scene: Scene, pixels: int) -> Scene:

@@ -41,15 +41,13 @@ def one_at_a_time(rows: Sequence[Row]) -> dict[str, list[tuple[str, Row]]]:
         if len(changed) == 1:
             ((knob, value),) = changed.items()
             found.setdefault(knob, [(str(base[knob]), base)]).append((str(value), row))
-    return {knob: sorted(values, key=lambda pair: (_number(pair[0]), pair[0])) for knob, values in found.items()}
 
+    def place(pair: tuple[str, Row]) -> tuple[float, str]:
+        """On the knob's axis: numbers by size, the unlimited last, words after that by name."""
+        value = pair[0]
+        return float(value) if value.isdigit() else math.inf, value
 
-def _number(value: str) -> float:
-    """Where a value stands on its knob's axis: numbers by size, the unlimited last, words after that by name."""
-    try:
-        return float(value)
-    except ValueError:
-        return math.inf
+    return {knob: sorted(values, key=place) for knob, values in found.items()}
 
 
 def advice(measured: Sequence[Row], error: float | None, seconds: float | None) -> list[str]:

@@ -62,14 +62,8 @@ def plan(
     for knob, absent in _unused(scene).items():
         if knob in knobs:
             raise ArgumentError("tradeoff", "knobs", f"{knob!r} changes nothing here: the scene has no {absent}")
-    if width:
-        scene = resized(scene, width, max(1, round(width / scene.camera.width * scene.camera.height)))
-    else:
-        scene = shrunk(scene, PIXELS // 2 if quick else PIXELS)
-    rows: list[Row] = []
-    for row in _configurations(scene, knobs or KNOBS, quick):
-        if row not in rows:
-            rows.append(row)
+    scene = resized(scene, width, None) if width else shrunk(scene, PIXELS // 2 if quick else PIXELS)
+    rows = list({tuple(row.values()): row for row in _configurations(scene, knobs or KNOBS, quick)}.values())  # each once
     # Four times the base's samples at least, else the reference's error would be that of rounding.
     samples = max(FINEST // 4 if quick else FINEST, 4 * (rows[0]["samples"] or 1))
     exact = rows[0] | {"precision": "float64"}

@@ -12,7 +12,7 @@ Run = Callable[..., tuple[int | str | None, str, str]]
 @pytest.fixture
 def command(monkeypatch, capsys) -> Run:
     """A function of the words after `jaxhf`: it returns the exit code, standard output and standard error."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)
+    monkeypatch.setattr("jaxhf.cli.limits.set_up_jax", lambda options: None)
 
     def run(*words: object) -> tuple[int | str | None, str, str]:
         try:

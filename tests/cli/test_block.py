@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.cli.block import Look, _in_haze as in_haze, _moved as moved, block, exaggeration, with_water
+from jaxhf.cli.block import Look, _in_haze as in_haze, block, exaggeration, with_water
+from jaxhf.scene.camera import cropped
 
 RAMP = np.linspace(0, 1, 101)[:, None] * np.ones(101)
 
@@ -50,7 +51,7 @@ def test_a_look_that_cannot_be_is_refused(name: str, value: float):
 def test_a_camera_looks_past_the_centres_of_its_pixels():
     camera = jaxhf.Perspective.look_at((3, -2, 4), (0, 1, 0), fov=50, width=60, height=40)
     for dx, dy in ((0.25, -0.375), (-0.5, 0.0)):
-        past = moved(camera, dx, dy)
+        past = cropped(camera, dx, dy, 60, 40)
         for x, y in ((0.5, 39.5), (17.0, 3.0)):
             np.testing.assert_allclose(past.ray(*jnp.array([x, y])).d, camera.ray(*jnp.array([x + dx, y + dy])).d, atol=1e-6)
 

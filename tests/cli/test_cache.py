@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jaxhf.cli import arguments, cache
+from jaxhf.cli import cache, limits
 
 SCENE = Path(__file__).parents[2] / "scenes" / "debug4x4.toml"
 
@@ -87,7 +87,7 @@ def configured(monkeypatch, tmp_path):
 
     def set_up(wanted=True, precision="float32"):
         values.clear()
-        arguments.set_up_jax(Namespace(devices=1, precision=precision, cache=wanted))
+        limits.set_up_jax(Namespace(devices=1, precision=precision, cache=wanted))
         assert values["jax_enable_x64"] == (precision == "float64")
         return values
 

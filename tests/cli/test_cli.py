@@ -101,7 +101,7 @@ def rendered(monkeypatch):
         image = np.random.default_rng(0).uniform(0, 1.2, (*shape, 3)).astype(scene.heights.dtype)
         return image, {"exhausted": exhausted}
 
-    monkeypatch.setattr("jaxhf.rendering.render.render", render)
+    monkeypatch.setattr("jaxhf.cli.commands.render.render", render)
     return given
 
 
@@ -167,7 +167,7 @@ def test_our_own_bug_keeps_its_traceback(tmp_path, monkeypatch, command):
     def broken(*_, **__):
         raise ValueError("a bug")
 
-    monkeypatch.setattr("jaxhf.rendering.render.render", broken)
+    monkeypatch.setattr("jaxhf.cli.commands.render.render", broken)
     with pytest.raises(ValueError, match=r"^a bug$"):
         command("render", SCENE, "-o", tmp_path / "out.png")
 

@@ -93,7 +93,7 @@ def pretended(options: dict, ends: bool = True):
 def test_what_the_file_says_reaches_fit_and_results_lie_where_the_terrain_lies(folder, monkeypatch, run):
     rasterio = pytest.importorskip("rasterio")
     options = {}
-    monkeypatch.setattr("jaxhf.fitting.fit.fit", pretended(options))
+    monkeypatch.setattr("jaxhf.cli.commands.fit.fit", pretended(options))
     assert run("out.tif", "--report", folder / "out.html") == (
         0,
         "noise, estimated: 0.0123\n"
@@ -148,10 +148,10 @@ def windowed(options: dict, ends: bool = True):
 
 def test_windows_are_told_one_by_one(folder, monkeypatch, run):
     options, checkpoint = {}, folder / "all.npz.checkpoint"
-    monkeypatch.setattr("jaxhf.fitting.windows.fit_windows", windowed(options, ends=False))
+    monkeypatch.setattr("jaxhf.cli.commands.fit.fit_windows", windowed(options, ends=False))
     code, _, said = run("all.npz", "--window", 32, "--overlap", 8)
     assert (code, said) == (130, f"\njaxhf: interrupted; the same command with --resume goes on from {checkpoint}\n")
-    monkeypatch.setattr("jaxhf.fitting.windows.fit_windows", windowed(options))
+    monkeypatch.setattr("jaxhf.cli.commands.fit.fit_windows", windowed(options))
     code, said, warned = run("all.npz", "--window", 32, "--overlap", 8, "--resume")
     lines = said.splitlines()
     assert code == 0
@@ -185,7 +185,7 @@ def test_what_windows_cannot_have_is_refused(run, words, text):
 
 def test_after_ctrl_c_it_says_how_to_go_on(folder, monkeypatch, run):
     options, checkpoint = {}, folder / "part.tif.checkpoint"
-    monkeypatch.setattr("jaxhf.fitting.fit.fit", pretended(options, ends=False))
+    monkeypatch.setattr("jaxhf.cli.commands.fit.fit", pretended(options, ends=False))
     said = f"interrupted; the same command with --resume goes on from {checkpoint}"
     assert run("part.tif") == (130, "", f"\njaxhf: {said}\n")
     assert not (folder / "part.tif").exists()
@@ -193,7 +193,7 @@ def test_after_ctrl_c_it_says_how_to_go_on(folder, monkeypatch, run):
     said = f"jaxhf: error: {checkpoint}: an interrupted fit left this checkpoint; --resume"
     assert (code, err.startswith(said)) == (2, True)
 
-    monkeypatch.setattr("jaxhf.fitting.fit.fit", pretended(options))
+    monkeypatch.setattr("jaxhf.cli.commands.fit.fit", pretended(options))
     assert run("part.tif", "--resume")[0] == 0
     assert options["resume"]
     assert not checkpoint.exists()
@@ -220,7 +220,7 @@ def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch,
         return real(*arguments, progress=watch, **options)
 
     with monkeypatch.context() as patched:
-        patched.setattr("jaxhf.fitting.fit.fit", fit)
+        patched.setattr("jaxhf.cli.commands.fit.fit", fit)
         assert run("cut.tif", case="plain.toml")[0] == 130
         assert not (folder / "cut.tif").exists()
         assert run("cut.tif", "--resume", case="plain.toml")[0] == 0
@@ -233,7 +233,6 @@ def test_interrupted_and_resumed_it_ends_with_the_same_bits(folder, monkeypatch,
 
 SLOW = """
 import sys, time
-import jaxhf.fitting.fit
 from jaxhf.fitting.history import Draws, Step
 from jaxhf.cli import main, progress
 from jaxhf.cli.commands import fit
@@ -247,7 +246,7 @@ def pretended(scenes, targets, *, progress, **options):
     time.sleep(0.5)
     raise KeyboardInterrupt
 
-jaxhf.fitting.fit.fit = pretended
+fit.fit = pretended
 progress._EACH_SECOND = 0.2
 progress._EACH_MINUTE = float(sys.argv.pop(1))
 fit._EARLY = 1.0

@@ -17,8 +17,8 @@ SCENE = str(Path(__file__).parents[2] / "scenes" / "debug4x4.toml")  # 320 x 240
 @pytest.fixture
 def refused(monkeypatch, capsys, tmp_path):
     """The one line of a command that is refused."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: limits.require_devices(options.devices))
-    monkeypatch.setattr("jaxhf.rendering.render.render", lambda *_, **__: pytest.fail("began to render"))
+    monkeypatch.setattr("jaxhf.cli.limits.set_up_jax", lambda options: limits.require_devices(options.devices))
+    monkeypatch.setattr("jaxhf.cli.commands.render.render", lambda *_, **__: pytest.fail("began to render"))
 
     def run(*arguments):
         assert main([*arguments, "-o", str(tmp_path / "out.npy")]) == 2

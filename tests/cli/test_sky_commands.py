@@ -99,9 +99,9 @@ def test_a_bar_tells_what_is_done_until_ctrl_c(run, name, heights, tmp_path, mon
 
 def test_a_full_disk_leaves_none_of_several_maps(run, tmp_path, monkeypatch):
     pytest.importorskip("rasterio")
-    from jaxhf.io.terrain import rasters
+    from jaxhf.cli.commands import sky
 
-    geotiff, written = rasters.geotiff, []
+    geotiff, written = sky.geotiff, []
 
     def full(*given):
         written.append(given)
@@ -109,7 +109,7 @@ def test_a_full_disk_leaves_none_of_several_maps(run, tmp_path, monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
         return geotiff(*given)
 
-    monkeypatch.setattr(rasters, "geotiff", full)
+    monkeypatch.setattr(sky, "geotiff", full)
     code, said = run("horizon", "out.tif", "--azimuths", "4")
     assert (code, "cannot be written: No space left" in said) == (2, True)
     assert [path.name for path in tmp_path.iterdir()] == ["terrain.npz"]

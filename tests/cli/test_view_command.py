@@ -10,11 +10,12 @@ import pytest
 
 import jaxhf
 from jaxhf.cli import block as looks
-from jaxhf.cli.commands.view import _sun, _sun_path
+from jaxhf.cli.arguments import sun
+from jaxhf.cli.commands import view
+from jaxhf.cli.commands.view import _sun_path
 from jaxhf.core.errors import UserError
 from jaxhf.io.terrain.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.terrain.terrain import Terrain
-from jaxhf.rendering import render as _render
 
 SMALL = ["--size", "48x32", "--preset", "draft", "--devices", "1"]
 MORNING, EVENING = "2026-06-21T05:00:00Z", "2026-06-21T18:00+01:00"
@@ -47,8 +48,8 @@ def test_a_terrain_stands_in_the_middle_of_its_picture(terrain, tmp_path, comman
 def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch, command):
     """Each film prepares its terrain once."""
     framing, views = jaxhf.Perspective.framing, []
-    prepare, prepared = _render.prepare, []
-    monkeypatch.setattr(_render, "prepare", lambda scene: (prepared.append(scene), prepare(scene))[1])
+    prepare, prepared = view.prepare, []
+    monkeypatch.setattr(view, "prepare", lambda scene: (prepared.append(scene), prepare(scene))[1])
 
     def recorded(field, azimuth, *rest, **options):
         views.append((azimuth, options["around"]))
@@ -75,7 +76,7 @@ def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch, 
 def test_the_sun_moves_as_it_does_over_the_terrain(terrain):
     heights = dataclasses.replace(jaxhf.load_heights(terrain), georeference=Georeference(WGS84_DEGREES, offset=(7.0, 45.5)))
     heights = dataclasses.replace(heights, dx=0.125, dy=1 / 6)  # its middle is at 46.5 degrees north, 8 east
-    options = argparse.Namespace(sun_from=_sun(MORNING), sun_to=_sun(EVENING), frames=13, latitude=None, longitude=None)
+    options = argparse.Namespace(sun_from=sun(MORNING), sun_to=sun(EVENING), frames=13, latitude=None, longitude=None)
     path = _sun_path(options, heights)
     assert path is not None
     hours = np.datetime64("2026-06-21T05") + np.arange(13).astype("timedelta64[h]")
@@ -166,6 +167,6 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
 def test_there_is_a_terrain_to_try(terrain, tmp_path, monkeypatch, command):
     """Here another, as that of matplotlib takes seconds; docs/index.md shows it."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("jaxhf.io.terrain.load.jacksboro_file", lambda: terrain)
+    monkeypatch.setattr("jaxhf.cli.commands.view.jacksboro_file", lambda: terrain)
     assert command("view", "--demo", *SMALL)[0] == 0
     assert np.ptp(imageio.imread("in.png")) > 100

@@ -88,7 +88,7 @@ def test_rays_and_maps(shape):
 @pytest.mark.parametrize("shape", SIZES)
 def test_commands(shape, tmp_path, monkeypatch):
     """`view` of 1024 x 1024 heights and more ended in a traceback, for a sum of XLA's library within a kernel."""
-    monkeypatch.setattr("jaxhf.cli.arguments.set_up_jax", lambda options: None)  # JAX is set up already
+    monkeypatch.setattr("jaxhf.cli.limits.set_up_jax", lambda options: None)  # JAX is set up already
     np.save(tmp_path / "z.npy", heights(*shape))
     source, out = str(tmp_path / "z.npy"), str(tmp_path)
     picture = ["--size", "32x20", "--preset", "draft"]

@@ -1,1 +1,1 @@
-"""One file a command: its options and what it does."""
+"""What each command does: `run`, in a file that is imported when it is asked for."""

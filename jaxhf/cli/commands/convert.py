@@ -6,16 +6,13 @@ import warnings
 from pathlib import Path
 
 from ...core.errors import UserError
-from .. import arguments
-from ..command import Command
+from ...io.terrain.load import load_heights
+from ...io.terrain.meshes import MESHES, require_writable_mesh, save_mesh
+from ...io.terrain.save import HEIGHTS, require_writable_heights, save_heights
+from ..describe import heightfield_line
 
 
 def run(options: argparse.Namespace) -> None:
-    from ...io.terrain.load import load_heights
-    from ...io.terrain.meshes import MESHES, require_writable_mesh, save_mesh
-    from ...io.terrain.save import HEIGHTS, require_writable_heights, save_heights
-    from ..describe import heightfield_line
-
     ending = Path(options.output).suffix.lower()
     in_metres = ending in MESHES  # alone; others are in the unit of the file
     if in_metres:
@@ -38,21 +35,3 @@ def run(options: argparse.Namespace) -> None:
     if ending == ".png" and (terrain.heights % 1 != 0).any():
         alone = " (.png holds whole numbers: heights are rounded to steps of 1)"
     print(f"{options.output}: {heightfield_line(terrain)}{alone}")
-
-
-_WRITTEN = ".tif, .npz, .npy, .asc, .png (rounded) or .exr; a mesh: .glb, .obj or .ply"
-COMMAND = Command(
-    "convert",
-    "write a terrain in another format",
-    examples=("terrain.tif terrain.npz", "terrain.tif block.glb --base 0"),
-    options={
-        "": (
-            arguments.IN,
-            arguments.option("output", metavar="OUT", help=_WRITTEN),
-            arguments.number("--base", "Z", "close a mesh by walls down to this height [open]"),
-        ),
-        **arguments.RASTER,
-    },
-    run=run,
-    about="It keeps its place on the map, or becomes a mesh of triangles.",
-)

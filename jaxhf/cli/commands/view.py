@@ -7,48 +7,32 @@ import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from ...core.errors import ArgumentError, UserError
-from .. import arguments
-from ..arguments import FINITE, POSITIVE, choice, flag, number, option, whole
-from ..command import Command
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from ...io.terrain.terrain import Terrain
-    from ...rendering.render import Prepared
-    from ...scene.camera import Perspective
-    from ...scene.heightfield import Heightfield
-    from ..block import Look
-
-_PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel
+from ...io.pictures.films import FILMS, require_writable_film, writing_film
+from ...io.pictures.images import PICTURES, linear_from_srgb, require_writable, save_image, srgb_from_linear
+from ...io.terrain.drape import load_drape
+from ...io.terrain.load import jacksboro_file, load_heights
+from ...io.terrain.terrain import Terrain
+from ...maps.relief import color_relief
+from ...rendering.render import Prepared, prepare
+from ...scene.camera import Perspective
+from ...scene.heightfield import Heightfield
+from ...scene.sun import sun
+from ...xla.devices import local_mesh
+from .. import arguments, limits
+from ..block import Look, block, exaggeration, lights, photograph, with_water
+from ..catalogue import PRESETS
+from ..overwriting import require_no_input
+from ..progress import bar
 
 _TALLEST = 100  # times its length: beyond, a terrain is a needle that no pixel shows
 
 
-def _sun(text: str) -> tuple[float, float] | datetime.datetime:
-    """Azimuth and altitude, or a time with its offset from UTC."""
-    try:
-        if "," in text:
-            azimuth, altitude = text.split(",")
-            return float(azimuth), float(altitude)
-        time = datetime.datetime.fromisoformat(text)
-    except ValueError:
-        time = None
-    if time is None or time.tzinfo is None:
-        rule = "must be an azimuth and an altitude, as 90,10, or a time with its offset from UTC, as 2026-06-21T07:00-05:00"
-        raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
-    return time
-
-
-def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | None":
+def _sun_path(options: argparse.Namespace, terrain: Terrain) -> np.ndarray | None:
     """The sun's azimuth and altitude in each frame of a film, shape (frames, 2); None where it stands still."""
-    import numpy as np
-
-    from ...scene.sun import sun
-
     first, last, place = options.sun_from, options.sun_to, (options.latitude, options.longitude)
     times = isinstance(first, datetime.datetime)
     if times != isinstance(last, datetime.datetime):
@@ -75,23 +59,8 @@ def _sun_path(options: argparse.Namespace, terrain: "Terrain") -> "np.ndarray | 
     return np.stack([azimuth, altitude], -1)
 
 
-def _size(text: str) -> tuple[int, int]:
-    try:
-        width, height = (int(word) for word in text.lower().split("x"))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be two numbers of pixels, as 1280x800, it is {text!r}") from None
-    if min(width, height) < 1:
-        raise argparse.ArgumentTypeError(f"must be positive, it is {text}")
-    return width, height
-
-
 def _output(options: argparse.Namespace) -> tuple[Path, bool]:
     """The file, and whether it is a film; UserError where options do not go together."""
-    from ...io.pictures.films import FILMS, require_writable_film
-    from ...io.pictures.images import PICTURES, require_writable
-    from ...io.terrain.load import jacksboro_file
-    from ..overwriting import require_no_input
-
     if options.demo == (options.terrain is not None):
         raise UserError(f"view: IN or --demo must say what to show, {'not both' if options.demo else 'there is neither'}")
     if options.demo:
@@ -115,9 +84,6 @@ def _output(options: argparse.Namespace) -> tuple[Path, bool]:
 
 
 def run(options: argparse.Namespace) -> None:
-    from ...io.pictures.images import save_image
-    from ...io.terrain.load import load_heights
-
     output, film = _output(options)
     begin = time.perf_counter()
     terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
@@ -125,21 +91,14 @@ def run(options: argparse.Namespace) -> None:
         raise UserError(f"view: {options.terrain} holds no height")
     options.frames = options.frames or 72
     path = _sun_path(options, terrain)
-    from ...rendering.render import prepare
-    from ...scene.heightfield import Heightfield
-    from ...xla.devices import local_mesh
-    from ..block import block, exaggeration, photograph
-    from ..limits import require_memory
-    from ..progress import bar
-
     factor = options.exaggeration or exaggeration(terrain.heights, terrain.dx, terrain.dy)
     z, colours, base = _solid(options, terrain, factor)
-    arguments.set_up_jax(options)
+    limits.set_up_jax(options)
     field = Heightfield(z, terrain.dx, terrain.dy)
     frames = _frames(options, field, base, path, film)
     camera, look = frames[0]
     scene = block(field, colours, camera, look, base)
-    require_memory(scene, local_mesh().size)
+    limits.require_memory(scene, local_mesh().size)
     ready, said = prepare(scene), "{} x {} pixels".format(*options.size)
     if film:
         _film(output, ready, frames)
@@ -150,15 +109,8 @@ def run(options: argparse.Namespace) -> None:
     print(f"{output}: {said}, heights x {factor:g}, {time.perf_counter() - begin:.1f} s")
 
 
-def _solid(options: argparse.Namespace, terrain: "Terrain", factor: float) -> "tuple[np.ndarray, np.ndarray, float | None]":
+def _solid(options: argparse.Namespace, terrain: Terrain, factor: float) -> tuple[np.ndarray, np.ndarray, float | None]:
     """What `block` takes: the terrain's heights times a factor, with water on them; colours; the floor's level."""
-    import numpy as np
-
-    from ...io.pictures.images import linear_from_srgb
-    from ...io.terrain.drape import load_drape
-    from ...maps.relief import color_relief
-    from ..block import with_water
-
     z = terrain.heights.astype(options.precision)
     if options.drape is not None:
         colours = load_drape(options.drape, terrain)
@@ -180,13 +132,10 @@ def _solid(options: argparse.Namespace, terrain: "Terrain", factor: float) -> "t
 
 
 def _frames(
-    options: argparse.Namespace, field: "Heightfield", base: float | None, path: "np.ndarray | None", film: bool
-) -> "list[tuple[Perspective, Look]]":
+    options: argparse.Namespace, field: Heightfield, base: float | None, path: np.ndarray | None, film: bool
+) -> list[tuple[Perspective, Look]]:
     """A camera and a look for each frame: round the terrain, or in a moving sun, whose `path` it is; for a picture one."""
-    from ...scene.camera import Perspective
-    from ..block import Look
-
-    look = Look(**arguments.given(options, "azimuth", "altitude", "haze"), samples=_PRESETS[options.preset])
+    look = Look(**arguments.given(options, "azimuth", "altitude", "haze"), samples=PRESETS[options.preset])
     azimuth = look.azimuth - 110 if options.camera_azimuth is None else options.camera_azimuth
     around, (width, height) = film and path is None, options.size
     looks = [look] if path is None else [dataclasses.replace(look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
@@ -199,69 +148,11 @@ def _frames(
     return [(camera, look) for camera in cameras for look in looks]  # of which one is alone
 
 
-def _film(output: Path, ready: "Prepared", frames: "Sequence[tuple[Perspective, Look]]") -> None:
+def _film(output: Path, ready: Prepared, frames: Sequence[tuple[Perspective, Look]]) -> None:
     """Writes frames of a block that was prepared in the light of the first one."""
-    import numpy as np
-
-    from ...io.pictures.films import writing_film
-    from ...io.pictures.images import srgb_from_linear
-    from ..block import lights, photograph
-    from ..progress import bar
-
     with writing_film(output, 24) as add, bar(total=len(frames), unit=" frames") as shown:
         for camera, look in frames:
             lit = ready if look is frames[0][1] else ready.with_lights(lights(ready.scene.heightfields[0], look))
             image = photograph(lit, camera, look)
             add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
             shown.update()
-
-
-_DEGREES = "DEGREES"
-_PRESET = "1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]"
-_FROM = "where the camera stands, clockwise from north [110 left of the sun]"
-_SUN_FROM = "a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00"
-_RAMP = "colours by height: a gdaldem colour file, or a matplotlib colour map"
-_DRAPE = "a picture laid over it: a GeoTIFF where it lies, others from corner to corner"
-COMMAND = Command(
-    "view",
-    "show a terrain as a solid block, or fly round it",
-    examples=("--demo -o block.png", "dem.tif -o orbit.gif --size 640x400 --frames 48"),
-    options={
-        "": (
-            option("terrain", metavar="IN", nargs="?", help=f"heights: {arguments.TERRAIN}"),
-            flag("--demo", "in place of IN the Jacksboro fault, which matplotlib ships"),
-            option("-o", "--output", metavar="OUT", help=".png, .jpg, .exr, .npy; a film: .gif, .mp4 [IN's name, .png]"),
-        ),
-        "picture": (
-            option("--size", type=_size, default=(1280, 800), metavar="WxH", help="pixels [1280x800]"),
-            choice("--preset", tuple(_PRESETS), _PRESET, default="balanced"),
-            whole("--frames", "N", "of a film, 24 a second [72]", least=2),
-        ),
-        "camera": (
-            number("--from", _DEGREES, _FROM, dest="camera_azimuth"),
-            number("--above", _DEGREES, "above the horizon [35]", 35.0, dest="camera_altitude"),
-            number("--fov", _DEGREES, "angle of view [30]", 30.0),
-        ),
-        "light": (
-            number("--azimuth", _DEGREES, "of the sun, clockwise from north [315]"),
-            number("--altitude", _DEGREES, "of the sun, above the horizon [45]"),
-            option("--sun-from", type=_sun, metavar="AZ,ALT|TIME", help=_SUN_FROM),
-            option("--sun-to", type=_sun, metavar="AZ,ALT|TIME", help="and where it ends, or when"),
-            number("--latitude", _DEGREES, "for times [that of the terrain's middle]"),
-            number("--longitude", _DEGREES, "for times [that of the terrain's middle]"),
-            number("--haze", "SHARE", "of light lost along the terrain [0.15]"),
-        ),
-        "terrain": (
-            number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]", rule=POSITIVE),
-            option("--ramp", metavar="FILE|NAME", help=_RAMP),
-            option("--drape", metavar="IMAGE", help=_DRAPE),
-            number("--water", "LEVEL", "below it is water", rule=FINITE),
-            option("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet"),
-        ),
-        **arguments.RASTER,
-        **arguments.MACHINE,
-    },
-    run=run,
-    about="It is seen from a place that shows all of it. A .gif or .mp4 goes round it.",
-    placed=False,
-)
