@@ -1,6 +1,7 @@
 """The command line: how it begins and how errors end. Ctrl-C is looked after first; all else is imported after that."""
 
 import codecs
+import contextlib
 import gc
 import io
 import os
@@ -40,7 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 import_module(f".commands.{options.command.module or options.command.name}", __package__).run(options)
                 sys.stdout.flush()
     except KeyboardInterrupt as stopped:
-        print(f"\njaxhf: {str(stopped) or 'interrupted'}", file=sys.stderr)
+        print(f"\njaxhf: {str(stopped) or 'interrupted'}", file=sys.stderr, flush=True)
+        if arguments is None:  # where XLA still compiles, the end of Python may crash
+            with contextlib.suppress(OSError):
+                sys.stdout.flush()
+            os._exit(130)
         return 130
     except BrokenPipeError:  # of `jaxhf info x | head -1`: who reads has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where Python flushes the rest at the end
