@@ -39,21 +39,19 @@ class Part(NamedTuple):
         return SceneError(self.path, line_of(self.text, self.where), message)
 
     def read(self, keys: Keys) -> dict[str, Any]:
-        """The values of all `keys`, by their kinds; SceneError on any other key, and on one that is missing."""
+        """The values of those `keys` that are there, by their kinds; SceneError on any other key, and where one is needed."""
         self.require_known(keys)
         values = {}
         for name, key in keys.items():
-            if name not in self.table:
-                if key.default is ...:
-                    raise self.error(f"{self.name or 'a scene'} must have {name!r}, it is missing")
-                values[name] = key.default
-                continue
-            try:
-                values[name] = key.kind(self.table[name])
-            except (ValueError, OverflowError) as error:
-                shown = repr(self.table[name])
-                shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
-                raise self.at(name).error(f"{self.at(name).name} must be {error}, it is {shown}") from error
+            if name in self.table:
+                try:
+                    values[name] = key.kind(self.table[name])
+                except (ValueError, OverflowError) as error:
+                    shown = repr(self.table[name])
+                    shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
+                    raise self.at(name).error(f"{self.at(name).name} must be {error}, it is {shown}") from error
+            elif key.needed:
+                raise self.error(f"{self.name or 'a scene'} must have {name!r}, it is missing")
         return values
 
     def require_known(self, known: Iterable[str]) -> None:

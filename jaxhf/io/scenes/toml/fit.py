@@ -1,7 +1,7 @@
 """Reads what to recover from which pictures: a scene with tables about pictures; `docs/guides/fit-files.md` describes it."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,22 +22,21 @@ from ...pictures.images import load_image, load_numbers
 from ..pbrt.reader import load_pbrt
 from .checks import Part
 from .priors import Provenance, known_deviations, known_heights
-from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene, transfer_of
+from .scene import named_file, open_toml, read_camera, read_lights, read_samples, read_world, transfer_of
 from .tables import SCENE, Key, Keys, optional
 from .values import flag, number, numbers, or_word, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
 _CASE: Keys = {
-    "scene": Key(word, None),
+    "scene": Key(word),
     **SCENE,
-    "camera": Key(table, None),
-    "objects": Key(tables, None),
-    "pictures": Key(tables),
-    "fit": Key(table, {}),
-    "settings": Key(table, {}),
+    "camera": Key(table),
+    "objects": Key(tables),
+    "pictures": Key(tables, needed=True),
+    **optional("fit", "settings", kind=table),
 }
 _PICTURE: Keys = {
-    "image": Key(word),
+    "image": Key(word, needed=True),
     **optional("transfer", "mask", "weights", kind=word),
     **optional("noise", kind=number),
     **optional("camera", kind=table),
@@ -51,7 +50,7 @@ _FIT: Keys = {
     **optional("draws", "max_steps", kind=whole),
     **optional("prior", "unknown", kind=table),
 }
-_PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number))), **optional("length", kind=number)}
+_PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number), needed=True)), **optional("length", kind=number)}
 _UNKNOWN: Keys = {
     **optional("albedo", kind=word),
     **optional("albedo_std", "light_std", kind=number),
@@ -60,8 +59,7 @@ _UNKNOWN: Keys = {
 }
 _ARGUMENTS = {("fit",): _FIT, ("fit", "prior"): _PRIOR, ("fit", "unknown"): _UNKNOWN}
 _SETTINGS: Keys = {
-    knob.name: Key({OneOf: word, Whole: whole}.get(type(knob.metadata["rule"]), flag), None)
-    for knob in dataclasses.fields(Settings)
+    knob.name: Key({OneOf: word, Whole: whole}.get(type(knob.metadata["rule"]), flag)) for knob in dataclasses.fields(Settings)
 }
 
 
@@ -107,13 +105,13 @@ class Case:
 
 
 class _Base(NamedTuple):
-    """What the pictures have in common; the camera is made for a picture of so many rows and columns."""
+    """What the pictures have in common."""
 
-    objects: tuple[Object, ...]
-    lights: tuple[Light, ...]
-    samples: int
-    camera: Callable[[tuple[int, ...]], Camera] | None
+    objects: Sequence[Object]
+    lights: Sequence[Light]
     field: Provenance  # of the first heightfield, which the fit recovers
+    samples: int
+    view: Part | Camera | None  # the camera, or its table
 
 
 def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
@@ -126,13 +124,13 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         raise part.error("a fit must have 'pictures', those that were measured; this is a scene, for `jaxhf render`")
     values = part.read(_CASE)
     chosen = part.at("settings")
-    settings = chosen.made(Settings, **_given(chosen, _SETTINGS))
+    settings = chosen.made(Settings, **chosen.read(_SETTINGS))
     base = _base(part, values, dtype)
     if not values["pictures"]:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
     chosen = part.at("fit")
-    options, unknown = _given(chosen, _FIT), _given(chosen.at("unknown"), _UNKNOWN)
-    prior = _given(chosen.at("prior"), _PRIOR) if "prior" in options else {}
+    options, unknown = chosen.read(_FIT), chosen.at("unknown").read(_UNKNOWN)
+    prior = chosen.at("prior").read(_PRIOR) if "prior" in options else {}
     noise, *_ = (options.pop(name, None) for name in ("noise", "prior", "unknown"))
     for place, given in ((chosen, options), (chosen.at("prior"), prior)):
         for name, value in given.items():
@@ -156,44 +154,33 @@ def _picture(
     """A picture's scene, radiance, weights, noise and name; `noise` is that of the table `chosen`, for all pictures."""
     given = part.read(_PICTURE)
     target = _read(part, "image", partial(load_image, transfer=transfer_of(part)), given["image"])
-    lights = base.lights if given["lights"] is None else read_lights(part, base.field.stored)
+    lights = read_lights(part, base.field.stored) if "lights" in given else base.lights
     scene = part.made(Scene, base.objects, _camera(part, base, target.shape[:2]), lights, base.samples)
     weights = _weights(part, given, target)
-    place, noise = (chosen, noise) if given["noise"] is None else (part, given["noise"])
+    place, noise = (part, given["noise"]) if "noise" in given else (chosen, noise)
     if noise is not None and not noise > 0:
         place = place.at("noise")
         raise place.error(f"{place.name} must be positive, it is {noise:g}")
     return scene, target, weights, noise, given["image"]
 
 
-def _given(part: Part, keys: Keys) -> dict[str, Any]:
-    return {name: value for name, value in part.read(keys).items() if name in part.table}
-
-
 def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
-    if values["scene"] is None:
-        if values["objects"] is None:
-            raise part.error("a fit must have 'scene', the name of a scene file, or 'objects', both are missing")
-        return _toml_base(part, values["samples"], dtype)
-    for name in SCENE:
-        if name in part.table:
-            raise part.at(name).error(f"{name} must stand without scene, whose file has its own")
-    place = part.at("scene")
-    path = place.made(named_file, part, values["scene"])
-    if place.made(by_ending, {".toml": True, ".pbrt": False}, path, "read a scene from"):
-        other = open_toml(path)
-        return _toml_base(other, read_scene(other)["samples"], dtype)
-    scene = load_pbrt(path, dtype)
-    fields = (Provenance.of(item.shape) for item in scene.objects if isinstance(item.shape, Heightfield))
-    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, next(fields, Provenance()))
-
-
-def _toml_base(part: Part, samples: int, dtype: np.dtype) -> _Base:
-    objects = read_objects(part, dtype)
-    camera = partial(_sized, part.at("camera")) if "camera" in part.table else None
-    field = next((field for _, field in objects if field is not None), Provenance())
-    lights = read_lights(part, field.stored)
-    return _Base(tuple(item for item, _ in objects), tuple(lights), samples, camera, field)
+    samples = values.get("samples", 1)
+    if "scene" in values:
+        for name in SCENE:
+            if name in part.table:
+                raise part.at(name).error(f"{name} must stand without scene, whose file has its own")
+        place = part.at("scene")
+        path = place.made(named_file, part, values["scene"])
+        if place.made(by_ending, {".toml": False, ".pbrt": True}, path, "read a scene from"):
+            scene = load_pbrt(path, dtype)
+            fields = (Provenance.of(item.shape) for item in scene.objects if isinstance(item.shape, Heightfield))
+            return _Base(scene.objects, scene.lights, next(fields, Provenance()), scene.samples, scene.camera)
+        part = open_toml(path)
+        samples = read_samples(part)
+    elif "objects" not in values:
+        raise part.error("a fit must have 'scene', the name of a scene file, or 'objects', both are missing")
+    return _Base(*read_world(part, dtype), samples, part.at("camera") if "camera" in part.table else None)
 
 
 def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any:
@@ -217,26 +204,19 @@ def _weights(picture: Part, given: dict[str, Any], target: np.ndarray) -> Float3
 
 
 def _camera(picture: Part, base: _Base, size: tuple[int, ...]) -> Camera:
-    if "camera" in picture.table:
-        camera = _sized(picture.at("camera"), size)
-    elif base.camera is not None:
-        camera = base.camera(size)
-    else:
+    """The camera of a picture with so many rows and columns, which are its own where its table states none."""
+    view, (height, width) = picture.at("camera") if "camera" in picture.table else base.view, size
+    if view is None:
         raise picture.error(f"{picture.name} must have a camera: there is none for all pictures")
-    height, width = size
+    if isinstance(view, Part) and view.table.keys().isdisjoint(("width", "height")):
+        view = view._replace(table={**view.table, "height": height, "width": width})
+    camera = read_camera(view) if isinstance(view, Part) else view
     if height != round(width * camera.height / camera.width) and width != round(height * camera.width / camera.height):
         stated = _by((camera.height, camera.width))
         raise picture.at("image").error(
             f"{picture.name}.image must have the proportions of its camera, {stated}; it is {_by(size)}"
         )
     return dataclasses.replace(camera, width=width, height=height)
-
-
-def _sized(view: Part, size: tuple[int, ...]) -> Camera:
-    """A camera that has the size of its picture where its table states none."""
-    if "width" in view.table or "height" in view.table:
-        return read_camera(view)
-    return read_camera(view._replace(table={**view.table, "height": size[0], "width": size[1]}))
 
 
 def _by(size: tuple[int, ...]) -> str:
