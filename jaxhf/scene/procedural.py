@@ -90,7 +90,7 @@ def bumps(
 
 
 def grid(size: Sequence[int], lines: int = 10) -> Float[np.ndarray, "h w 3"]:
-    """A texture that shows (u, v): `lines` cells a side, redder along u, greener along v, with a red axis v = 0, a green u = 0."""
+    """A texture that shows (u, v): `lines` cells a side, redder along u, greener along v; the axes are red and green."""
     require("", "lines", lines, Whole(1))
     u, v = _texel_centres(size)
     h, w = size
