@@ -31,21 +31,15 @@ _KINDS = {
 
 
 def by_ending(codecs: Mapping[str, Codec], path: Path, task: str) -> Codec:
-    """What does `task` for the ending of `path`; FileError where nothing does."""
+    """What does `task` for the ending of `path`; FileError where nothing does, with the one that was meant, or all that do."""
     ending = path.suffix.lower()
-    if ending not in codecs:
-        named = f"the ending {path.suffix!r}" if ending else "a name without an ending"
-        raise FileError(f"{path}: cannot {task} {named}; {_fitting(ending, codecs, task)}")
-    return codecs[ending]
-
-
-def _fitting(ending: str, known: Iterable[str], task: str) -> str:
-    """A tail for an error about an ending: the one that was meant; all that would do, where it is another kind of file."""
-    known = sorted(known)
-    if ending not in _KINDS:
-        return nearest(ending, known, cutoff=0.7)
-    is_other = task.startswith("read") and _KINDS[ending] not in map(_KINDS.get, known)
-    return f"known: {', '.join(known)}" + is_other * f"; this is {_KINDS[ending]}"
+    if ending in codecs:
+        return codecs[ending]
+    named = f"the ending {path.suffix!r}" if ending else "a name without an ending"
+    tail = f"known: {', '.join(sorted(codecs))}" if ending in _KINDS else nearest(ending, codecs, cutoff=0.7)
+    if task.startswith("read") and ending in _KINDS and _KINDS[ending] not in map(_KINDS.get, codecs):
+        tail += f"; this is {_KINDS[ending]}"
+    raise FileError(f"{path}: cannot {task} {named}; {tail}")
 
 
 def file_path(owner: str, path: Any) -> Path:

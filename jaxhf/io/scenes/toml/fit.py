@@ -21,7 +21,7 @@ from ...files import PathLike, by_ending, require_file, require_precision
 from ...pictures.images import load_image, load_numbers
 from ..pbrt.reader import load_pbrt
 from .checks import Part
-from .priors import Provenance, known_deviations, known_heights
+from .priors import Provenance, known_heights
 from .scene import named_file, open_toml, read_camera, read_lights, read_samples, read_world, transfer_of
 from .tables import SCENE, Key, Keys, optional
 from .values import flag, number, numbers, or_word, table, tables, whole, word
@@ -135,8 +135,7 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     for place, given in ((chosen, options), (chosen.at("prior"), prior)):
         for name, value in given.items():
             if isinstance(value, str):
-                reader = known_deviations if name == "std" else known_heights
-                given[name] = _read(place, name, partial(reader, base.field), value)
+                given[name] = _read(place, name, partial(known_heights, base.field, name == "std"), value)
     pictures = [_picture(picture, base, chosen, noise) for picture in part.all("pictures")]
     scenes, targets, weights, noises, names = zip(*pictures, strict=True)
     known = [value for value in noises if value is not None]

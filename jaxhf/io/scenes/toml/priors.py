@@ -58,8 +58,8 @@ class Provenance:
         return self.stored if same else self.placed
 
 
-def known_heights(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
-    """Heights as `start` and `prior` of `fit` take them.
+def known_heights(field: Provenance, deviations: bool, path: Path) -> Float[np.ndarray, "my mx"]:
+    """Heights as `start` and `prior` of `fit` take them, or their standard `deviations`, which have no sign.
 
     If the file and the terrain both have a `crs`: its heights, resampled to the terrain's vertices. Else the heights of the
     file as they are, which `fit` stretches over the terrain from corner to corner.
@@ -67,7 +67,8 @@ def known_heights(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
     Raises:
       FileNotFoundError, ValueError: as `load_heights`; or the file does not cover the terrain, or has holes in it.
     """
-    terrain = read_terrain(path, field.z_scale, field.nodata, nodata_overrules=False)
+    z_scale = abs(field.z_scale) if deviations else field.z_scale
+    terrain = read_terrain(path, z_scale, field.nodata, nodata_overrules=False)
     heights, grid = terrain.heights, field.grid(path, terrain)
     if terrain.crs is not None and grid is not None and grid.crs is not None:
         if terrain.crs.degrees and not grid.crs.degrees:
@@ -80,8 +81,3 @@ def known_heights(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
             f"it must have a height everywhere, {len(holes)} of {heights.size} are holes; the first is row {iy} column {ix}"
         )
     return heights
-
-
-def known_deviations(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
-    """Standard deviations of such heights; they have no sign."""
-    return known_heights(dataclasses.replace(field, z_scale=abs(field.z_scale)), path)
