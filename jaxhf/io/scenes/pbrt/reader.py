@@ -48,7 +48,7 @@ def load_pbrt(path: Path, dtype: DTypeLike = np.float32) -> Scene:
         raise SceneError(path, max(1, len(text.splitlines())), "the file ends without a WorldBegin")
     if reader.block == "world":
         raise reader.world.error("this WorldBegin has no WorldEnd")
-    return reader.scene()
+    return Scene(reader.objects, reader.view, reader.lights, reader.samples)
 
 
 def _read_text(path: Path) -> str:
@@ -78,6 +78,7 @@ class _Reader:
     resolution: tuple[int, int] = (640, 480)
     samples: int = 4  # of the "lowdiscrepancy" sampler that pbrt-v2 takes where a scene names none
     camera: Arguments | None = None
+    view: Perspective = field(init=False)  # from WorldBegin on
     objects: list[Object] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
 
@@ -87,13 +88,6 @@ class _Reader:
             with located(statement.word):
                 self._execute(statement)
         self.files.pop()
-
-    def scene(self) -> Scene:
-        assert self.camera is not None, "WorldBegin demands a camera"
-        width, height = self.resolution
-        with located(self.camera.word):
-            camera = Perspective(self.frames["camera"], self.camera["float fov"], width=width, height=height)
-        return Scene(objects=tuple(self.objects), camera=camera, lights=tuple(self.lights), samples=self.samples)
 
     def _execute(self, statement: Statement) -> None:
         word = statement.word
@@ -121,7 +115,10 @@ class _Reader:
             case "CoordinateSystem":
                 self.frames[statement.name().name()] = self.matrix
             case "CoordSysTransform":
-                self._enter_frame(statement.name())
+                frame = statement.name()
+                if frame.name() not in self.frames:
+                    raise frame.error(f"unknown coordinate system {frame}; {nearest(frame.name(), self.frames)}")
+                self.matrix = self.frames[frame.name()]
             case "Texture":
                 self._declare_texture(statement)
             case "Film":
@@ -155,6 +152,8 @@ class _Reader:
     def _world_begin(self, word: Token) -> None:
         if self.camera is None:
             raise word.error("there must be a Camera before WorldBegin")
+        with located(self.camera.word):
+            self.view = Perspective(self.frames["camera"], self.camera["float fov"], *self.resolution)
         self.block, self.world = "world", word
         self.matrix = self.frames["world"] = np.eye(4)
 
@@ -190,11 +189,6 @@ class _Reader:
                 matrix = self.matrix @ matrix
                 require("", "the current transformation", matrix, invertible)
             self.matrix = matrix
-
-    def _enter_frame(self, name: Token) -> None:
-        if name.name() not in self.frames:
-            raise name.error(f"unknown coordinate system {name}; {nearest(name.name(), self.frames)}")
-        self.matrix = self.frames[name.name()]
 
     # The parts of the scene.
 
