@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ....core.errors import ArgumentError, UserError
-from ...errors import SceneError, nearest
+from ...errors import SceneError, nearest, resolve_inside
 from .lines import Where, follow, line_of
 from .tables import Keys
 
@@ -89,6 +89,11 @@ class Part(NamedTuple):
         if len(present) > 1:
             raise self.at(second).error(f"{self.name} must have {first} or {second}, it has both")
         return present[0] if present else None
+
+    def file(self, key: str, reader: Callable[[Path], Any]) -> Any:
+        """What `reader` makes of the file whose name is the value of `key`."""
+        folder = self.path.parent
+        return self.at(key).made(lambda: reader(resolve_inside(folder, folder, self.table[key])))
 
     def made(self, function: Callable[..., Any], *args: Any, **values: Any) -> Any:
         """function(*args, **values); what the user got wrong becomes a SceneError, on the line of the key that is to blame."""

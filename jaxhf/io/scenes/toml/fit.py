@@ -1,7 +1,7 @@
 """Reads what to recover from which pictures: a scene with tables about pictures; `docs/guides/fit-files.md` describes it."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,13 +18,13 @@ from ....scene.heightfield import Heightfield
 from ....scene.light import Light
 from ....scene.scene import Object, Scene
 from ...files import PathLike, by_ending, require_file, require_precision
-from ...pictures.images import load_image, load_numbers
+from ...pictures.images import load_numbers
 from ..pbrt.reader import load_pbrt
 from .checks import Part
 from .priors import Provenance, known_heights
-from .scene import named_file, open_toml, read_camera, read_lights, read_samples, read_world, transfer_of
+from .scene import open_toml, read_camera, read_image, read_lights, read_samples, read_world
 from .tables import SCENE, Key, Keys, optional
-from .values import flag, number, numbers, or_word, table, tables, whole, word
+from .values import flag, number, numbers, or_word, positive, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
 _CASE: Keys = {
@@ -38,7 +38,7 @@ _CASE: Keys = {
 _PICTURE: Keys = {
     "image": Key(word, needed=True),
     **optional("transfer", "mask", "weights", kind=word),
-    **optional("noise", kind=number),
+    **optional("noise", kind=positive),
     **optional("camera", kind=table),
     **optional("lights", kind=tables),
 }
@@ -46,7 +46,7 @@ _ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argu
 # Those of `fit`, `Prior`, `Unknown` and `Settings`, whose defaults they have and who check their values.
 _FIT: Keys = {
     **optional("start", kind=or_word(number)),
-    **optional("noise", kind=number),
+    **optional("noise", kind=positive),
     **optional("draws", "max_steps", kind=whole),
     **optional("prior", "unknown", kind=table),
 }
@@ -135,8 +135,8 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     for place, given in ((chosen, options), (chosen.at("prior"), prior)):
         for name, value in given.items():
             if isinstance(value, str):
-                given[name] = _read(place, name, partial(known_heights, base.field, name == "std"), value)
-    pictures = [_picture(picture, base, chosen, noise) for picture in part.all("pictures")]
+                given[name] = place.file(name, partial(known_heights, base.field, name == "std"))
+    pictures = [_picture(picture, base, noise) for picture in part.all("pictures")]
     scenes, targets, weights, noises, names = zip(*pictures, strict=True)
     known = [value for value in noises if value is not None]
     if known and len(known) < len(noises):
@@ -147,20 +147,13 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     )  # fmt: skip
 
 
-def _picture(
-    part: Part, base: _Base, chosen: Part, noise: float | None
-) -> tuple[Scene, np.ndarray, np.ndarray | None, float | None, str]:
-    """A picture's scene, radiance, weights, noise and name; `noise` is that of the table `chosen`, for all pictures."""
+def _picture(part: Part, base: _Base, noise: float | None) -> tuple[Scene, np.ndarray, np.ndarray | None, float | None, str]:
+    """A picture's scene, radiance, weights, noise and name; `noise` is that of pictures that state none."""
     given = part.read(_PICTURE)
-    target = _read(part, "image", partial(load_image, transfer=transfer_of(part)), given["image"])
+    target = read_image(part)
     lights = read_lights(part, base.field.stored) if "lights" in given else base.lights
     scene = part.made(Scene, base.objects, _camera(part, base, target.shape[:2]), lights, base.samples)
-    weights = _weights(part, given, target)
-    place, noise = (part, given["noise"]) if "noise" in given else (chosen, noise)
-    if noise is not None and not noise > 0:
-        place = place.at("noise")
-        raise place.error(f"{place.name} must be positive, it is {noise:g}")
-    return scene, target, weights, noise, given["image"]
+    return scene, target, _weights(part, target), given.get("noise", noise), given["image"]
 
 
 def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
@@ -170,7 +163,7 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
             if name in part.table:
                 raise part.at(name).error(f"{name} must stand without scene, whose file has its own")
         place = part.at("scene")
-        path = place.made(named_file, part, values["scene"])
+        path = part.file("scene", Path)
         if place.made(by_ending, {".toml": False, ".pbrt": True}, path, "read a scene from"):
             scene = load_pbrt(path, dtype)
             fields = (Provenance.of(item.shape) for item in scene.objects if isinstance(item.shape, Heightfield))
@@ -182,19 +175,14 @@ def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
     return _Base(*read_world(part, dtype), samples, part.at("camera") if "camera" in part.table else None)
 
 
-def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any:
-    """What `reader` makes of the file whose `name` is the value of `key`."""
-    return part.at(key).made(lambda: reader(named_file(part, name)))
-
-
-def _weights(picture: Part, given: dict[str, Any], target: np.ndarray) -> Float32[np.ndarray, "h w"] | None:
+def _weights(picture: Part, target: np.ndarray) -> Float32[np.ndarray, "h w"] | None:
     present = picture.at_most_one("mask", "weights")
     size = target.shape[:2]
-    declares = Path(given["image"]).suffix.lower() in (".tif", ".tiff")  # a nan elsewhere is for `fit` to refuse
+    declares = Path(picture.table["image"]).suffix.lower() in (".tif", ".tiff")  # a nan elsewhere is for `fit` to refuse
     there = ~np.isnan(target[..., 0]) if declares else np.ones(size, bool)
     if present is None:
         return None if there.all() else there.astype(np.float32)
-    weights = _read(picture, present, load_numbers, given[present]).mean(axis=-1)
+    weights = picture.file(present, load_numbers).mean(axis=-1)
     if weights.shape != size:
         place = picture.at(present)
         raise place.error(f"{place.name} must have the size of the image, {_by(size)}; it is {_by(weights.shape)}")

@@ -4,6 +4,7 @@ Which keys there are stands in `tables.py`; any other key, a value of another ty
 are errors.
 """
 
+import functools
 import re
 import tomllib
 import warnings
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
 from ....core.affine import invertible
@@ -24,7 +26,7 @@ from ....scene.heightfield import Heightfield
 from ....scene.light import Directional, Light
 from ....scene.scene import Object, Scene
 from ....scene.texture import ImageTexture, Wrap
-from ...errors import SceneError, nearest, resolve_inside
+from ...errors import SceneError, nearest
 from ...pictures.images import TRANSFERS, load_image
 from ...terrain.load import jacksboro_file, read_terrain
 from ...terrain.terrain import Terrain
@@ -103,44 +105,40 @@ def _variant(part: Part, key: str, variants: Any) -> Any:
     """What the function makes that the value of `key` chooses from `variants`."""
     function, keys = variants[part.choice(key, variants)]
     values = part.read({key: Key(word), **keys})
-    return part.made(function, **{name: values[name] for name in keys if name in values})
+    del values[key]
+    return part.made(function, **values)
 
 
 def _texture(part: Part) -> ImageTexture:
     if part.one_of(("image", "source"), {key for _, keys in TEXTURES.values() for key in keys}) == "source":
         return ImageTexture(_variant(part, "source", TEXTURES))
-    name = part.read(optional("image", "transfer", "wrap", kind=word))["image"]
-    transfer, wrap = transfer_of(part), part.choice("wrap", get_args(Wrap), "repeat")
+    part.read(optional("image", "transfer", "wrap", kind=word))
+    image, wrap = read_image(part), part.choice("wrap", get_args(Wrap), "repeat")
     # An image starts at its top, a texture at v = 0: so it lies on a map with the north up.
-    image = part.at("image").made(lambda: load_image(named_file(part, name), transfer=transfer)[::-1])
-    return part.at("image").made(ImageTexture, image, wrap=wrap)
+    return part.at("image").made(ImageTexture, image[::-1], wrap=wrap)
 
 
-def transfer_of(part: Part) -> str | None:
-    """What the table of an image says of its whole numbers, see `load_image`."""
-    return part.choice("transfer", TRANSFERS) if "transfer" in part.table else None
-
-
-def named_file(part: Part, name: str) -> Path:
-    return resolve_inside(part.path.parent, part.path.parent, name)
+def read_image(part: Part) -> Float32[np.ndarray, "h w 3"]:
+    """The picture that a table names; it may say what the whole numbers in it are, see `load_image`."""
+    transfer = part.choice("transfer", TRANSFERS) if "transfer" in part.table else None
+    return part.file("image", functools.partial(load_image, transfer=transfer))
 
 
 def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> tuple[Object, Provenance | None]:
     is_field = part.choice("shape", ("heightfield", "cylinder")) == "heightfield"
     make_material, material_keys = MATERIALS[part.choice("material", MATERIALS, "matte")]
     common: Keys = {**OBJECT, **material_keys}
-    shape_keys = _field_keys(part, common) if is_field else CYLINDER
-    values = part.read({**common, **shape_keys})
+    values = part.read({**common, **(_field_keys(part, common) if is_field else CYLINDER)})
     given = part.at_most_one("transform", "matrix")
     world = values[given] if given else None
     if given:
         part.made(require, "", given, world, invertible)
-    paint = {name: _painted(part.at(name), values[name], textures) for name in material_keys if name in values}
+    paint = {name: _painted(part.at(name), values[name], textures) for name in material_keys & values.keys()}
     material = part.made(make_material, **paint)
     if is_field:
         shape, known = part.made(_heightfield, part, values, dtype)
     else:
-        shape, known = part.made(Cylinder, **{name: values[name] for name in shape_keys if name in values}), None
+        shape, known = part.made(Cylinder, **{name: values[name] for name in CYLINDER & values.keys()}), None
     return Object(shape, material, world), known
 
 
@@ -166,14 +164,13 @@ def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> tuple[H
     grid = {name: values[name] for name in ("dx", "dy", "x0", "y0") if name in values}
     if "file" in values or source == "jacksboro":
 
-        def load() -> Provenance:
-            path = named_file(part, values["file"]) if "file" in values else None
+        def load(path: Path | None = None) -> Provenance:
             stored = read_terrain(path or jacksboro_file(), z_scale, values.get("nodata"))
             return Provenance(stored.in_metres(**grid), stored, path, bool(grid), z_scale, values.get("nodata"))
 
-        known = part.at("source" if source else "file").made(load)
+        known = part.at("source").made(load) if source else part.file("file", load)
         return known.placed.heightfield(dtype), known
-    chosen = {name: values[name] for name in HEIGHTS[source] if name in values} if source else {}
+    chosen = {name: values[name] for name in HEIGHTS[source] & values.keys()} if source else {}
     heights = procedural.HEIGHTS[source](**chosen) if source else values["heights"]
     field = Heightfield(fitted(heights * z_scale, dtype), **grid)
     return field, Provenance.of(field, grid, z_scale)

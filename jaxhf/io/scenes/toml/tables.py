@@ -21,7 +21,7 @@ class Key(NamedTuple):
     needed: bool = False
 
 
-Keys = Mapping[str, Key]
+Keys = dict[str, Key]
 
 
 def optional(*names: str, kind: kinds.Kind | None = None) -> Keys:

@@ -68,6 +68,7 @@ def number(value: Any) -> float:
     return _in_range(value)
 
 
+positive = _kind(lambda value: number(value) > 0, "positive")
 angle_above_horizon = _kind(lambda value: -90 <= number(value) <= 90, "from -90 to 90 degrees")
 
 
