@@ -74,13 +74,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def require_folder(path: Path, what: str) -> None:
-    """Checks that a file can be put where `path` says.
-
-    Raises:
-      FileNotFoundError: the folder does not exist.
-      FileError: `path` is a folder itself.
-      PermissionError: the folder cannot be written to.
-    """
+    """Checks that a file can be put where `path` says: into a folder that is there and can be written to."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {str(path.parent)!r}")
     if path.is_dir():
@@ -93,9 +87,7 @@ def require_folder(path: Path, what: str) -> None:
 def replacing(path: Path, beside: Mapping[Path, str] | None = None) -> Iterator[Path]:
     """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong.
 
-    Args:
-      path: the file.
-      beside: small text files that go with it, and their contents, which are written before any file takes its place.
+    Small text files that go `beside` it, given with their contents, are written before any file takes its place.
     """
     beside = beside or {}
     with replacing_all([path, *beside]) as (temporary, *others):
