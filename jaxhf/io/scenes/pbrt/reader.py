@@ -93,11 +93,9 @@ class _Reader:
         word = statement.word
         if word.text not in _BLOCKS:
             raise word.error(f"unknown directive {str(word)!r}; {nearest(word.text[:60], _BLOCKS)}")
-        if self.block == "end":
-            raise word.error(f"{word} must not follow WorldEnd")
-        if _BLOCKS[word.text] not in ("any", self.block):
-            late = self.world is not None
-            raise word.error(f"{word} must {'not ' if late else ''}follow WorldBegin")
+        if self.block == "end" or _BLOCKS[word.text] not in ("any", self.block):
+            rules = {"options": "follow WorldBegin", "world": "not follow WorldBegin", "end": "not follow WorldEnd"}
+            raise word.error(f"{word} must {rules[self.block]}")
         match word.text:
             case "AttributeBegin" | "TransformBegin":
                 self.saved.append((statement.nothing(), self.matrix, self.material, self.textures))
@@ -236,18 +234,17 @@ class _Reader:
         with located(args.word):
             if args.kind == "mirror":
                 return Mirror(args["color Kr"])
-            return Matte(args["color Kd"] if args["texture Kd"] is None else self._texture(args))
-
-    def _texture(self, args: Arguments) -> ImageTexture:
-        name, known = args["texture Kd"], self.textures
-        if name not in known:
-            hint = nearest(name[:60], known) if known else "there is none"
-            raise args.error("texture Kd", f"unknown texture {name!r}; {hint}")
-        path, place = known[name]
-        if path not in self.images:
-            with located(place):
-                self.images[path] = ImageTexture(load_image(path, transfer="srgb"))
-        return self.images[path]
+            name, known = args["texture Kd"], self.textures
+            if name is None:
+                return Matte(args["color Kd"])
+            if name not in known:
+                hint = nearest(name[:60], known) if known else "there is none"
+                raise args.error("texture Kd", f"unknown texture {name!r}; {hint}")
+            path, place = known[name]
+            if path not in self.images:
+                with located(place):
+                    self.images[path] = ImageTexture(load_image(path, transfer="srgb"))
+            return Matte(self.images[path])
 
 
 def _heightfield(args: Arguments, dtype: np.dtype) -> Heightfield:
