@@ -185,11 +185,6 @@ def require_writable(owner: str, what: str, endings: Iterable[str], path: PathLi
     return path
 
 
-def require_writable_text(path: PathLike, ending: str) -> Path:
-    """As `require_writable`, for `save_text` and one ending."""
-    return require_writable("save_text", "a page", (ending,), path)
-
-
 def save_text(path: PathLike, text: str) -> None:
     """Writes a text as UTF-8; the file appears whole or not at all."""
     with replacing(Path(path)) as temporary:

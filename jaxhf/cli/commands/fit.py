@@ -79,13 +79,13 @@ def run(options: argparse.Namespace) -> None:
 def _require_writable(options: argparse.Namespace, *heights: Path) -> None:
     """Refuses before the fit what could not be written after it."""
     from ...core.extras import import_extra
-    from ...io.files import require_writable_text
+    from ...io.files import require_writable
     from ...io.terrain.save import require_writable_heights
 
     for path in heights:
         require_writable_heights(path, (".npy", ".npz", ".tif", ".tiff"))  # which hold any heights, and holes
     if options.report:
-        require_writable_text(options.report, ".html")
+        require_writable("save_text", "a page", (".html",), options.report)
         import_extra("matplotlib", "a report needs", "plot")
 
 

@@ -2,7 +2,6 @@
 
 import importlib
 import math
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -29,12 +28,7 @@ def load_drape(path: PathLike, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
     path = require_file(path)
     if path.suffix.lower() not in (".tif", ".tiff"):
         return load_image(path, transfer="srgb")[::-1]
-    with reading(path):
-        return _placed(path, terrain)
-
-
-def _placed(path: Path, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
-    with opened(path) as dataset:
+    with reading(path), opened(path) as dataset:
         rasterio = importlib.import_module("rasterio")
         if dataset.count not in (1, 3, 4) or set(dataset.dtypes) != {"uint8"}:
             raise FileError(f"it must have 1, 3 or 4 bands of bytes, it has {dataset.count} of {dataset.dtypes[0]}")

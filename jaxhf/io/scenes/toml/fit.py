@@ -11,7 +11,6 @@ from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
 from ....core.errors import ArgumentError, UserError
-from ....core.rules import OneOf, Whole
 from ....core.settings import Settings
 from ....scene.camera import Camera
 from ....scene.heightfield import Heightfield
@@ -43,7 +42,7 @@ _PICTURE: Keys = {
     **optional("lights", kind=tables),
 }
 _ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argument of `fit` is in such a table
-# Those of `fit`, `Prior`, `Unknown` and `Settings`, whose defaults they have and who check their values.
+# Those of `fit`, `Prior` and `Unknown`, whose defaults they have and who check their values.
 _FIT: Keys = {
     **optional("start", kind=or_word(number)),
     **optional("noise", kind=positive),
@@ -58,9 +57,6 @@ _UNKNOWN: Keys = {
     **optional("camera_std", kind=numbers(2)),
 }
 _ARGUMENTS = {("fit",): _FIT, ("fit", "prior"): _PRIOR, ("fit", "unknown"): _UNKNOWN}
-_SETTINGS: Keys = {
-    knob.name: Key({OneOf: word, Whole: whole}.get(type(knob.metadata["rule"]), flag)) for knob in dataclasses.fields(Settings)
-}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -124,7 +120,8 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         raise part.error("a fit must have 'pictures', those that were measured; this is a scene, for `jaxhf render`")
     values = part.read(_CASE)
     chosen = part.at("settings")
-    settings = chosen.made(Settings, **chosen.read(_SETTINGS))
+    chosen.require_known([knob.name for knob in dataclasses.fields(Settings)])
+    settings = chosen.made(Settings, **chosen.table)
     base = _base(part, values, dtype)
     if not values["pictures"]:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
