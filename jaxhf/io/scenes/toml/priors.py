@@ -23,14 +23,14 @@ class Provenance:
       placed: where the scene puts it; None: there is no heightfield.
       stored: its file, in that file's coordinates; None: there is none.
       path: that file.
-      moved: whether its table has any of dx, dy, x0 and y0.
+      like: that, where it is a GeoTIFF whose georeference the heights have: the table moves it by none of dx, dy, x0 and y0.
       z_scale, nodata: of its table, or their defaults.
     """
 
     placed: Terrain | None = None
     stored: Terrain | None = None
     path: Path | None = None
-    moved: bool = False
+    like: Path | None = None
     z_scale: float = 1.0
     nodata: float | None = None
 
@@ -39,11 +39,6 @@ class Provenance:
         """That of heights in no file. They have a `crs` if `grid`, the keys of their table, has x0, y0 and the cell size."""
         crs = CoordinateSystem() if {"x0", "y0"} <= set(grid) and not {"dx", "dy"}.isdisjoint(grid) else None
         return cls(Terrain(np.asarray(field.heights), field.dx, field.dy, field.x0, field.y0, crs), z_scale=z_scale)
-
-    @property
-    def like(self) -> Path | None:
-        """The GeoTIFF whose georeference the heights have; None: there is none."""
-        return self.path if self.path and not self.moved and self.path.suffix.lower() in (".tif", ".tiff") else None
 
     def grid(self, path: Path, other: Terrain) -> Terrain | None:
         """Its grid in coordinates that can be compared with those of `other`, which is the file `path`.

@@ -166,7 +166,8 @@ def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> tuple[H
 
         def load(path: Path | None = None) -> Provenance:
             stored = read_terrain(path or jacksboro_file(), z_scale, values.get("nodata"))
-            return Provenance(stored.in_metres(**grid), stored, path, bool(grid), z_scale, values.get("nodata"))
+            like = path if path and not grid and path.suffix.lower() in (".tif", ".tiff") else None
+            return Provenance(stored.in_metres(**grid), stored, path, like, z_scale, values.get("nodata"))
 
         known = part.at("source").made(load) if source else part.file("file", load)
         return known.placed.heightfield(dtype), known
