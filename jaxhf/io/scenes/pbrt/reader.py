@@ -197,7 +197,8 @@ class _Reader:
         if args["bool jitter"]:
             raise args.error("bool jitter", 'jitter must be "false": jittered samples, the default, are not supported')
         side = args["integer xsamples"]
-        args.require("integer ysamples", args["integer ysamples"] == side, f"equal xsamples, {side}")
+        if args["integer ysamples"] != side:
+            raise args.error("integer ysamples", f"ysamples must equal xsamples, {side}, it is {args['integer ysamples']}")
         self.samples = side * side
 
     def _light_source(self, args: Arguments) -> None:

@@ -72,10 +72,6 @@ class Arguments:
         """An error where that parameter's value stands, else at the directive."""
         return self.tokens.get(declared, self.word).error(message, k)
 
-    def require(self, declared: str, valid: bool, rule: str) -> None:
-        if not valid:
-            raise self.error(declared, f"{declared.split()[1]} must {rule}, it is {self.values[declared]}")
-
 
 @dataclass(frozen=True)
 class Statement:
@@ -146,27 +142,21 @@ class Statement:
         for declared, value in values.items():
             if value is ...:
                 raise word.error(f"{word} {kind} must have a parameter {declared!r}")
-        found = Arguments(word, kind.name(), values, tokens)
-        for declared, (holds, rule) in _RULES.items():
-            if declared in tokens:
-                found.require(declared, bool(holds(values[declared])), rule)
-        return found
+        return Arguments(word, kind.name(), values, tokens)
 
 
 def statements(path: Path, text: str) -> Iterator[Statement]:
     """Splits `text` at its directives, known or not."""
-    word, rest = None, []
+    found: list[Token] = []
     for token in tokenize(path, text):
-        if token.kind != "word":
-            if word is None:
-                raise token.error(f"a directive must come first, found {token}")
-            rest.append(token)
-            continue
-        if word is not None:
-            yield Statement(word, tuple(rest))
-        word, rest = token, []
-    if word is not None:
-        yield Statement(word, tuple(rest))
+        if token.kind == "word" and found:
+            yield Statement(found[0], tuple(found[1:]))
+            found = []
+        elif token.kind != "word" and not found:
+            raise token.error(f"a directive must come first, found {token}")
+        found.append(token)
+    if found:
+        yield Statement(found[0], tuple(found[1:]))
 
 
 def _declared(place: str, token: Token, table: Parameters) -> str:
@@ -199,9 +189,11 @@ def _value(declared: str, token: Token) -> Any:
         raise token.error(f"{declared!r} must be finite, it is {token}")
     if kind == "integer" and not values[0].is_integer():
         raise token.error(f"{declared!r} must be a whole number, it is {values[0]}")
-    if count > 1:
-        return values
-    return int(values[0]) if kind == "integer" else float(values[0])
+    value = values if count > 1 else int(values[0]) if kind == "integer" else float(values[0])
+    holds, rule = _RULES.get(declared, (None, ""))
+    if holds is not None and not holds(value):
+        raise token.error(f"{declared.split()[1]} must {rule}, it is {value}")
+    return value
 
 
 def _amount(count: int | None, is_text: bool) -> str:
