@@ -29,7 +29,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(arguments)
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides
             warnings.showwarning = lambda message, *_, **__: print(
                 f"jaxhf: warning: {' '.join(str(message).split())}", file=sys.stderr
             )

@@ -7,7 +7,6 @@ are errors.
 import functools
 import re
 import tomllib
-import warnings
 from pathlib import Path
 from typing import Any, get_args
 
@@ -23,7 +22,7 @@ from ....scene import procedural
 from ....scene.camera import Camera
 from ....scene.cylinder import Cylinder
 from ....scene.heightfield import Heightfield
-from ....scene.light import Directional, Light
+from ....scene.light import Light
 from ....scene.scene import Object, Scene
 from ....scene.texture import ImageTexture, Wrap
 from ...errors import SceneError, nearest
@@ -94,11 +93,7 @@ def _light(part: Part, terrain: Terrain | None) -> Light:
             )
         latitude, longitude = part.made(lambda: terrain.place)
         part = part._replace(table={**part.table, "latitude": latitude, "longitude": longitude})
-    light = _variant(part, "type", LIGHTS)
-    if isinstance(light, Directional) and "radiance" in part.table:
-        old = part.at("radiance")
-        warnings.warn(str(old.error(f"{old.name} is now called irradiance")), DeprecationWarning, stacklevel=2)
-    return light
+    return _variant(part, "type", LIGHTS)
 
 
 def _variant(part: Part, key: str, variants: Any) -> Any:

@@ -30,10 +30,6 @@ def optional(*names: str, kind: kinds.Kind | None = None) -> Keys:
 
 
 def _directional(kind: type[Directional] = Directional, **given) -> Directional:
-    if "radiance" in given:
-        if "irradiance" in given:
-            raise ArgumentError("", "radiance", "must stand without irradiance, whose old name it is")
-        given["irradiance"] = given.pop("radiance")
     ways = [keys for keys in (("towards",), ("azimuth", "altitude"), ("time", "latitude", "longitude")) if given.keys() & keys]
     if len(ways) > 1:
         first, *_ = given.keys() & ways[0]
@@ -91,7 +87,7 @@ CAMERAS: dict[str, tuple[Callable[..., Camera], Keys]] = {
 }
 _DIRECTION = optional("towards", "azimuth", "altitude", "time", "latitude", "longitude", "irradiance")
 LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
-    "directional": (_directional, {**_DIRECTION, **optional("radiance")}),  # the old name of irradiance
+    "directional": (_directional, _DIRECTION),
     "sun": (functools.partial(_directional, kind=Sun), {**_DIRECTION, **optional("angular_diameter", "chords")}),
     "point": (_point, _keys(_point)),
     "sky": (Sky, _keys(Sky)),
