@@ -32,7 +32,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     try:
         with warnings.catch_warnings():
-            warnings.filterwarnings("always", ".* is now called", DeprecationWarning)  # of keys in files, which Python hides
             warnings.showwarning = lambda message, *_, **__: print(
                 f"jaxhf: warning: {' '.join(str(message).split())}", file=sys.stderr
             )

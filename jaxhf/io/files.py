@@ -31,21 +31,15 @@ _KINDS = {
 
 
 def by_ending(codecs: Mapping[str, Codec], path: Path, task: str) -> Codec:
-    """What does `task` for the ending of `path`; FileError where nothing does."""
+    """What does `task` for the ending of `path`; FileError where nothing does, with the one that was meant, or all that do."""
     ending = path.suffix.lower()
-    if ending not in codecs:
-        named = f"the ending {path.suffix!r}" if ending else "a name without an ending"
-        raise FileError(f"{path}: cannot {task} {named}; {_fitting(ending, codecs, task)}")
-    return codecs[ending]
-
-
-def _fitting(ending: str, known: Iterable[str], task: str) -> str:
-    """A tail for an error about an ending: the one that was meant; all that would do, where it is another kind of file."""
-    known = sorted(known)
-    if ending not in _KINDS:
-        return nearest(ending, known, cutoff=0.7)
-    is_other = task.startswith("read") and _KINDS[ending] not in map(_KINDS.get, known)
-    return f"known: {', '.join(known)}" + is_other * f"; this is {_KINDS[ending]}"
+    if ending in codecs:
+        return codecs[ending]
+    named = f"the ending {path.suffix!r}" if ending else "a name without an ending"
+    tail = f"known: {', '.join(sorted(codecs))}" if ending in _KINDS else nearest(ending, codecs, cutoff=0.7)
+    if task.startswith("read") and ending in _KINDS and _KINDS[ending] not in map(_KINDS.get, codecs):
+        tail += f"; this is {_KINDS[ending]}"
+    raise FileError(f"{path}: cannot {task} {named}; {tail}")
 
 
 def file_path(owner: str, path: Any) -> Path:
@@ -80,13 +74,7 @@ def reading(path: Path) -> Iterator[None]:
 
 
 def require_folder(path: Path, what: str) -> None:
-    """Checks that a file can be put where `path` says.
-
-    Raises:
-      FileNotFoundError: the folder does not exist.
-      FileError: `path` is a folder itself.
-      PermissionError: the folder cannot be written to.
-    """
+    """Checks that a file can be put where `path` says: into a folder that is there and can be written to."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: there is no folder {str(path.parent)!r}")
     if path.is_dir():
@@ -99,9 +87,7 @@ def require_folder(path: Path, what: str) -> None:
 def replacing(path: Path, beside: Mapping[Path, str] | None = None) -> Iterator[Path]:
     """Yields a temporary name beside `path`, which takes its place at the end, or vanishes if anything goes wrong.
 
-    Args:
-      path: the file.
-      beside: small text files that go with it, and their contents, which are written before any file takes its place.
+    Small text files that go `beside` it, given with their contents, are written before any file takes its place.
     """
     beside = beside or {}
     with replacing_all([path, *beside]) as (temporary, *others):
@@ -197,11 +183,6 @@ def require_writable(owner: str, what: str, endings: Iterable[str], path: PathLi
             package, extra = _NEEDS[ending]
             import_extra(package, f"writing {ending} needs", extra)
     return path
-
-
-def require_writable_text(path: PathLike, ending: str) -> Path:
-    """As `require_writable`, for `save_text` and one ending."""
-    return require_writable("save_text", "a page", (ending,), path)
 
 
 def save_text(path: PathLike, text: str) -> None:

@@ -231,18 +231,16 @@ def cropped(camera: Camera, x: float, y: float, width: int, height: int) -> Came
     Its matrix may be no rotation any more, see `Perspective`.
     """
     matrix = np.array(camera.world_from_camera, np.float64)
-    short = min(camera.width, camera.height)
-    sx, sy = (2 * x + width - camera.width) / short, (camera.height - 2 * y - height) / short  # `_screen` of its centre
-    times = min(width, height) / short
+    sx, sy = _screen(camera, x + width / 2, y + height / 2)
+    times = min(width, height) / min(camera.width, camera.height)
     if isinstance(camera, Perspective):
-        half = np.tan(np.radians(np.asarray(camera.fov, np.float64)) / 2)
-        matrix[:, 2] += half * (sx * matrix[:, 0] + sy * matrix[:, 1])
-        return dataclasses.replace(
-            camera, world_from_camera=matrix, fov=np.degrees(2 * np.arctan(times * half)), width=width, height=height
-        )
-    half = np.asarray(camera.extent, np.float64) / 2
-    matrix[:, 3] += half * (sx * matrix[:, 0] + sy * matrix[:, 1])
-    return dataclasses.replace(camera, world_from_camera=matrix, extent=2 * times * half, width=width, height=height)
+        half, moved = np.tan(np.radians(np.asarray(camera.fov, np.float64)) / 2), 2
+        lens = {"fov": np.degrees(2 * np.arctan(times * half))}
+    else:
+        half, moved = np.asarray(camera.extent, np.float64) / 2, 3
+        lens = {"extent": 2 * times * half}
+    matrix[:, moved] += half * (sx * matrix[:, 0] + sy * matrix[:, 1])
+    return dataclasses.replace(camera, world_from_camera=matrix, **lens, width=width, height=height)
 
 
 def _shown(camera: Camera, lens: str) -> str:
@@ -254,7 +252,7 @@ def _shown(camera: Camera, lens: str) -> str:
     return f"{type(camera).__name__}({pose}, {lens}, {camera.width} x {camera.height})"
 
 
-def _screen(camera: Camera, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
+def _screen(camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:
     """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
     short = min(camera.width, camera.height)
     return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
@@ -268,26 +266,18 @@ def _camera_from_world(camera: Camera) -> Affine:
 def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
     """The inverse of `_screen`: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
     scale = min(camera.width, camera.height) / (2 * half)
-    linear, offset = camera_from_world.linear, camera_from_world.offset
-    return Projection(
-        jnp.stack([linear[0] * scale + w * (camera.width / 2), -linear[1] * scale + w * (camera.height / 2), w, linear[2]]),
-        jnp.stack(
-            [
-                offset[0] * scale + w_offset * (camera.width / 2),
-                -offset[1] * scale + w_offset * (camera.height / 2),
-                w_offset,
-                offset[2],
-            ]
-        ),
-    )
+
+    def rows(p: Any, w: Any) -> jax.Array:
+        return jnp.stack([p[0] * scale + w * (camera.width / 2), -p[1] * scale + w * (camera.height / 2), w, p[2]])
+
+    return Projection(rows(camera_from_world.linear, w), rows(camera_from_world.offset, w_offset))
 
 
 def _look_at(eye: Any, target: Any, up: Any) -> Any:
-    eye, target, up = float_leaf(eye), float_leaf(target), float_leaf(up)
-    leaves = {"eye": eye, "target": target, "up": up}
-    for name, leaf in leaves.items():
+    eye, target, up = leaves = float_leaf(eye), float_leaf(target), float_leaf(up)
+    for name, leaf in zip(("eye", "target", "up"), leaves, strict=True):
         require("look_at", name, leaf, VECTOR)
-    host = all(isinstance(leaf, np.ndarray) for leaf in leaves.values())
+    host = all(isinstance(leaf, np.ndarray) for leaf in leaves)
     xp = np if host else jnp
 
     def direction(v):

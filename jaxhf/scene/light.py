@@ -1,6 +1,5 @@
 """Lights."""
 
-import warnings
 from typing import Any, TypeGuard, TypeVar
 
 import equinox as eqx
@@ -17,6 +16,10 @@ D = TypeVar("D", bound="Directional")
 _DIAMETER = Number("be above 0 and at most 10 degrees", lambda value: 0 < value <= 10)
 
 
+def _irradiance(value: Any) -> Any:
+    return rgb_leaf(np.pi if value is None else value)
+
+
 class Directional(Record):
     """Parallel light from infinitely far away.
 
@@ -24,36 +27,29 @@ class Directional(Record):
       towards: the vector from the scene towards the light, world frame; its length does not matter.
       irradiance: of a surface that faces the light, one number or (r, g, b); None: pi, under which a white matte surface
         that faces the light has radiance 1.
-      radiance: what the argument `irradiance` was called until 0.1; gives a DeprecationWarning.
     """
 
     towards: VectorLeaf = eqx.field(converter=float_leaf, metadata={"rule": VECTOR})
-    irradiance: VectorLeaf = eqx.field(converter=rgb_leaf, metadata={"rule": COLOUR})
-
-    def __init__(self, towards: Any, irradiance: Any = None, *, radiance: Any = None):
-        self.towards = towards
-        self.irradiance = _chosen(irradiance, radiance, 5)  # two frames between are Equinox's
+    irradiance: VectorLeaf = eqx.field(converter=_irradiance, default=None, metadata={"rule": COLOUR})
 
     def _require_consistent(self):
         if isinstance(self.towards, np.ndarray) and not self.towards.any():
             raise ArgumentError(type(self).__name__, "towards", "must not be zero, it is [0, 0, 0]")
 
     @classmethod
-    def from_angles(
-        cls: type[D], azimuth: Any = 315.0, altitude: Any = 45.0, irradiance: Any = None, *, radiance: Any = None, **more: Any
-    ) -> D:
+    def from_angles(cls: type[D], azimuth: Any = 315.0, altitude: Any = 45.0, irradiance: Any = None, **more: Any) -> D:
         """Light from a compass direction, as cartographers give it: x is east, y north, z up.
 
         Args:
           azimuth: the direction in which the light stands, degrees clockwise from north.
           altitude: its height above the horizon, degrees.
-          irradiance, radiance, more: as for the class.
+          irradiance, more: as for the class.
         """
         azimuth, altitude = float_leaf(azimuth), float_leaf(altitude)
         xp = np if isinstance(azimuth, np.ndarray) and isinstance(altitude, np.ndarray) else jnp
         a, h = xp.deg2rad(azimuth), xp.deg2rad(altitude)
         towards = xp.stack([xp.sin(a) * xp.cos(h), xp.cos(a) * xp.cos(h), xp.sin(h)])
-        return cls(towards, _chosen(irradiance, radiance, 3), **more)
+        return cls(towards, irradiance, **more)
 
     @classmethod
     def at(
@@ -98,14 +94,8 @@ class Sun(Directional):
         them: 32 keep behind a tower to 0.8 % what 8 keep to 4 %, see docs/measurements/settings.md.
     """
 
-    angular_diameter: ScalarLeaf = eqx.field(converter=float_leaf, metadata={"rule": _DIAMETER})
+    angular_diameter: ScalarLeaf = eqx.field(converter=float_leaf, default=0.53, metadata={"rule": _DIAMETER})
     chords: int = eqx.field(converter=whole_number, static=True, default=8, metadata={"rule": Whole(1)})
-
-    def __init__(
-        self, towards: Any, irradiance: Any = None, angular_diameter: Any = 0.53, chords: Any = 8, *, radiance: Any = None
-    ):
-        super().__init__(towards, irradiance, radiance=radiance)
-        self.angular_diameter, self.chords = angular_diameter, chords
 
     def _require_consistent(self):
         super()._require_consistent()
@@ -149,13 +139,3 @@ Light = Directional | Sun | Point | Sky
 def casts_sharp_shadows(light: Light) -> TypeGuard[Directional | Point]:
     """Whether the light reaches a point wholly or not at all, so that its shadows have edges."""
     return not isinstance(light, Sun | Sky)
-
-
-def _chosen(irradiance: Any, radiance: Any, stacklevel: int) -> Any:
-    """The irradiance of a directional light, whichever of its two names it was given by."""
-    if radiance is None:
-        return np.pi if irradiance is None else irradiance
-    if irradiance is not None:
-        raise ArgumentError("Directional", "radiance", "must stand without irradiance, whose old name it is")
-    warnings.warn("Directional: radiance is now called irradiance", DeprecationWarning, stacklevel=stacklevel)
-    return radiance

@@ -1,7 +1,8 @@
 """Heights and textures made from a formula and a seed, in NumPy.
 
 The same seed gives the same numbers wherever NumPy's `default_rng` does, up to rounding. A size is (rows, columns); row 0 lies
-at v = 0 (of heights: in the south), column 0 at u = 0 (in the west). Heights fill their `range` exactly.
+at v = 0 (of heights: in the south), column 0 at u = 0 (in the west). Heights fill their `range` exactly; textures are linear
+colours.
 """
 
 from collections.abc import Sequence
@@ -89,11 +90,7 @@ def bumps(
 
 
 def grid(size: Sequence[int], lines: int = 10) -> Float[np.ndarray, "h w 3"]:
-    """A texture that shows (u, v): `lines` cells a side, redder along u, greener along v; the axis v = 0 is red, u = 0 green.
-
-    Returns:
-      Linear colours, shape (h, w, 3).
-    """
+    """A texture that shows (u, v): `lines` cells a side, redder along u, greener along v; the axes are red and green."""
     require("", "lines", lines, Whole(1))
     u, v = _texel_centres(size)
     h, w = size
@@ -109,11 +106,7 @@ def grid(size: Sequence[int], lines: int = 10) -> Float[np.ndarray, "h w 3"]:
 def checker(
     size: Sequence[int], squares: int = 8, first: Colour = (0.8, 0.8, 0.8), second: Colour = (0.15, 0.15, 0.15)
 ) -> Float[np.ndarray, "h w 3"]:
-    """A texture of `squares` x `squares` squares in turn of the `first` and the `second` colour; the first at (0, 0).
-
-    Returns:
-      Linear colours, shape (h, w, 3).
-    """
+    """A texture of `squares` x `squares` squares in turn of the `first` and the `second` colour; the first at (0, 0)."""
     require("", "squares", squares, Whole(1))
     u, v = _texel_centres(size)
     odd = (np.floor(u * squares) + np.floor(v * squares)) % 2
@@ -140,9 +133,6 @@ def sky(
       sun_radius: of its disc, in v.
       sun_radiance: of its disc; a glow of a tenth of it surrounds it.
       clouds: the part of the sky that is covered, 0..1.
-
-    Returns:
-      Linear colours, shape (h, w, 3).
     """
     require("", "clouds", clouds, Number("lie in 0..1", lambda value: 0 <= value <= 1))
     require("", "sun_radius", sun_radius, POSITIVE)

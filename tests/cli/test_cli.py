@@ -149,18 +149,6 @@ def test_info(command):
     assert sky.startswith("light 1: Sky, radiance (0.05, 0.07, 0.1)")
 
 
-def test_an_old_key_gets_one_line(tmp_path, command):
-    """Python hides DeprecationWarnings that are not of the main module."""
-    path = tmp_path / "old.toml"
-    old = SCENE.read_text() + '\n[[lights]]\ntype = "directional"\nradiance = 2\n'
-    path.write_text(old)
-    code, said, complained = command("info", path)
-    assert (code, "irradiance (2, 2, 2)" in said) == (0, True)
-    number = old.count("[[lights]]") - 1
-    where = f"{path}:{old.count(chr(10))}: lights[{number}].radiance"
-    assert complained == f"jaxhf: warning: {where} is now called irradiance\n"
-
-
 def test_our_own_bug_keeps_its_traceback(tmp_path, monkeypatch, command):
     """Only what is known for the user's mistake becomes one line."""
 

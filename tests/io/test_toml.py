@@ -137,10 +137,7 @@ def test_directional_lights(tmp_path, text, towards):
     assert_same(light, Directional(towards, np.pi), atol=1e-15)
 
 
-def test_old_keys_and_cameras_by_calibration(tmp_path):
-    with pytest.warns(DeprecationWarning, match=r"scene\.toml:8: lights\[0\]\.radiance is now called irradiance$"):
-        (light,) = read(tmp_path, f'{CAMERA}[[lights]]\ntype = "directional"\nradiance = [1, 2, 3]\n{FIELD}').lights
-    assert_same(light, Directional.from_angles(irradiance=(1, 2, 3)))
+def test_cameras_by_calibration(tmp_path):
     camera = read(tmp_path, view(f"{PINHOLE}fy = 50")).camera
     pose = np.array([[1, 0, 0, 5], [0, -1, 0, 6], [0, 0, -1, 7], [0, 0, 0, 1]])
     assert_same(camera, Perspective.from_intrinsics(40, 50, 20, 15, world_from_camera=pose, width=40, height=30))

@@ -1,6 +1,5 @@
 """What a scene is made of: which values are refused, and in which words; defaults; the normals at vertices."""
 
-import dataclasses
 import functools
 import re
 from typing import Any
@@ -138,17 +137,6 @@ def test_bad_input_is_refused(make, message):
         assert refused.value.argument == message.partition(": ")[2].partition(" ")[0]
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
-
-
-@pytest.mark.parametrize("make", [lambda **more: jaxhf.Directional((0, 0, 1), **more), jaxhf.Directional.from_angles])
-def test_the_old_name_of_irradiance(make):
-    with pytest.warns(DeprecationWarning, match="radiance is now called irradiance"):
-        light = make(radiance=(1, 2, 3))
-    np.testing.assert_array_equal(light.irradiance, (1, 2, 3))
-    with pytest.raises(jaxhf.ArgumentError, match="radiance must stand without irradiance") as refused:
-        make(radiance=1, irradiance=1)
-    assert refused.value.argument == "radiance"
-    np.testing.assert_array_equal(dataclasses.replace(light, towards=(0, 1, 0)).irradiance, light.irradiance)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from ...fitting.given import Checkpoint, Prior, Unknown
 from ...fitting.history import Draws, Pace, Step
 from ...fitting.windows import Mosaic, fit_windows
 from ...io.errors import FileError
-from ...io.files import require_writable_text, save_text
+from ...io.files import require_writable, save_text
 from ...io.pictures.images import save_image
 from ...io.scenes.toml.fit import Case, load_case
 from ...io.terrain.save import require_writable_heights, save_heights
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> None:
     for path in (heights, std):  # before the fit, not after it
         require_writable_heights(path, (".npy", ".npz", ".tif", ".tiff"))  # which hold any heights, and holes
     if options.report:
-        require_writable_text(options.report, ".html")
+        require_writable("save_text", "a page", (".html",), options.report)
         import_extra("matplotlib", "a report needs", "plot")
     if checkpoint.exists() and not options.resume:
         raise FileError(

@@ -151,19 +151,16 @@ def _write_pfm(path: Path, pixels: np.ndarray) -> None:
 # One reader a format: a path to shape (h, w, 3) or (h, w), float32 or, where values are encoded, uint8 or uint16.
 READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".png": read_png,
-    ".jpg": _read_jpeg,
-    ".jpeg": _read_jpeg,
+    **dict.fromkeys((".jpg", ".jpeg"), _read_jpeg),
     ".exr": read_exr,
     ".pfm": _read_pfm,
     ".npy": _read_npy,
-    ".tif": _read_tiff,
-    ".tiff": _read_tiff,
+    **dict.fromkeys((".tif", ".tiff"), _read_tiff),
 }
 # One writer a format: a path, and pixels as the file holds them, bytes or floats of shape (h, w, 3) or (h, w).
 WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
     ".png": write_png,
-    ".jpg": _write_jpeg,
-    ".jpeg": _write_jpeg,
+    **dict.fromkeys((".jpg", ".jpeg"), _write_jpeg),
     ".exr": lambda path, pixels: write_channels(path, channels_of(pixels)),
     ".pfm": _write_pfm,
     ".npy": write_npy,

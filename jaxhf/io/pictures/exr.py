@@ -48,10 +48,8 @@ def channels_of(pixels: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def write_channels(path: Path, planes: Mapping[str, np.ndarray]) -> None:
-    """Channels of shape (h, w) by their names, top row first, in float32.
-
-    Raises:
-      OSError: what is found in the file is something else: OpenEXR does not say when a disk is full.
+    """Channels of shape (h, w) by their names, top row first, in float32; OSError where the disk is full, which OpenEXR does
+    not say: what was written is read again.
     """
     exr = import_extra("OpenEXR", "writing .exr needs", "exr")
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}

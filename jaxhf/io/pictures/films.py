@@ -27,15 +27,14 @@ def writing_film(path: PathLike, rate: int) -> Iterator[Add]:
     """
     path = require_writable_film(path)
     ending = path.suffix.lower()
-    with replacing(path) as temporary:
+    with replacing(path) as temporary, temporary.open("wb") as file:
         if ending == ".gif":
             frames: list[Any] = []
             yield frames.append
             # By name, not by the file's own ending, which is that of a temporary one.
-            with temporary.open("wb") as file:
-                imageio.imwrite(file, frames, plugin="pillow", extension=".gif", duration=1000 / rate, loop=0)
+            imageio.imwrite(file, frames, plugin="pillow", extension=".gif", duration=1000 / rate, loop=0)
             return
-        with temporary.open("wb") as file, imageio.imopen(file, "w", plugin="pyav", extension=".mp4", container="mp4") as film:
+        with imageio.imopen(file, "w", plugin="pyav", extension=".mp4", container="mp4") as film:
             film.init_video_stream("libx264", fps=rate)
 
             def add(frame: np.ndarray) -> None:

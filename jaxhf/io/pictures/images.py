@@ -6,17 +6,20 @@ In memory every image is linear, shape (h, w, 3), top row first.
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
 
 from ...core.errors import ArgumentError
+from ...core.rules import OneOf, require
 from .. import files
 from ..errors import FileError
 from ..files import PathLike, by_ending, reading, replacing, require_file
 from .codecs import OF_BYTES, READERS, WRITERS
 from .exr import channels_of, write_channels
+
+Transfer = Literal["srgb", "linear"]
 
 
 def load_image(path: PathLike, *, transfer: str | None = None) -> Float32[np.ndarray, "h w 3"]:
@@ -46,7 +49,7 @@ def load_numbers(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
 
 
 def _load(path: PathLike, transfer: str | None, left_out: float) -> np.ndarray:
-    require_transfer("load_image", transfer or "srgb")
+    require("load_image", "transfer", transfer or "srgb", OneOf(Transfer))
     path = require_file(path)
     reader = by_ending(READERS, path, "read an image with")
     with reading(path):
@@ -63,11 +66,6 @@ def _load(path: PathLike, transfer: str | None, left_out: float) -> np.ndarray:
     if np.ma.is_masked(stored):
         image = np.where(np.ma.getmaskarray(stored), np.float32(left_out), image)
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
-
-
-def require_transfer(owner: str, transfer: Any) -> None:
-    if transfer not in TRANSFERS:
-        raise ArgumentError(owner, "transfer", f"must be one of {', '.join(TRANSFERS)}; it is {transfer!r}")
 
 
 def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapping[str, Any] | None = None) -> None:
@@ -92,7 +90,7 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         is another, or there are `aovs` of another size, or without .exr.
     """
     path = require_writable(path)
-    require_transfer("save_image", transfer)
+    require("save_image", "transfer", transfer, OneOf(Transfer))
     pixels = np.asarray(image)
     if pixels.dtype.kind == "V":  # bfloat16 and its like, which .npy would store without their meaning
         pixels = pixels.astype(np.float32)

@@ -2,8 +2,6 @@
 
 import importlib
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +10,7 @@ from ..errors import FileError
 from ..files import PathLike, reading, require_file
 from ..gdal import opened
 from ..pictures.images import linear_from_srgb, load_image
+from .georeference import Georeference
 from .terrain import Terrain
 
 _MOST = 4096  # texels along a side
@@ -29,18 +28,16 @@ def load_drape(path: PathLike, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
     path = require_file(path)
     if path.suffix.lower() not in (".tif", ".tiff"):
         return load_image(path, transfer="srgb")[::-1]
-    with reading(path):
-        return _placed(path, terrain)
-
-
-def _placed(path: Path, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
-    with opened(path) as dataset:
+    with reading(path), opened(path) as dataset:
         rasterio = importlib.import_module("rasterio")
         if dataset.count not in (1, 3, 4) or set(dataset.dtypes) != {"uint8"}:
             raise FileError(f"it must have 1, 3 or 4 bands of bytes, it has {dataset.count} of {dataset.dtypes[0]}")
         if dataset.colorinterp[0].name == "palette":
             raise FileError("its bands must be colours, it has a palette (gdal_translate -expand rgb makes colours of it)")
-        _require_same_system(dataset, terrain, rasterio)
+        place, crs = terrain.georeference or Georeference(), dataset.crs
+        if crs is not None and place.wkt and rasterio.crs.CRS.from_wkt(place.wkt) != crs:
+            rule = f"it must be in the terrain's reference system, {place.name}; it is in {crs.to_string()}"
+            raise FileError(f"{rule} (gdalwarp changes it)")
         dx, dy, x0, y0 = terrain.in_file
         ny, nx = terrain.heights.shape
         west, south, east, north = x0, y0, x0 + (nx - 1) * dx, y0 + (ny - 1) * dy
@@ -56,12 +53,3 @@ def _placed(path: Path, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
             fill_value=0, resampling=rasterio.enums.Resampling.bilinear,
         )  # fmt: skip
     return linear_from_srgb(np.moveaxis(bands, 0, -1)[::-1] / 255)
-
-
-def _require_same_system(dataset: Any, terrain: Terrain, rasterio: Any) -> None:
-    known = terrain.georeference
-    if dataset.crs is None or known is None or not known.wkt:
-        return
-    if rasterio.crs.CRS.from_wkt(known.wkt) != dataset.crs:
-        given = dataset.crs.to_string()
-        raise FileError(f"it must be in the terrain's reference system, {known.name}; it is in {given} (gdalwarp changes it)")

@@ -88,11 +88,7 @@ def _horizontal(wkt: str) -> str:
 
 
 def coordinate_system(wkt: str) -> CoordinateSystem:
-    """What well-known text says, in either form, of the horizontal coordinates; "" says that they are lengths.
-
-    Raises:
-      FileError: its angles are not degrees.
-    """
+    """What well-known text says, in either form, of the horizontal coordinates, whose angles must be degrees; "": lengths."""
     horizontal = _horizontal(wkt)
     code = re.search(r'(?:AUTHORITY|\bID)\["EPSG",\s*"?(\d+)"?$', horizontal)
     number = int(code[1]) if code else None

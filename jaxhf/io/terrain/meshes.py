@@ -2,7 +2,6 @@
 
 import re
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -58,15 +57,10 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
         raise ArgumentError("save_mesh", "terrain", "must have a cell without a hole, it has none")
     points = np.stack([*np.meshgrid(np.arange(nx) * terrain.dx, np.arange(ny) * terrain.dy), heights], axis=-1).reshape(-1, 3)
     faces = _surface(whole)
-    of = np.arange(ny * nx)  # the vertex of the terrain that each point belongs to
     if base is not None:
-        faces = np.concatenate([faces, faces[:, ::-1] + len(of), _walls(whole, len(of))])
-        points, of = np.concatenate([points, points * (1, 1, 0) + (0, 0, base)]), np.tile(of, 2)
-    used = np.zeros(len(points), bool)
-    used[faces] = True
-    if not used.all():  # copies of the largest arrays
-        points, faces, of = points[used], (np.cumsum(used) - 1)[faces], of[used]
-    mesh = _mesh(path, points, faces, terrain, of, colours, uv)
+        faces = np.concatenate([faces, faces[:, ::-1] + ny * nx, _walls(whole, ny * nx)])
+        points = np.concatenate([points, points * (1, 1, 0) + (0, 0, base)])
+    mesh = _mesh(path.suffix.lower(), points, faces, heights.shape, colours, uv)
     with replacing(path) as temporary:
         temporary.write_bytes(mesh)
 
@@ -94,18 +88,12 @@ def _walls(whole: Bool[np.ndarray, "cy cx"], count: int) -> _Triangles:
 
 
 def _mesh(
-    path: Path,
-    points: Float[np.ndarray, "n 3"],
-    faces: _Triangles,
-    terrain: Terrain,
-    of: Int[np.ndarray, " n"],
-    colours: Any,
-    uv: bool,
+    ending: str, points: Float[np.ndarray, "n 3"], faces: _Triangles, shape: tuple[int, ...], colours: Any, uv: bool
 ) -> bytes:
-    """The file's bytes; `of` says which vertex of the terrain each point belongs to."""
-    trimesh, ending = import_extra("trimesh", "writing meshes needs", "mesh"), path.suffix.lower()
-    ny, nx = terrain.heights.shape
-    visual = None
+    """The file's bytes; the points are the vertices of a terrain of that shape, perhaps followed by their feet."""
+    trimesh = import_extra("trimesh", "writing meshes needs", "mesh")
+    ny, nx = shape
+    visual, of = None, np.arange(len(points)) % (ny * nx)  # the vertex that each point belongs to
     if colours is not None:
         colours = colours.reshape(ny * nx, -1)[of]
         if ending == ".glb":  # whose colours are linear
@@ -117,7 +105,9 @@ def _mesh(
     if ending == ".glb":
         points = points[:, [0, 2, 1]] * (1, 1, -1)
     plain = {"tree_postprocessor": _with_material} if ending == ".glb" else {}
-    data = trimesh.Trimesh(points, faces, process=False, visual=visual).export(file_type=ending[1:], **plain)
+    mesh = trimesh.Trimesh(points, faces, process=False, visual=visual)
+    mesh.remove_unreferenced_vertices()
+    data = mesh.export(file_type=ending[1:], **plain)
     if isinstance(data, bytes):
         return data
     return re.sub(r"^(mtllib|usemtl).*\n?", "", data, flags=re.MULTILINE).encode()

@@ -97,8 +97,7 @@ _WRITERS: dict[str, Callable[[Path, Terrain], None]] = {
     ".png": _write_png,
     ".npy": lambda path, terrain: write_npy(path, terrain.heights),
     ".npz": _write_npz,
-    ".tif": _write_tiff,
-    ".tiff": _write_tiff,
+    **dict.fromkeys((".tif", ".tiff"), _write_tiff),
 }
 HEIGHTS = tuple(_WRITERS)
 

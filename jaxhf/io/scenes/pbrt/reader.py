@@ -5,26 +5,32 @@ that is not there. What is read means what pbrt-v2 makes of it, but for the name
 which they stand, not to the first one.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import DTypeLike
 
-from ....core.affine import invertible
+from ....core.affine import invertible, rotate, scale, translate
+from ....core.errors import UserError
+from ....core.precision import fitted
 from ....core.rules import require
 from ....scene.camera import Perspective
 from ....scene.cylinder import Cylinder
+from ....scene.heightfield import Heightfield
 from ....scene.light import Directional, Light, Point
 from ....scene.material import Material, Matte, Mirror
 from ....scene.scene import Object, Scene
 from ....scene.texture import ImageTexture
 from ...errors import SceneError, nearest, resolve_inside
 from ...pictures.images import load_image
-from .parts import KINDS, RULES, TRANSFORMS, Matrix, heightfield
 from .statements import Arguments, Statement, statements
 from .tokens import Token, located
+
+Matrix = Float[np.ndarray, "4 4"]
 
 
 def load_pbrt(path: Path, dtype: DTypeLike = np.float32) -> Scene:
@@ -42,7 +48,7 @@ def load_pbrt(path: Path, dtype: DTypeLike = np.float32) -> Scene:
         raise SceneError(path, max(1, len(text.splitlines())), "the file ends without a WorldBegin")
     if reader.block == "world":
         raise reader.world.error("this WorldBegin has no WorldEnd")
-    return reader.scene()
+    return Scene(reader.objects, reader.view, reader.lights, reader.samples)
 
 
 def _read_text(path: Path) -> str:
@@ -72,31 +78,24 @@ class _Reader:
     resolution: tuple[int, int] = (640, 480)
     samples: int = 4  # of the "lowdiscrepancy" sampler that pbrt-v2 takes where a scene names none
     camera: Arguments | None = None
+    view: Perspective = field(init=False)  # from WorldBegin on
     objects: list[Object] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
 
     def run(self, path: Path, text: str) -> None:
         self.files.append(path.parent.resolve() / path.name)  # beside a link, not where it leads
         for statement in statements(path, text):
-            self._execute(statement)
+            with located(statement.word):
+                self._execute(statement)
         self.files.pop()
-
-    def scene(self) -> Scene:
-        assert self.camera is not None, "WorldBegin demands a camera"
-        width, height = self.resolution
-        with located(self.camera.word):
-            camera = Perspective(self.frames["camera"], self.camera["float fov"], width=width, height=height)
-        return Scene(objects=tuple(self.objects), camera=camera, lights=tuple(self.lights), samples=self.samples)
 
     def _execute(self, statement: Statement) -> None:
         word = statement.word
         if word.text not in _BLOCKS:
             raise word.error(f"unknown directive {str(word)!r}; {nearest(word.text[:60], _BLOCKS)}")
-        if self.block == "end":
-            raise word.error(f"{word} must not follow WorldEnd")
-        if _BLOCKS[word.text] not in ("any", self.block):
-            late = self.world is not None
-            raise word.error(f"{word} must {'not ' if late else ''}follow WorldBegin")
+        if self.block == "end" or _BLOCKS[word.text] not in ("any", self.block):
+            rules = {"options": "follow WorldBegin", "world": "not follow WorldBegin", "end": "not follow WorldEnd"}
+            raise word.error(f"{word} must {rules[self.block]}")
         match word.text:
             case "AttributeBegin" | "TransformBegin":
                 self.saved.append((statement.nothing(), self.matrix, self.material, self.textures))
@@ -114,29 +113,29 @@ class _Reader:
             case "CoordinateSystem":
                 self.frames[statement.name().name()] = self.matrix
             case "CoordSysTransform":
-                self._enter_frame(statement.name())
+                frame = statement.name()
+                if frame.name() not in self.frames:
+                    raise frame.error(f"unknown coordinate system {frame}; {nearest(frame.name(), self.frames)}")
+                self.matrix = self.frames[frame.name()]
             case "Texture":
                 self._declare_texture(statement)
-            case directive if directive in KINDS:
-                self._take(statement.arguments(KINDS[directive], RULES))
-            case _:
-                self._concatenate(statement)
-
-    def _take(self, args: Arguments) -> None:
-        """Takes what a directive with a kind says. PixelFilter and SurfaceIntegrator may only say what is done anyway."""
-        match args.word.text:
             case "Film":
+                args = statement.arguments()
                 self.resolution = args["integer xresolution"], args["integer yresolution"]
             case "Sampler":
-                self._sampler(args)
+                self._sampler(statement.arguments())
+            case "PixelFilter" | "SurfaceIntegrator":
+                statement.arguments()  # which may only say what is done anyway
             case "Camera":
-                self.camera, self.frames["camera"] = args, np.linalg.inv(self.matrix)
+                self.camera, self.frames["camera"] = statement.arguments(), np.linalg.inv(self.matrix)
             case "LightSource":
-                self._light_source(args)
+                self._light_source(statement.arguments())
             case "Material":
-                self.material = args
+                self.material = statement.arguments()
             case "Shape":
-                self._shape(args)
+                self._shape(statement.arguments())
+            case _:
+                self._concatenate(statement)
 
     # Blocks, files, attributes.
 
@@ -151,6 +150,8 @@ class _Reader:
     def _world_begin(self, word: Token) -> None:
         if self.camera is None:
             raise word.error("there must be a Camera before WorldBegin")
+        with located(self.camera.word):
+            self.view = Perspective(self.frames["camera"], self.camera["float fov"], *self.resolution)
         self.block, self.world = "world", word
         self.matrix = self.frames["world"] = np.eye(4)
 
@@ -174,23 +175,18 @@ class _Reader:
     # Transforms: the current one is multiplied from the right, so that the last directive acts first on points.
 
     def _concatenate(self, statement: Statement) -> None:
-        word = statement.word
-        with np.errstate(all="ignore"), located(word):
-            if word.text in TRANSFORMS:
-                count, make = TRANSFORMS[word.text]
+        word = statement.word.text
+        with np.errstate(all="ignore"):
+            if word in _TRANSFORMS:
+                count, make = _TRANSFORMS[word]
                 matrix = make(*statement.numbers(count))
             else:
                 matrix = statement.matrix()
-            require("", word.text, matrix, invertible)
-            if word.text != "Transform":
+            require("", word, matrix, invertible)
+            if word != "Transform":
                 matrix = self.matrix @ matrix
                 require("", "the current transformation", matrix, invertible)
             self.matrix = matrix
-
-    def _enter_frame(self, name: Token) -> None:
-        if name.name() not in self.frames:
-            raise name.error(f"unknown coordinate system {name}; {nearest(name.name(), self.frames)}")
-        self.matrix = self.frames[name.name()]
 
     # The parts of the scene.
 
@@ -201,36 +197,35 @@ class _Reader:
         if args["bool jitter"]:
             raise args.error("bool jitter", 'jitter must be "false": jittered samples, the default, are not supported')
         side = args["integer xsamples"]
-        args.require("integer ysamples", args["integer ysamples"] == side, f"equal xsamples, {side}")
+        if args["integer ysamples"] != side:
+            raise args.error("integer ysamples", f"ysamples must equal xsamples, {side}, it is {args['integer ysamples']}")
         self.samples = side * side
 
     def _light_source(self, args: Arguments) -> None:
-        with located(args.word):
-            if args.kind == "point":  # pbrt-v2 moves it by "from" after the transformation, so "from" counts in world units
-                light = Point(self.matrix[:3, 3] + args["point from"], args["color I"] * args["color scale"])
-            else:
-                towards = self.matrix[:3, :3] @ (args["point from"] - args["point to"])
-                light = Directional(towards, args["color L"] * args["color scale"])
-            self.lights.append(light)
+        if args.kind == "point":  # pbrt-v2 moves it by "from" after the transformation, so "from" counts in world units
+            light = Point(self.matrix[:3, 3] + args["point from"], args["color I"] * args["color scale"])
+        else:
+            towards = self.matrix[:3, :3] @ (args["point from"] - args["point to"])
+            light = Directional(towards, args["color L"] * args["color scale"])
+        self.lights.append(light)
 
     def _declare_texture(self, statement: Statement) -> None:
         name, value_type = statement.string(0), statement.string(1)
         if value_type.name() != "color":
             raise value_type.error(f'the type of a Texture must be "color", it is {value_type}')
-        args = statement.arguments(KINDS["Texture"], RULES, at=2)
+        args = statement.arguments(at=2)
         place = args.tokens["string filename"]
         with located(place):
             path = resolve_inside(self.root, self.files[-1].parent, args["string filename"])
         self.textures = {**self.textures, name.name(): (path, place)}
 
     def _shape(self, args: Arguments) -> None:
-        with located(args.word):
-            if args.kind == "heightfield":
-                shape = heightfield(args, self.dtype)
-            else:
-                shape = Cylinder(args["float radius"], args["float zmin"], args["float zmax"])
-            world_from_object = None if np.array_equal(self.matrix, np.eye(4)) else self.matrix
-            self.objects.append(Object(shape, self._made_material(), world_from_object))
+        if args.kind == "heightfield":
+            shape = _heightfield(args, self.dtype)
+        else:
+            shape = Cylinder(args["float radius"], args["float zmin"], args["float zmax"])
+        world_from_object = None if np.array_equal(self.matrix, np.eye(4)) else self.matrix
+        self.objects.append(Object(shape, self._made_material(), world_from_object))
 
     def _made_material(self) -> Material:
         """Made where a shape uses it, with the textures of that place: pbrt-v2 lets a texture follow its material."""
@@ -240,24 +235,60 @@ class _Reader:
         with located(args.word):
             if args.kind == "mirror":
                 return Mirror(args["color Kr"])
-            return Matte(args["color Kd"] if args["texture Kd"] is None else self._texture(args))
+            name, known = args["texture Kd"], self.textures
+            if name is None:
+                return Matte(args["color Kd"])
+            if name not in known:
+                hint = nearest(name[:60], known) if known else "there is none"
+                raise args.error("texture Kd", f"unknown texture {name!r}; {hint}")
+            path, place = known[name]
+            if path not in self.images:
+                with located(place):
+                    self.images[path] = ImageTexture(load_image(path, transfer="srgb"))
+            return Matte(self.images[path])
 
-    def _texture(self, args: Arguments) -> ImageTexture:
-        name, known = args["texture Kd"], self.textures
-        if name not in known:
-            hint = nearest(name[:60], known) if known else "there is none"
-            raise args.error("texture Kd", f"unknown texture {name!r}; {hint}")
-        path, place = known[name]
-        if path not in self.images:
-            with located(place):
-                self.images[path] = ImageTexture(load_image(path, transfer="srgb"))
-        return self.images[path]
+
+def _heightfield(args: Arguments, dtype: np.dtype) -> Heightfield:
+    """The surface of a `Shape "heightfield"`."""
+    nu, nv, z = args["integer nu"], args["integer nv"], args["float Pz"]
+    if z.size != nu * nv:
+        raise args.error("float Pz", f"Pz must hold nu * nv = {nu} * {nv} = {nu * nv} heights, it holds {z.size}")
+    with np.errstate(over="ignore"):
+        heights = z.astype(dtype)
+    bad = np.flatnonzero(~np.isfinite(heights))
+    if bad.size:
+        k = int(bad[0])
+        message = f"Pz[{k}] (column {k % nu}, row {k // nu}) must be finite in {dtype}, it is {z[k]}"
+        raise args.error("float Pz", message, k)
+    return Heightfield(fitted(z, dtype).reshape(nv, nu))
 
 
+def _look_at(*numbers: float) -> Matrix:
+    """camera_from_world of pbrt-v2: x right, y up, z forward, left-handed in a right-handed world."""
+    eye, target, up = np.reshape(numbers, (3, 3))
+    if not np.any(target - eye):
+        raise UserError(f"LookAt: the target must differ from the eye, both are {eye.tolist()}")
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(up, forward)
+    length = np.linalg.norm(right)
+    if not length > 1e-9 * np.linalg.norm(up):
+        raise UserError(f"LookAt: up must not point along the view, it is {up.tolist()} for the view {forward.tolist()}")
+    right = right / length
+    world_from_camera = np.eye(4)
+    world_from_camera[:3] = np.stack([right, np.cross(forward, right), forward, eye], axis=1)
+    return np.linalg.inv(world_from_camera)
+
+
+_TRANSFORMS: Mapping[str, tuple[int, Callable[..., Any]]] = {
+    "LookAt": (9, _look_at),
+    "Rotate": (4, rotate),
+    "Scale": (3, scale),
+    "Translate": (3, translate),
+}
 _BLOCKS: Mapping[str, str] = {  # where a directive may stand
     **dict.fromkeys(("Camera", "Film", "PixelFilter", "Sampler", "SurfaceIntegrator", "WorldBegin"), "options"),
     **dict.fromkeys(("AttributeBegin", "AttributeEnd", "TransformBegin", "TransformEnd", "WorldEnd"), "world"),
     **dict.fromkeys(("LightSource", "Material", "Shape", "Texture"), "world"),
     **dict.fromkeys(("CoordSysTransform", "CoordinateSystem", "Identity", "Include"), "any"),
-    **dict.fromkeys(("ConcatTransform", "Transform", *TRANSFORMS), "any"),
+    **dict.fromkeys(("ConcatTransform", "Transform", *_TRANSFORMS), "any"),
 }

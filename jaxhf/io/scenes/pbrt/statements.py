@@ -1,4 +1,7 @@
-"""The tokens of a .pbrt file as directives with what they take: numbers, a name, or a kind and its typed parameters."""
+"""The tokens of a .pbrt file as directives with what they take: numbers, a name, or a kind and its typed parameters.
+
+Which kinds and parameters there are stands in `KINDS`.
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -12,9 +15,44 @@ from ...errors import SceneError, nearest
 from .tokens import Token, Values, tokenize
 
 Parameters = Mapping[str, Any]  # the defaults of a kind's parameters by their declarations, "float fov"; ...: must be given
-Kinds = Mapping[str, Parameters]
 Rule = tuple[Callable[[Any], bool], str]  # whether a value is allowed, and what it must be
 
+_ORIGIN, _WHITE = np.zeros(3), np.ones(3)
+# Every kind and parameter that is understood, with pbrt-v2's defaults. Depth 5 counts the camera ray: at most four mirrors.
+KINDS: Mapping[str, Mapping[str, Parameters]] = {
+    "Film": {"image": {"string filename": "pbrt.exr", "integer xresolution": 640, "integer yresolution": 480}},
+    "Sampler": {
+        "bestcandidate": {"integer pixelsamples": 4},
+        "stratified": {"integer xsamples": 2, "integer ysamples": 2, "bool jitter": True},
+    },
+    "PixelFilter": {"box": {"float xwidth": 0.5, "float ywidth": 0.5}},
+    "SurfaceIntegrator": {"directlighting": {"integer maxdepth": 5}, "whitted": {"integer maxdepth": 5}},
+    "Camera": {"perspective": {"float fov": 90.0}},
+    "LightSource": {
+        "point": {"color I": _WHITE, "color scale": _WHITE, "point from": _ORIGIN},
+        "distant": {"color L": _WHITE, "color scale": _WHITE, "point from": _ORIGIN, "point to": np.array([0.0, 0, 1])},
+    },
+    "Texture": {"imagemap": {"string filename": ...}},
+    "Material": {
+        "matte": {"color Kd": 0.5 * _WHITE, "texture Kd": None, "float sigma": 0.0},
+        "mirror": {"color Kr": 0.9 * _WHITE},
+    },
+    "Shape": {
+        "heightfield": {"integer nu": ..., "integer nv": ..., "float Pz": ...},
+        "cylinder": {"float radius": 1.0, "float zmin": -1.0, "float zmax": 1.0, "float phimax": 360.0},
+    },
+}
+_LEAST_ONE: Rule = (lambda count: count >= 1, "be at least 1")
+_RULES: Mapping[str, Rule] = {
+    **dict.fromkeys(("integer xresolution", "integer yresolution", "integer pixelsamples", "integer xsamples"), _LEAST_ONE),
+    **dict.fromkeys(("integer nu", "integer nv"), (lambda count: count >= 2, "be at least 2")),
+    **dict.fromkeys(("float xwidth", "float ywidth"), (lambda width: width == 0.5, "be 0.5")),
+    **dict.fromkeys(("color I", "color L", "color scale", "color Kd", "color Kr"), (lambda c: min(c) >= 0, "be 0 or more")),
+    "integer maxdepth": (lambda depth: depth == 5, "be 5"),
+    "float fov": (lambda fov: 0 < fov < 180, "lie between 0 and 180 degrees"),
+    "float sigma": (lambda sigma: sigma == 0, "be 0 (rough surfaces are not supported)"),
+    "float phimax": (lambda phi: phi == 360, "be 360 (parts of a circle are not supported)"),
+}
 _COUNTS = {"color": 3, "point": 3, "float Pz": None}  # of values, by type or declaration: else one; None: any number
 
 
@@ -33,10 +71,6 @@ class Arguments:
     def error(self, declared: str, message: str, k: int | None = None) -> SceneError:
         """An error where that parameter's value stands, else at the directive."""
         return self.tokens.get(declared, self.word).error(message, k)
-
-    def require(self, declared: str, valid: bool, rule: str) -> None:
-        if not valid:
-            raise self.error(declared, f"{declared.split()[1]} must {rule}, it is {self.values[declared]}")
 
 
 @dataclass(frozen=True)
@@ -87,9 +121,10 @@ class Statement:
             raise self.word.error(f"{self.word} takes {what}, found {len(self.rest)}")
         return self.rest
 
-    def arguments(self, kinds: Kinds, rules: Mapping[str, Rule], at: int = 0) -> Arguments:
+    def arguments(self, at: int = 0) -> Arguments:
         """The kind of a `Shape "kind" "type name" value ...` and its parameters; `at`: how many strings precede the kind."""
         word, kind = self.word, self.string(at)
+        kinds = KINDS[word.text]
         defaults = kinds.get(kind.name())
         if defaults is None:
             raise kind.error(f"unknown {word} {kind}; {nearest(kind.name()[:60], kinds)}")
@@ -107,27 +142,21 @@ class Statement:
         for declared, value in values.items():
             if value is ...:
                 raise word.error(f"{word} {kind} must have a parameter {declared!r}")
-        found = Arguments(word, kind.name(), values, tokens)
-        for declared, (holds, rule) in rules.items():
-            if declared in tokens:
-                found.require(declared, bool(holds(values[declared])), rule)
-        return found
+        return Arguments(word, kind.name(), values, tokens)
 
 
 def statements(path: Path, text: str) -> Iterator[Statement]:
     """Splits `text` at its directives, known or not."""
-    word, rest = None, []
+    found: list[Token] = []
     for token in tokenize(path, text):
-        if token.kind != "word":
-            if word is None:
-                raise token.error(f"a directive must come first, found {token}")
-            rest.append(token)
-            continue
-        if word is not None:
-            yield Statement(word, tuple(rest))
-        word, rest = token, []
-    if word is not None:
-        yield Statement(word, tuple(rest))
+        if token.kind == "word" and found:
+            yield Statement(found[0], tuple(found[1:]))
+            found = []
+        elif token.kind != "word" and not found:
+            raise token.error(f"a directive must come first, found {token}")
+        found.append(token)
+    if found:
+        yield Statement(found[0], tuple(found[1:]))
 
 
 def _declared(place: str, token: Token, table: Parameters) -> str:
@@ -160,9 +189,11 @@ def _value(declared: str, token: Token) -> Any:
         raise token.error(f"{declared!r} must be finite, it is {token}")
     if kind == "integer" and not values[0].is_integer():
         raise token.error(f"{declared!r} must be a whole number, it is {values[0]}")
-    if count > 1:
-        return values
-    return int(values[0]) if kind == "integer" else float(values[0])
+    value = values if count > 1 else int(values[0]) if kind == "integer" else float(values[0])
+    holds, rule = _RULES.get(declared, (None, ""))
+    if holds is not None and not holds(value):
+        raise token.error(f"{declared.split()[1]} must {rule}, it is {value}")
+    return value
 
 
 def _amount(count: int | None, is_text: bool) -> str:

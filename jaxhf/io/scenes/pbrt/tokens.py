@@ -53,10 +53,7 @@ class Token:
     def error(self, message: str, k: int | None = None) -> SceneError:
         """An error on the line where this token begins, or on that of the k-th number inside a block."""
         at = 0 if k is None else [match.start() for match in re.finditer(r"\S+", self._body)][k]
-        return self._error_at(at, message)
-
-    def _error_at(self, offset: int, message: str) -> SceneError:
-        return SceneError(self.path, self.line + self._body.count("\n", 0, offset), message)
+        return SceneError(self.path, self.line + self._body.count("\n", 0, at), message)
 
     def name(self) -> str:
         """What a string holds between its quotes."""
@@ -75,7 +72,7 @@ class Token:
         end = match.end() if match else 0
         if end < len(body):
             word = body[end : end + 60].split()[0]
-            raise self._error_at(end, f"{word!r} in the bracket of line {self.line} is not a number")
+            raise self.error(f"{word!r} in the bracket of line {self.line} is not a number", len(body[:end].split()))
         return np.array(body.split(), dtype=np.float64)
 
     @property

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ....core.errors import ArgumentError, UserError
-from ...errors import SceneError, nearest
+from ...errors import SceneError, nearest, resolve_inside
 from .lines import Where, follow, line_of
 from .tables import Keys
 
@@ -39,21 +39,19 @@ class Part(NamedTuple):
         return SceneError(self.path, line_of(self.text, self.where), message)
 
     def read(self, keys: Keys) -> dict[str, Any]:
-        """The values of all `keys`, by their kinds; SceneError on any other key, and on one that is missing."""
+        """The values of those `keys` that are there, by their kinds; SceneError on any other key, and where one is needed."""
         self.require_known(keys)
         values = {}
         for name, key in keys.items():
-            if name not in self.table:
-                if key.default is ...:
-                    raise self.error(f"{self.name or 'a scene'} must have {name!r}, it is missing")
-                values[name] = key.default
-                continue
-            try:
-                values[name] = key.kind(self.table[name])
-            except (ValueError, OverflowError) as error:
-                shown = repr(self.table[name])
-                shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
-                raise self.at(name).error(f"{self.at(name).name} must be {error}, it is {shown}") from error
+            if name in self.table:
+                try:
+                    values[name] = key.kind(self.table[name])
+                except (ValueError, OverflowError) as error:
+                    shown = repr(self.table[name])
+                    shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
+                    raise self.at(name).error(f"{self.at(name).name} must be {error}, it is {shown}") from error
+            elif key.needed:
+                raise self.error(f"{self.name or 'a scene'} must have {name!r}, it is missing")
         return values
 
     def require_known(self, known: Iterable[str]) -> None:
@@ -91,6 +89,11 @@ class Part(NamedTuple):
         if len(present) > 1:
             raise self.at(second).error(f"{self.name} must have {first} or {second}, it has both")
         return present[0] if present else None
+
+    def file(self, key: str, reader: Callable[[Path], Any]) -> Any:
+        """What `reader` makes of the file whose name is the value of `key`."""
+        folder = self.path.parent
+        return self.at(key).made(lambda: reader(resolve_inside(folder, folder, self.table[key])))
 
     def made(self, function: Callable[..., Any], *args: Any, **values: Any) -> Any:
         """function(*args, **values); what the user got wrong becomes a SceneError, on the line of the key that is to blame."""

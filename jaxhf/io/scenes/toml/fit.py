@@ -1,7 +1,7 @@
 """Reads what to recover from which pictures: a scene with tables about pictures; `docs/guides/fit-files.md` describes it."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,47 +11,45 @@ from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
 from ....core.errors import ArgumentError, UserError
-from ....core.rules import OneOf, Whole
 from ....core.settings import Settings
 from ....scene.camera import Camera
 from ....scene.heightfield import Heightfield
 from ....scene.light import Light
 from ....scene.scene import Object, Scene
 from ...files import PathLike, by_ending, require_file, require_precision
-from ...pictures.images import load_image, load_numbers
+from ...pictures.images import load_numbers
 from ..pbrt.reader import load_pbrt
 from .checks import Part
-from .priors import Provenance, known_deviations, known_heights
-from .scene import named_file, open_toml, read_camera, read_lights, read_objects, read_scene, transfer_of
+from .priors import Provenance, known_heights
+from .scene import open_toml, read_camera, read_image, read_lights, read_samples, read_world
 from .tables import SCENE, Key, Keys, optional
-from .values import flag, number, numbers, or_word, table, tables, whole, word
+from .values import flag, number, numbers, or_word, positive, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
 _CASE: Keys = {
-    "scene": Key(word, None),
+    "scene": Key(word),
     **SCENE,
-    "camera": Key(table, None),
-    "objects": Key(tables, None),
-    "pictures": Key(tables),
-    "fit": Key(table, {}),
-    "settings": Key(table, {}),
+    "camera": Key(table),
+    "objects": Key(tables),
+    "pictures": Key(tables, needed=True),
+    **optional("fit", "settings", kind=table),
 }
 _PICTURE: Keys = {
-    "image": Key(word),
+    "image": Key(word, needed=True),
     **optional("transfer", "mask", "weights", kind=word),
-    **optional("noise", kind=number),
+    **optional("noise", kind=positive),
     **optional("camera", kind=table),
     **optional("lights", kind=tables),
 }
 _ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argument of `fit` is in such a table
-# Those of `fit`, `Prior`, `Unknown` and `Settings`, whose defaults they have and who check their values.
+# Those of `fit`, `Prior` and `Unknown`, whose defaults they have and who check their values.
 _FIT: Keys = {
     **optional("start", kind=or_word(number)),
-    **optional("noise", kind=number),
+    **optional("noise", kind=positive),
     **optional("draws", "max_steps", kind=whole),
     **optional("prior", "unknown", kind=table),
 }
-_PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number))), **optional("length", kind=number)}
+_PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number), needed=True)), **optional("length", kind=number)}
 _UNKNOWN: Keys = {
     **optional("albedo", kind=word),
     **optional("albedo_std", "light_std", kind=number),
@@ -59,10 +57,6 @@ _UNKNOWN: Keys = {
     **optional("camera_std", kind=numbers(2)),
 }
 _ARGUMENTS = {("fit",): _FIT, ("fit", "prior"): _PRIOR, ("fit", "unknown"): _UNKNOWN}
-_SETTINGS: Keys = {
-    knob.name: Key({OneOf: word, Whole: whole}.get(type(knob.metadata["rule"]), flag), None)
-    for knob in dataclasses.fields(Settings)
-}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,13 +101,13 @@ class Case:
 
 
 class _Base(NamedTuple):
-    """What the pictures have in common; the camera is made for a picture of so many rows and columns."""
+    """What the pictures have in common."""
 
-    objects: tuple[Object, ...]
-    lights: tuple[Light, ...]
-    samples: int
-    camera: Callable[[tuple[int, ...]], Camera] | None
+    objects: Sequence[Object]
+    lights: Sequence[Light]
     field: Provenance  # of the first heightfield, which the fit recovers
+    samples: int
+    view: Part | Camera | None  # the camera, or its table
 
 
 def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
@@ -126,20 +120,20 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         raise part.error("a fit must have 'pictures', those that were measured; this is a scene, for `jaxhf render`")
     values = part.read(_CASE)
     chosen = part.at("settings")
-    settings = chosen.made(Settings, **_given(chosen, _SETTINGS))
+    chosen.require_known([knob.name for knob in dataclasses.fields(Settings)])
+    settings = chosen.made(Settings, **chosen.table)
     base = _base(part, values, dtype)
     if not values["pictures"]:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
     chosen = part.at("fit")
-    options, unknown = _given(chosen, _FIT), _given(chosen.at("unknown"), _UNKNOWN)
-    prior = _given(chosen.at("prior"), _PRIOR) if "prior" in options else {}
+    options, unknown = chosen.read(_FIT), chosen.at("unknown").read(_UNKNOWN)
+    prior = chosen.at("prior").read(_PRIOR) if "prior" in options else {}
     noise, *_ = (options.pop(name, None) for name in ("noise", "prior", "unknown"))
     for place, given in ((chosen, options), (chosen.at("prior"), prior)):
         for name, value in given.items():
             if isinstance(value, str):
-                reader = known_deviations if name == "std" else known_heights
-                given[name] = _read(place, name, partial(reader, base.field), value)
-    pictures = [_picture(picture, base, chosen, noise) for picture in part.all("pictures")]
+                given[name] = place.file(name, partial(known_heights, base.field, name == "std"))
+    pictures = [_picture(picture, base, noise) for picture in part.all("pictures")]
     scenes, targets, weights, noises, names = zip(*pictures, strict=True)
     known = [value for value in noises if value is not None]
     if known and len(known) < len(noises):
@@ -150,65 +144,42 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     )  # fmt: skip
 
 
-def _picture(
-    part: Part, base: _Base, chosen: Part, noise: float | None
-) -> tuple[Scene, np.ndarray, np.ndarray | None, float | None, str]:
-    """A picture's scene, radiance, weights, noise and name; `noise` is that of the table `chosen`, for all pictures."""
+def _picture(part: Part, base: _Base, noise: float | None) -> tuple[Scene, np.ndarray, np.ndarray | None, float | None, str]:
+    """A picture's scene, radiance, weights, noise and name; `noise` is that of pictures that state none."""
     given = part.read(_PICTURE)
-    target = _read(part, "image", partial(load_image, transfer=transfer_of(part)), given["image"])
-    lights = base.lights if given["lights"] is None else read_lights(part, base.field.stored)
+    target = read_image(part)
+    lights = read_lights(part, base.field.stored) if "lights" in given else base.lights
     scene = part.made(Scene, base.objects, _camera(part, base, target.shape[:2]), lights, base.samples)
-    weights = _weights(part, given, target)
-    place, noise = (chosen, noise) if given["noise"] is None else (part, given["noise"])
-    if noise is not None and not noise > 0:
-        place = place.at("noise")
-        raise place.error(f"{place.name} must be positive, it is {noise:g}")
-    return scene, target, weights, noise, given["image"]
-
-
-def _given(part: Part, keys: Keys) -> dict[str, Any]:
-    return {name: value for name, value in part.read(keys).items() if name in part.table}
+    return scene, target, _weights(part, target), given.get("noise", noise), given["image"]
 
 
 def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:
-    if values["scene"] is None:
-        if values["objects"] is None:
-            raise part.error("a fit must have 'scene', the name of a scene file, or 'objects', both are missing")
-        return _toml_base(part, values["samples"], dtype)
-    for name in SCENE:
-        if name in part.table:
-            raise part.at(name).error(f"{name} must stand without scene, whose file has its own")
-    place = part.at("scene")
-    path = place.made(named_file, part, values["scene"])
-    if place.made(by_ending, {".toml": True, ".pbrt": False}, path, "read a scene from"):
-        other = open_toml(path)
-        return _toml_base(other, read_scene(other)["samples"], dtype)
-    scene = load_pbrt(path, dtype)
-    fields = (Provenance.of(item.shape) for item in scene.objects if isinstance(item.shape, Heightfield))
-    return _Base(scene.objects, scene.lights, scene.samples, lambda _: scene.camera, next(fields, Provenance()))
+    samples = values.get("samples", 1)
+    if "scene" in values:
+        for name in SCENE:
+            if name in part.table:
+                raise part.at(name).error(f"{name} must stand without scene, whose file has its own")
+        place = part.at("scene")
+        path = part.file("scene", Path)
+        if place.made(by_ending, {".toml": False, ".pbrt": True}, path, "read a scene from"):
+            scene = load_pbrt(path, dtype)
+            fields = (Provenance.of(item.shape) for item in scene.objects if isinstance(item.shape, Heightfield))
+            return _Base(scene.objects, scene.lights, next(fields, Provenance()), scene.samples, scene.camera)
+        part = open_toml(path)
+        samples = read_samples(part)
+    elif "objects" not in values:
+        raise part.error("a fit must have 'scene', the name of a scene file, or 'objects', both are missing")
+    return _Base(*read_world(part, dtype), samples, part.at("camera") if "camera" in part.table else None)
 
 
-def _toml_base(part: Part, samples: int, dtype: np.dtype) -> _Base:
-    objects = read_objects(part, dtype)
-    camera = partial(_sized, part.at("camera")) if "camera" in part.table else None
-    field = next((field for _, field in objects if field is not None), Provenance())
-    lights = read_lights(part, field.stored)
-    return _Base(tuple(item for item, _ in objects), tuple(lights), samples, camera, field)
-
-
-def _read(part: Part, key: str, reader: Callable[[Path], Any], name: str) -> Any:
-    """What `reader` makes of the file whose `name` is the value of `key`."""
-    return part.at(key).made(lambda: reader(named_file(part, name)))
-
-
-def _weights(picture: Part, given: dict[str, Any], target: np.ndarray) -> Float32[np.ndarray, "h w"] | None:
+def _weights(picture: Part, target: np.ndarray) -> Float32[np.ndarray, "h w"] | None:
     present = picture.at_most_one("mask", "weights")
     size = target.shape[:2]
-    declares = Path(given["image"]).suffix.lower() in (".tif", ".tiff")  # a nan elsewhere is for `fit` to refuse
+    declares = Path(picture.table["image"]).suffix.lower() in (".tif", ".tiff")  # a nan elsewhere is for `fit` to refuse
     there = ~np.isnan(target[..., 0]) if declares else np.ones(size, bool)
     if present is None:
         return None if there.all() else there.astype(np.float32)
-    weights = _read(picture, present, load_numbers, given[present]).mean(axis=-1)
+    weights = picture.file(present, load_numbers).mean(axis=-1)
     if weights.shape != size:
         place = picture.at(present)
         raise place.error(f"{place.name} must have the size of the image, {_by(size)}; it is {_by(weights.shape)}")
@@ -217,26 +188,19 @@ def _weights(picture: Part, given: dict[str, Any], target: np.ndarray) -> Float3
 
 
 def _camera(picture: Part, base: _Base, size: tuple[int, ...]) -> Camera:
-    if "camera" in picture.table:
-        camera = _sized(picture.at("camera"), size)
-    elif base.camera is not None:
-        camera = base.camera(size)
-    else:
+    """The camera of a picture with so many rows and columns, which are its own where its table states none."""
+    view, (height, width) = picture.at("camera") if "camera" in picture.table else base.view, size
+    if view is None:
         raise picture.error(f"{picture.name} must have a camera: there is none for all pictures")
-    height, width = size
+    if isinstance(view, Part) and view.table.keys().isdisjoint(("width", "height")):
+        view = view._replace(table={**view.table, "height": height, "width": width})
+    camera = read_camera(view) if isinstance(view, Part) else view
     if height != round(width * camera.height / camera.width) and width != round(height * camera.width / camera.height):
         stated = _by((camera.height, camera.width))
         raise picture.at("image").error(
             f"{picture.name}.image must have the proportions of its camera, {stated}; it is {_by(size)}"
         )
     return dataclasses.replace(camera, width=width, height=height)
-
-
-def _sized(view: Part, size: tuple[int, ...]) -> Camera:
-    """A camera that has the size of its picture where its table states none."""
-    if "width" in view.table or "height" in view.table:
-        return read_camera(view)
-    return read_camera(view._replace(table={**view.table, "height": size[0], "width": size[1]}))
 
 
 def _by(size: tuple[int, ...]) -> str:

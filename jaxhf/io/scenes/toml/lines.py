@@ -10,10 +10,6 @@ def line_of(text: str, where: Where) -> int | None:
     """The line on which the value of `where` begins, or the nearest table around it; None: that is the whole file.
 
     It is the line behind the longest beginning of the file that is TOML and does not hold it.
-
-    Args:
-      text: valid TOML.
-      where: the way to a value, of which the last steps may be missing.
     """
     lines, begin, deepest, found = text.split("\n"), 1, 0, None
     for end, line in enumerate(lines, 1):

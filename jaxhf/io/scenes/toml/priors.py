@@ -23,14 +23,14 @@ class Provenance:
       placed: where the scene puts it; None: there is no heightfield.
       stored: its file, in that file's coordinates; None: there is none.
       path: that file.
-      moved: whether its table has any of dx, dy, x0 and y0.
+      like: that, where it is a GeoTIFF whose georeference the heights have: the table moves it by none of dx, dy, x0 and y0.
       z_scale, nodata: of its table, or their defaults.
     """
 
     placed: Terrain | None = None
     stored: Terrain | None = None
     path: Path | None = None
-    moved: bool = False
+    like: Path | None = None
     z_scale: float = 1.0
     nodata: float | None = None
 
@@ -39,11 +39,6 @@ class Provenance:
         """That of heights in no file. They have a `crs` if `grid`, the keys of their table, has x0, y0 and the cell size."""
         crs = CoordinateSystem() if {"x0", "y0"} <= set(grid) and not {"dx", "dy"}.isdisjoint(grid) else None
         return cls(Terrain(np.asarray(field.heights), field.dx, field.dy, field.x0, field.y0, crs), z_scale=z_scale)
-
-    @property
-    def like(self) -> Path | None:
-        """The GeoTIFF whose georeference the heights have; None: there is none."""
-        return self.path if self.path and not self.moved and self.path.suffix.lower() in (".tif", ".tiff") else None
 
     def grid(self, path: Path, other: Terrain) -> Terrain | None:
         """Its grid in coordinates that can be compared with those of `other`, which is the file `path`.
@@ -58,8 +53,8 @@ class Provenance:
         return self.stored if same else self.placed
 
 
-def known_heights(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
-    """Heights as `start` and `prior` of `fit` take them.
+def known_heights(field: Provenance, deviations: bool, path: Path) -> Float[np.ndarray, "my mx"]:
+    """Heights as `start` and `prior` of `fit` take them, or their standard `deviations`, which have no sign.
 
     If the file and the terrain both have a `crs`: its heights, resampled to the terrain's vertices. Else the heights of the
     file as they are, which `fit` stretches over the terrain from corner to corner.
@@ -67,7 +62,8 @@ def known_heights(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
     Raises:
       FileNotFoundError, ValueError: as `load_heights`; or the file does not cover the terrain, or has holes in it.
     """
-    terrain = read_terrain(path, field.z_scale, field.nodata, nodata_overrules=False)
+    z_scale = abs(field.z_scale) if deviations else field.z_scale
+    terrain = read_terrain(path, z_scale, field.nodata, nodata_overrules=False)
     heights, grid = terrain.heights, field.grid(path, terrain)
     if terrain.crs is not None and grid is not None and grid.crs is not None:
         if terrain.crs.degrees and not grid.crs.degrees:
@@ -80,8 +76,3 @@ def known_heights(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
             f"it must have a height everywhere, {len(holes)} of {heights.size} are holes; the first is row {iy} column {ix}"
         )
     return heights
-
-
-def known_deviations(field: Provenance, path: Path) -> Float[np.ndarray, "my mx"]:
-    """Standard deviations of such heights; they have no sign."""
-    return known_heights(dataclasses.replace(field, z_scale=abs(field.z_scale)), path)

@@ -4,13 +4,14 @@ Which keys there are stands in `tables.py`; any other key, a value of another ty
 are errors.
 """
 
+import functools
 import re
 import tomllib
-import warnings
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
 from ....core.affine import invertible
@@ -21,27 +22,26 @@ from ....scene import procedural
 from ....scene.camera import Camera
 from ....scene.cylinder import Cylinder
 from ....scene.heightfield import Heightfield
-from ....scene.light import Directional, Light
+from ....scene.light import Light
 from ....scene.scene import Object, Scene
 from ....scene.texture import ImageTexture, Wrap
-from ...errors import SceneError, nearest, resolve_inside
+from ...errors import SceneError, nearest
 from ...pictures.images import TRANSFERS, load_image
 from ...terrain.load import jacksboro_file, read_terrain
 from ...terrain.terrain import Terrain
 from .checks import Part
 from .priors import Provenance
-from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, OBJECT, ORIGINS, SCENE, TEXTURES, Key, Keys
+from .tables import CAMERAS, CYLINDER, GRID, HEIGHTS, LIGHTS, MATERIALS, OBJECT, ORIGINS, SCENE, TEXTURES, Key, Keys, optional
 from .values import word
 
 
 def load_toml(path: Path, dtype: DTypeLike = np.float32) -> Scene:
     """The scene that a .toml file describes; arguments and errors as those of `load_scene`."""
     part = open_toml(path)
-    values = read_scene(part)
+    samples = read_samples(part)
     camera = read_camera(part.at("camera"))
-    objects = read_objects(part, np.dtype(dtype))
-    lights = read_lights(part, next((known.stored for _, known in objects if known and known.stored), None))
-    return part.made(Scene, [item for item, _ in objects], camera, lights, samples=values["samples"])
+    objects, lights, _ = read_world(part, np.dtype(dtype))
+    return part.made(Scene, objects, camera, lights, samples)
 
 
 def open_toml(path: Path) -> Part:
@@ -59,12 +59,21 @@ def open_toml(path: Path) -> Part:
     return Part(path, text, (), content)
 
 
-def read_scene(part: Part) -> dict[str, Any]:
-    """The values of a scene's outermost table."""
+def read_samples(part: Part) -> int:
+    """The samples of a scene, with all of its outermost table checked."""
     for name in ("pictures", "fit"):
         if name in part.table:
             raise part.at(name).error(f"{name!r} makes this a fit file, for `jaxhf fit`; a scene has no such table")
-    return part.read(SCENE)
+    return part.read(SCENE).get("samples", 1)
+
+
+def read_world(part: Part, dtype: np.dtype) -> tuple[list[Object], list[Light], Provenance]:
+    """The objects of a scene with its textures, its lights, and where the first heightfield is from."""
+    textures = {name: _texture(part.at("textures", name)) for name in part.table.get("textures", {})}
+    objects = [_object(item, textures, dtype) for item in part.all("objects")]
+    known = [field for _, field in objects if field is not None]
+    terrain = next((field.stored for field in known if field.stored), None)
+    return [item for item, _ in objects], read_lights(part, terrain), known[0] if known else Provenance()
 
 
 def read_camera(part: Part) -> Camera:
@@ -84,17 +93,7 @@ def _light(part: Part, terrain: Terrain | None) -> Light:
             )
         latitude, longitude = part.made(lambda: terrain.place)
         part = part._replace(table={**part.table, "latitude": latitude, "longitude": longitude})
-    light = _variant(part, "type", LIGHTS)
-    if isinstance(light, Directional) and "radiance" in part.table:
-        old = part.at("radiance")
-        warnings.warn(str(old.error(f"{old.name} is now called irradiance")), DeprecationWarning, stacklevel=2)
-    return light
-
-
-def read_objects(part: Part, dtype: np.dtype) -> list[tuple[Object, Provenance | None]]:
-    """The objects of a scene with its textures; beside each heightfield, where it is from."""
-    textures = {name: _texture(part.at("textures", name)) for name in part.table.get("textures", {})}
-    return [_object(item, textures, dtype) for item in part.all("objects")]
+    return _variant(part, "type", LIGHTS)
 
 
 def _variant(part: Part, key: str, variants: Any) -> Any:
@@ -108,44 +107,34 @@ def _variant(part: Part, key: str, variants: Any) -> Any:
 def _texture(part: Part) -> ImageTexture:
     if part.one_of(("image", "source"), {key for _, keys in TEXTURES.values() for key in keys}) == "source":
         return ImageTexture(_variant(part, "source", TEXTURES))
-    name = part.read({"image": Key(word), "transfer": Key(word, None), "wrap": Key(word, None)})["image"]
-    transfer, wrap = transfer_of(part), part.choice("wrap", get_args(Wrap), "repeat")
+    part.read(optional("image", "transfer", "wrap", kind=word))
+    image, wrap = read_image(part), part.choice("wrap", get_args(Wrap), "repeat")
     # An image starts at its top, a texture at v = 0: so it lies on a map with the north up.
-    image = part.at("image").made(lambda: load_image(named_file(part, name), transfer=transfer)[::-1])
-    return part.at("image").made(ImageTexture, image, wrap=wrap)
+    return part.at("image").made(ImageTexture, image[::-1], wrap=wrap)
 
 
-def transfer_of(part: Part) -> str | None:
-    """What the table of an image says of its whole numbers, see `load_image`."""
-    return part.choice("transfer", TRANSFERS) if "transfer" in part.table else None
-
-
-def named_file(part: Part, name: str) -> Path:
-    return resolve_inside(part.path.parent, part.path.parent, name)
+def read_image(part: Part) -> Float32[np.ndarray, "h w 3"]:
+    """The picture that a table names; it may say what the whole numbers in it are, see `load_image`."""
+    transfer = part.choice("transfer", TRANSFERS) if "transfer" in part.table else None
+    return part.file("image", functools.partial(load_image, transfer=transfer))
 
 
 def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> tuple[Object, Provenance | None]:
     is_field = part.choice("shape", ("heightfield", "cylinder")) == "heightfield"
     make_material, material_keys = MATERIALS[part.choice("material", MATERIALS, "matte")]
     common: Keys = {**OBJECT, **material_keys}
-    shape_keys = _field_keys(part, common) if is_field else CYLINDER
-    values = part.read({**common, **shape_keys})
-    world = _world_from_object(part, values)
-    material = part.made(make_material, **{name: _painted(part.at(name), values[name], textures) for name in material_keys})
-    shape_values = {name: values[name] for name in shape_keys}
-    if is_field:
-        shape, known = part.made(_heightfield, part, shape_values, dtype)
-    else:
-        shape, known = part.made(Cylinder, **shape_values), None
-    return Object(shape, material, world), known
-
-
-def _world_from_object(part: Part, values: dict[str, Any]) -> np.ndarray | None:
+    values = part.read({**common, **(_field_keys(part, common) if is_field else CYLINDER)})
     given = part.at_most_one("transform", "matrix")
-    if given is None:
-        return None
-    part.made(require, "", given, values[given], invertible)
-    return values[given]
+    world = values[given] if given else None
+    if given:
+        part.made(require, "", given, world, invertible)
+    paint = {name: _painted(part.at(name), values[name], textures) for name in material_keys & values.keys()}
+    material = part.made(make_material, **paint)
+    if is_field:
+        shape, known = part.made(_heightfield, part, values, dtype)
+    else:
+        shape, known = part.made(Cylinder, **{name: values[name] for name in CYLINDER & values.keys()}), None
+    return Object(shape, material, world), known
 
 
 def _painted(part: Part, value: Any, textures: dict[str, ImageTexture]) -> Any:
@@ -164,20 +153,20 @@ def _field_keys(part: Part, common: Keys) -> Keys:
 
 
 def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> tuple[Heightfield, Provenance]:
-    if values["z_scale"] == 0:
+    z_scale, source = values.get("z_scale", 1.0), values.get("source")
+    if z_scale == 0:
         raise ArgumentError("", "z_scale", "must not be zero, it is 0")
-    source = values.get("source")
-    grid = {name: values[name] for name in ("dx", "dy", "x0", "y0") if values[name] is not None}
+    grid = {name: values[name] for name in ("dx", "dy", "x0", "y0") if name in values}
     if "file" in values or source == "jacksboro":
 
-        def load() -> Provenance:
-            path = named_file(part, values["file"]) if "file" in values else None
-            z_scale, nodata = values["z_scale"], values.get("nodata")
-            stored = read_terrain(path or jacksboro_file(), z_scale, nodata)
-            return Provenance(stored.in_metres(**grid), stored, path, bool(grid), z_scale, nodata)
+        def load(path: Path | None = None) -> Provenance:
+            stored = read_terrain(path or jacksboro_file(), z_scale, values.get("nodata"))
+            like = path if path and not grid and path.suffix.lower() in (".tif", ".tiff") else None
+            return Provenance(stored.in_metres(**grid), stored, path, like, z_scale, values.get("nodata"))
 
-        known = part.at("source" if source else "file").made(load)
+        known = part.at("source").made(load) if source else part.file("file", load)
         return known.placed.heightfield(dtype), known
-    heights = procedural.HEIGHTS[source](**{name: values[name] for name in HEIGHTS[source]}) if source else values["heights"]
-    field = Heightfield(fitted(heights * values["z_scale"], dtype), **grid)
-    return field, Provenance.of(field, grid, values["z_scale"])
+    chosen = {name: values[name] for name in HEIGHTS[source] & values.keys()} if source else {}
+    heights = procedural.HEIGHTS[source](**chosen) if source else values["heights"]
+    field = Heightfield(fitted(heights * z_scale, dtype), **grid)
+    return field, Provenance.of(field, grid, z_scale)

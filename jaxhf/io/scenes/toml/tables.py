@@ -15,37 +15,33 @@ from . import values as kinds
 
 
 class Key(NamedTuple):
-    """What a key takes. Without a `default` it must be there; where that is None, the reader decides."""
+    """What a key takes, and whether it must be there."""
 
     kind: kinds.Kind
-    default: Any = ...
+    needed: bool = False
 
 
-Keys = Mapping[str, Key]
+Keys = dict[str, Key]
 
 
 def optional(*names: str, kind: kinds.Kind | None = None) -> Keys:
     """Keys that may be missing, of one kind or, where that is None, of those that their names say."""
-    return {name: Key(kind or _KINDS[name], None) for name in names}
+    return {name: Key(kind or _KINDS[name]) for name in names}
 
 
-def _directional(irradiance, radiance=None, kind: type[Directional] = Directional, **given) -> Directional:
-    if irradiance is not None and radiance is not None:
-        raise ArgumentError("", "radiance", "must stand without irradiance, whose old name it is")
-    irradiance = radiance if irradiance is None else irradiance
-    given = {name: value for name, value in given.items() if value is not None}
+def _directional(kind: type[Directional] = Directional, **given) -> Directional:
     ways = [keys for keys in (("towards",), ("azimuth", "altitude"), ("time", "latitude", "longitude")) if given.keys() & keys]
     if len(ways) > 1:
         first, *_ = given.keys() & ways[0]
         raise ArgumentError("", first, f"must stand without {' and '.join(ways[1])}, it says the same")
     if "towards" in given:
-        return kind(**given, irradiance=irradiance)
+        return kind(**given)
     if "time" in given or "latitude" in given or "longitude" in given:
         for name in ("time", "latitude", "longitude"):
             if name not in given:
                 raise ArgumentError("", name, "must be given with time, latitude and longitude, it is missing")
-        return kind.at(**given, irradiance=irradiance)
-    return kind.from_angles(**given, irradiance=irradiance)
+        return kind.at(**given)
+    return kind.from_angles(**given)
 
 
 def _point(position, intensity) -> Point:
@@ -71,34 +67,33 @@ _KINDS: Mapping[str, kinds.Kind] = {
 }
 
 
-def _keys(function: Callable[..., Any], **defaults: Any) -> Keys:
-    """The parameters of a function, with its defaults where there are no others."""
+def _keys(function: Callable[..., Any], *needed: str) -> Keys:
+    """The parameters of a function; those without a default are needed, too."""
     given = inspect.signature(function).parameters.values()
-    own = {p.name: ... if p.default is p.empty else p.default for p in given}
-    return {name: Key(_KINDS[name], default) for name, default in {**own, **defaults}.items()}
+    return {p.name: Key(_KINDS[p.name], p.name in needed or p.default is p.empty) for p in given}
 
 
 SCENE: Keys = {
-    "samples": Key(kinds.whole, 1),
-    "camera": Key(kinds.table),
-    "lights": Key(kinds.tables, []),
-    "textures": Key(kinds.table_of_tables, {}),
-    "objects": Key(kinds.tables),
+    "samples": Key(kinds.whole),
+    "camera": Key(kinds.table, needed=True),
+    "lights": Key(kinds.tables),
+    "textures": Key(kinds.table_of_tables),
+    "objects": Key(kinds.tables, needed=True),
 }
 CAMERAS: dict[str, tuple[Callable[..., Camera], Keys]] = {
     "perspective": (Perspective.look_at, _keys(Perspective.look_at)),
-    "orthographic": (Orthographic.look_at, _keys(Orthographic.look_at, extent=...)),
+    "orthographic": (Orthographic.look_at, _keys(Orthographic.look_at, "extent")),
     "pinhole": (Perspective.from_intrinsics, _keys(Perspective.from_intrinsics)),
 }
 _DIRECTION = optional("towards", "azimuth", "altitude", "time", "latitude", "longitude", "irradiance")
 LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
-    "directional": (_directional, {**_DIRECTION, **optional("radiance")}),  # the old name of irradiance
+    "directional": (_directional, _DIRECTION),
     "sun": (functools.partial(_directional, kind=Sun), {**_DIRECTION, **optional("angular_diameter", "chords")}),
     "point": (_point, _keys(_point)),
     "sky": (Sky, _keys(Sky)),
 }
 MATERIALS: dict[str, tuple[Callable[..., Material], Keys]] = {
-    "matte": (Matte, _keys(Matte, albedo=0.7)),
+    "matte": (functools.partial(Matte, albedo=0.7), _keys(functools.partial(Matte, albedo=0.7))),
     "mirror": (Mirror, _keys(Mirror)),
 }
 TEXTURES = {name: (function, _keys(function)) for name, function in procedural.TEXTURES.items()}
@@ -107,15 +102,14 @@ HEIGHTS: dict[str, Keys] = {
     **{name: _keys(function) for name, function in procedural.HEIGHTS.items()},
 }
 ORIGINS: dict[str, Keys] = {  # where a heightfield comes from
-    "heights": {"heights": Key(kinds.grid)},
-    "file": {"file": Key(kinds.word), **optional("nodata", kind=kinds.number)},
-    "source": {"source": Key(kinds.word)},
+    "heights": optional("heights", kind=kinds.grid),
+    "file": {**optional("file", kind=kinds.word), **optional("nodata", kind=kinds.number)},
+    "source": optional("source", kind=kinds.word),
 }
-GRID: Keys = {**optional("dx", "dy", "x0", "y0", kind=kinds.number), "z_scale": Key(kinds.number, 1.0)}
+GRID = optional("dx", "dy", "x0", "y0", "z_scale", kind=kinds.number)
 CYLINDER = _keys(Cylinder)
 OBJECT: Keys = {
-    "shape": Key(kinds.word),
-    "material": Key(kinds.word, "matte"),
-    "transform": Key(kinds.steps, None),
-    "matrix": Key(kinds.matrix, None),
+    **optional("shape", "material", kind=kinds.word),
+    **optional("transform", kind=kinds.steps),
+    **optional("matrix", kind=kinds.matrix),
 }

@@ -68,10 +68,8 @@ def number(value: Any) -> float:
     return _in_range(value)
 
 
-def angle_above_horizon(value: Any) -> float:
-    if not -90 <= number(value) <= 90:
-        raise ValueError("from -90 to 90 degrees")
-    return float(value)
+positive = _kind(lambda value: number(value) > 0, "positive")
+angle_above_horizon = _kind(lambda value: -90 <= number(value) <= 90, "from -90 to 90 degrees")
 
 
 def or_word(kind: Kind, tail: str = " or a string") -> Kind:
