@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from ...rendering.render import render_each
@@ -228,8 +227,10 @@ def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
     moves = _moves(unknowns, problem, group)
     if not jax.tree.leaves(moves):
         return group.scenes
-    found = lax.map(lambda seen: moved(*seen), (group.scenes.lights, group.scenes.camera, moves))
-    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, found)
+    seen = group.scenes.lights, group.scenes.camera, moves
+    found = [moved(*jax.tree.map(lambda leaf, n=n: leaf[n], seen)) for n in range(len(group.indices))]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, stacked)
 
 
 def completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
