@@ -271,6 +271,7 @@ def test_a_real_sweep(tmp_path, sweep):
     ("options", "message"),
     [
         (["--error", "-1"], "--error must be positive, it is -1"), (["--knobs", "x"], "one is 'x'"),
+        (["--knobs", "x"], "knobs must be among "),
         (["--width", "0"], "--width must be positive, it is 0"), (["--devices", "-1"], "--devices must be positive, it is -1"),
     ],
 )  # fmt: skip
