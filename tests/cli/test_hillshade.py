@@ -1,4 +1,4 @@
-"""`jaxhf hillshade`, `slope`, `aspect`, `relief` and `convert`: maps in their place, terrains that come back as they were."""
+"""`jaxhf hillshade`, `slope`, `aspect` and `relief`: maps in their place."""
 
 import subprocess
 import sys
@@ -11,12 +11,6 @@ from PIL import Image
 import jaxhf
 from jaxhf import Terrain
 from jaxhf.cli.main import main
-
-
-def plane(east: float, north: float) -> Terrain:
-    """A plane on a map, its cells twice as high as wide."""
-    rows, columns = np.mgrid[:6, :9]
-    return Terrain(30.0 * east * columns + 60.0 * north * rows, 30.0, 60.0, 5e5, 4.1e6)
 
 
 def hills(holes: bool = True) -> Terrain:
@@ -95,35 +89,3 @@ def test_maps_and_conversions_do_without_jax(tmp_path):
     )
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, cwd=tmp_path)
     assert run.stdout.splitlines()[-1:] == ["set()"], run.stderr
-
-
-def test_conversion_keeps_heights_and_place(tmp_path, command):
-    pytest.importorskip("rasterio")
-    terrain = plane(0.5, 0.25)
-    terrain.heights[2, 3] = np.nan
-    jaxhf.save_heights(tmp_path / "one.npz", terrain)
-    code, out, _ = command("convert", tmp_path / "one.npz", tmp_path / "two.tif")
-    assert (code, "6 x 9 heights, cells 30 x 60, origin (500000, 4.1e+06)" in out) == (0, True)
-    found = jaxhf.load_heights(tmp_path / "two.tif")
-    np.testing.assert_array_equal(found.heights, terrain.heights)
-    assert (found.dx, found.dy, found.x0, found.y0) == (30, 60, 5e5, 4.1e6)
-    code, out, _ = command("convert", tmp_path / "two.tif", tmp_path / "three.npy", "--z-scale", 2, "--nodata", 0)
-    assert (code, ".npy holds the heights alone" in out) == (0, True)
-    expected = np.where(terrain.heights == 0, np.nan, 2 * terrain.heights)
-    np.testing.assert_array_equal(np.load(tmp_path / "three.npy"), expected)
-
-
-def test_conversion_says_what_is_left_out(tmp_path, command):
-    """And refuses before it reads."""
-    for name, top, said in (
-        ("out.png", 0.25, " (.png holds whole numbers: heights are rounded to steps of 1)\n"),
-        ("out.png", 1, "\n"),
-        ("out.exr", 1, " (.exr holds the heights alone)\n"),
-    ):
-        if name.endswith(".exr"):
-            pytest.importorskip("OpenEXR")
-        jaxhf.save_heights(tmp_path / "in.npz", Terrain(top * np.eye(3)))
-        code, out, _ = command("convert", tmp_path / "in.npz", tmp_path / name)
-        assert (code, out.endswith(f"range (0, {top}){said}")) == (0, True)
-    code, _, err = command("convert", tmp_path / "missing.tif", tmp_path / "out.jpg")
-    assert (code, "cannot write heights with the ending '.jpg'" in err) == (2, True)
