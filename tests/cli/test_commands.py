@@ -52,6 +52,7 @@ BROKEN = {
     'Shape "heightfield" "integer nu" [2] "integer nv" [2] "float Pz" [0 1 2]\nWorldEnd\n',
     "image.toml": SCENE.replace("'rock.png'", "'none.png'").replace("samples = 1\n", ""),
     "none.png": "none",
+    "bare.toml": CAMERA + 'objects = [{ shape = "cylinder" }]',
     "vrt.toml": SCENE.replace("hills.npy", "x.vrt"),
     "x.vrt": "",
 }
@@ -124,6 +125,7 @@ REFUSED = [
     ("view hills.npz -o a.png --exaggeration 1e9", "must leave a terrain at most 100 times its length high; times 1e+09 it"),
     ("view hills.npz -o a.png --demo", "IN or --demo must say what to show, not both"),
     ("view", "there is neither"),
+    ("tradeoff bare.toml", "bare.toml: there is no heightfield"),
     ("tradeoff scene.toml --error -1", "--error must be positive, it is -1"),
     ("tradeoff scene.toml --knobs x", "knobs must be among "),
     ("tradeoff scene.toml --knobs x", "; one is 'x'"),
