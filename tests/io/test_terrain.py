@@ -167,7 +167,7 @@ def lying_tiff(path, side):
     path.write_bytes(data)
 
 
-def raster(values=NORTH_FIRST, **options):
+def raster(values: np.ndarray = NORTH_FIRST, **options):
     return lambda path: geotiffs.write(path, values, **options)
 
 
