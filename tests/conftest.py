@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import jax
+import jaxtyping
 import pytest
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -91,6 +92,14 @@ def seeds() -> Path:
     if not SEEDS.is_dir():
         pytest.skip("shared/pbrt, the larger seed scenes with pbrt-v2's references, are not beside the project")
     return SEEDS
+
+
+@pytest.fixture
+def as_users_call_it() -> Iterator[None]:
+    """Where nobody checks annotations: else jaxtyping refuses much of what a message of ours answers."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

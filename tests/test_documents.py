@@ -1,6 +1,5 @@
 """What the documents say is so: each page's blocks run, in the reader's own configuration, and the site builds strictly."""
 
-import doctest
 import re
 import shlex
 import shutil
@@ -8,7 +7,6 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -166,14 +164,10 @@ def test_the_photographs_show_what_is_found_in_them(reader):
     assert 0.55 < np.mean(np.abs(off) < jaxhf.load_heights("heights_std.npz").heights) < 0.85  # of normal ones 0.68
 
 
-def test_docstrings_have_examples_that_run(reader):
-    """Blocks and prompts in docstrings, if there are any."""
+def test_docstrings_leave_examples_to_the_pages():
+    """Where they run."""
     for path in (ROOT / "jaxhf").rglob("*.py"):
-        text = path.read_text()
-        assert "```" not in text, f"{path}: examples in docstrings stand after >>>"
-        if ">>>" in text:
-            failed, _ = doctest.testmod(import_module(".".join(path.relative_to(ROOT).with_suffix("").parts)))
-            assert not failed, path
+        assert not re.search("```|>>>", path.read_text()), path
 
 
 def test_pages_are_easy_to_read():

@@ -12,10 +12,18 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def test_versions_agree():
+def test_version_and_license_are_named_alike():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert f"\nversion: {project['version']}\n" in (ROOT / "CITATION.cff").read_text()
-    assert f"## {project['version']}" in (ROOT / "CHANGELOG.md").read_text()
+    citation, changes, readme, license = (
+        (ROOT / name).read_text() for name in ("CITATION.cff", "CHANGELOG.md", "README.md", "LICENSE")
+    )
+    assert f"\nversion: {project['version']}\n" in citation
+    assert f"## {project['version']}" in changes
+    assert project["license"] == "Apache-2.0"
+    assert "\nlicense: Apache-2.0\n" in citation
+    assert "[Apache-2.0](LICENSE)" in readme
+    assert "Version 2.0, January 2004" in license
+    assert "the jaxhf authors" in license
 
 
 @pytest.mark.slow
@@ -38,13 +46,3 @@ def test_wheel_and_sdist(tmp_path):
     for command in ("info heights.asc", "hillshade heights.asc -o shade.png", "view heights.asc -o view.png --size 64x48"):
         subprocess.run([programs / "jaxhf", *command.split()], cwd=tmp_path, check=True)
     assert (tmp_path / "view.png").stat().st_size > 500
-
-
-def test_the_license_is_named_alike():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert project["license"] == "Apache-2.0"
-    assert "\nlicense: Apache-2.0\n" in (ROOT / "CITATION.cff").read_text()
-    assert "[Apache-2.0](LICENSE)" in (ROOT / "README.md").read_text()
-    text = (ROOT / "LICENSE").read_text()
-    assert "Version 2.0, January 2004" in text
-    assert "the jaxhf authors" in text

@@ -200,11 +200,3 @@ def test_any_name_is_taken_and_shown(tmp_path, variables, source, output, shown)
     assert run.returncode == 0, run.stderr
     assert run.stdout.decode().startswith(f"{shown}: ")
     assert (tmp_path / output).exists()
-
-
-def test_a_setting_that_cannot_be(tmp_path):
-    """In a process of its own, as in this one jaxtyping may refuse it first."""
-    run = jaxhf_command("render", SCENE, "-o", tmp_path / "out.png", "--shading", "x")
-    said = "jaxhf: error: Settings: shading must be one of smooth, flat; it is 'x'\n"
-    assert (run.returncode, run.stdout, run.stderr) == (2, "", said)
-    assert not list(tmp_path.iterdir())

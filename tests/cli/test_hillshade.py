@@ -1,23 +1,16 @@
-"""`jaxhf hillshade`, `slope`, `aspect`, `relief` and `convert`: maps in their place, terrains that come back as they were."""
+"""`jaxhf hillshade`, `slope`, `aspect` and `relief`: maps in their place."""
 
 import subprocess
 import sys
 
 import geotiffs
 import numpy as np
-import oracle
 import pytest
 from PIL import Image
 
 import jaxhf
 from jaxhf import Terrain
 from jaxhf.cli.main import main
-
-
-def plane(east: float, north: float) -> Terrain:
-    """A plane on a map, its cells twice as high as wide."""
-    rows, columns = np.mgrid[:6, :9]
-    return Terrain(30.0 * east * columns + 60.0 * north * rows, 30.0, 60.0, 5e5, 4.1e6)
 
 
 def hills(holes: bool = True) -> Terrain:
@@ -44,7 +37,7 @@ def test_maps_are_in_their_place(tmp_path, capsys):
         (["slope", "--dx", "10", "--compute-edges"], jaxhf.slope(terrain, 10.0, compute_edges=True), -9999),
         (["aspect", "--trigonometric"], jaxhf.aspect(terrain, trigonometric=True), -9999),
         (["aspect", "--zero-for-flat"], jaxhf.aspect(terrain, zero_for_flat=True), None),
-        (["relief", *words, "--alpha"], jaxhf.relief(terrain, **light, alpha=True), None),
+        (["relief", *words, "--alpha", "--shadows"], jaxhf.relief(terrain, **light, alpha=True, shadows=True), None),
         (["relief", "--no-shading", "--entries", "nearest"], jaxhf.color_relief(terrain, entries="nearest"), None),
     ]
     for command, expected, nodata in cases:
@@ -58,32 +51,6 @@ def test_maps_are_in_their_place(tmp_path, capsys):
     assert main(["relief", str(source), "-o", str(tmp_path / "map.png")]) == 0
     with Image.open(tmp_path / "map.png") as picture:
         np.testing.assert_array_equal(np.asarray(picture)[::-1], jaxhf.relief(terrain))
-
-
-def test_a_relief_lies_in_shadow_where_rays_say_so(tmp_path):
-    """By all triangles; there the colour is darkened as by the least of 255 shades, elsewhere it is that without shadows."""
-    rng = np.random.default_rng(5)
-    terrain = Terrain(rng.uniform(0, 400, (13, 17)).astype(np.float32), 100.0, 150.0)
-    jaxhf.save_heights(tmp_path / "in.npz", terrain)
-    pictures = {}
-    for name, words in (("shadows", ["--shadows"]), ("light", []), ("colours", ["--no-shading"])):
-        sun = [] if name == "colours" else ["--azimuth", "250", "--altitude", "30"]
-        assert main(["relief", str(tmp_path / "in.npz"), "-o", str(tmp_path / "out.npy"), *sun, *words]) == 0
-        pictures[name] = np.load(tmp_path / "out.npy")
-    azimuth, altitude = np.radians(250), np.radians(30)
-    towards = [np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)]
-    y, x = np.indices(terrain.heights.shape)
-    z = terrain.heights.astype(float)
-    vertices = np.stack([100.0 * x, 150.0 * y, z + 1e-6], -1).reshape(-1, 3)
-    t, _ = oracle.cast_triangles(z, 100.0, 150.0, 0.0, 0.0, vertices, np.tile(towards, (z.size, 1)))
-    dark = np.isfinite(t).reshape(terrain.heights.shape)
-    assert 40 < dark.sum() < 180
-    level = 1 + 254 * np.sin(altitude)  # the shade of level ground, which keeps its colour
-    expected = np.where(dark[..., None], np.rint(pictures["colours"] * (1 / 3 + 2 / 3 / level)), pictures["light"])
-    np.testing.assert_allclose(pictures["shadows"].astype(float), expected, atol=1)
-    # A slope that only faces away is as dark; these face the light, and other terrain keeps it from them.
-    assert (dark & (np.abs(pictures["light"] - expected).max(-1) > 40)).sum() > 10
-    np.testing.assert_array_equal(pictures["shadows"][~dark], pictures["light"][~dark])
 
 
 def test_how_far_apart_heights_are_is_said(tmp_path, command):
@@ -122,35 +89,3 @@ def test_maps_and_conversions_do_without_jax(tmp_path):
     )
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, cwd=tmp_path)
     assert run.stdout.splitlines()[-1:] == ["set()"], run.stderr
-
-
-def test_conversion_keeps_heights_and_place(tmp_path, command):
-    pytest.importorskip("rasterio")
-    terrain = plane(0.5, 0.25)
-    terrain.heights[2, 3] = np.nan
-    jaxhf.save_heights(tmp_path / "one.npz", terrain)
-    code, out, _ = command("convert", tmp_path / "one.npz", tmp_path / "two.tif")
-    assert (code, "6 x 9 heights, cells 30 x 60, origin (500000, 4.1e+06)" in out) == (0, True)
-    found = jaxhf.load_heights(tmp_path / "two.tif")
-    np.testing.assert_array_equal(found.heights, terrain.heights)
-    assert (found.dx, found.dy, found.x0, found.y0) == (30, 60, 5e5, 4.1e6)
-    code, out, _ = command("convert", tmp_path / "two.tif", tmp_path / "three.npy", "--z-scale", 2, "--nodata", 0)
-    assert (code, ".npy holds the heights alone" in out) == (0, True)
-    expected = np.where(terrain.heights == 0, np.nan, 2 * terrain.heights)
-    np.testing.assert_array_equal(np.load(tmp_path / "three.npy"), expected)
-
-
-def test_conversion_says_what_is_left_out(tmp_path, command):
-    """And refuses before it reads."""
-    for name, top, said in (
-        ("out.png", 0.25, " (.png holds whole numbers: heights are rounded to steps of 1)\n"),
-        ("out.png", 1, "\n"),
-        ("out.exr", 1, " (.exr holds the heights alone)\n"),
-    ):
-        if name.endswith(".exr"):
-            pytest.importorskip("OpenEXR")
-        jaxhf.save_heights(tmp_path / "in.npz", Terrain(top * np.eye(3)))
-        code, out, _ = command("convert", tmp_path / "in.npz", tmp_path / name)
-        assert (code, out.endswith(f"range (0, {top}){said}")) == (0, True)
-    code, _, err = command("convert", tmp_path / "missing.tif", tmp_path / "out.jpg")
-    assert (code, "cannot write heights with the ending '.jpg'" in err) == (2, True)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxhf import Terrain, save_heights
+from jaxhf import Terrain, load_heights, save_heights
 from jaxhf.io.terrain.georeference import WGS84_DEGREES, Georeference, coordinate_system
 
 DEGREES = Georeference(WGS84_DEGREES, nodata=-9999.0)
@@ -45,15 +45,27 @@ def test_info_describes_terrain(folder, command, name):
     assert command("info", folder / name)[:2] == (0, f"{folder / name}: {INFO[name]}")
 
 
-def test_convert_reports_what_the_file_says(folder, command):
-    """Its coordinates, but for a mesh, which is in metres, and may be a solid."""
-    trimesh = pytest.importorskip("trimesh")
-    for words, said in (
-        ("degrees.npz x.asc", "cells 0.01 x 0.01, origin (10, 44.99)"),
-        ("degrees.npz x.ply", "cells 788.468 x 1111.32, origin (0, 0)"),
-        ("metres.asc x.glb --base 0", "x.glb: Heightfield, 2 x 3 heights"),
-    ):
+CONVERTED = {
+    # What the file says, but for a mesh, which is in metres and may be a solid.
+    "degrees.npz x.asc": "x.asc: Heightfield, 3 x 3 heights, cells 0.01 x 0.01, origin (10, 44.99), range (1, 9), 1 hole",
+    "degrees.npz x.ply": "cells 788.468 x 1111.32, origin (0, 0), range (1, 9), 1 hole",
+    "metres.asc x.glb --base 0": "x.glb: Heightfield, 2 x 3 heights, cells 30 x 20, origin (500000, 4e+06), range (4, 9)",
+    "metres.asc x.tif": "cells 30 x 20, origin (500000, 4e+06), range (4, 9)",
+    "metres.asc x.npy --z-scale 2 --nodata 5": "range (8, 18), 1 hole (.npy holds the heights alone)",
+    "metres.asc x.exr": "range (4, 9) (.exr holds the heights alone)",
+    "metres.asc x.png": "range (4, 9)",
+    "metres.asc x.png --z-scale 0.25": "range (1, 2.25) (.png holds whole numbers: heights are rounded to steps of 1)",
+}
+
+
+def test_convert_says_what_it_writes(folder, command):
+    trimesh, _, _ = map(pytest.importorskip, ("trimesh", "rasterio", "OpenEXR"))
+    for words, said in CONVERTED.items():
         source, output, *more = words.split()
         code, out, _ = command("convert", folder / source, folder / output, *more)
-        assert (code, said in out) == (0, True)
+        assert (code, out.endswith(f"{said}\n")) == (0, True), out
+    found, given = (load_heights(folder / name) for name in ("x.tif", "metres.asc"))
+    np.testing.assert_array_equal(found.heights, given.heights)
+    assert (found.dx, found.dy, found.x0, found.y0) == (given.dx, given.dy, given.x0, given.y0) == (30, 20, 5e5, 4e6)
+    np.testing.assert_array_equal(np.load(folder / "x.npy"), [[8, np.nan, 12], [14, 16, 18]])
     assert trimesh.load(folder / "x.glb", force="mesh", process=False).is_watertight

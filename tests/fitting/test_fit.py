@@ -206,8 +206,10 @@ def test_draws_hold_the_truth_as_often_as_they_say(targets):
 
 
 def test_what_no_picture_shows_is_marked():
-    found = jaxhf.fit(scenes(camera=HALF), pictures(camera=HALF), **OPTIONS, max_steps=5, draws=20)
+    told = []
+    found = jaxhf.fit(scenes(camera=HALF), pictures(camera=HALF), **OPTIONS, max_steps=5, draws=20, progress=told.append)
     assert found.result is jaxhf.Stop.MAX_STEPS
+    assert [step.to_come for step in told[:5]] == [4, 3, 2, 1, 0]
     unseen = ~found.seen
     assert found.std is not None
     assert unseen[:, 8:].all()  # less than 0.45 of the side is in sight, and normals reach a cell farther

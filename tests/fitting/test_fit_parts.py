@@ -6,7 +6,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 import scipy.fft
@@ -273,14 +272,6 @@ def lamps() -> list[jaxhf.Scene]:
     """The second picture has no sun."""
     first, second, third = scenes()
     return [first, second.with_lights([jaxhf.Sky(1.0), jaxhf.Point((0.5, 0.5, 3.0))]), third]
-
-
-@pytest.fixture
-def as_users_call_it():
-    """Where nothing checks annotations first."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def usual_but(wrong: dict[str, Any]) -> dict[str, Any]:

@@ -82,54 +82,44 @@ def test_the_loss_is_that_of_the_last_step_where_max_steps_end_a_level():
     assert found.stats["loss"] == min(step.loss for step in found.history)
 
 
+LAST, BY_FACTORS = 3, 4  # the number of a stage
+
+
 @pytest.mark.parametrize(
-    ("factors", "steps", "predicted", "stop"),
+    ("stage", "factors", "steps", "predicted", "stop"),
     [
-        (False, [7.0], 1.0, None),  # which only evaluates
-        (False, [7.0, 5.0], 1.0, None),
-        (False, [7.0, 5.0], 0.1, jaxhf.Stop.CONVERGED),  # a step counts that gains 0.001 for each of 144 heights
-        (False, [7.0, 6.9], 1.0, jaxhf.Stop.CONVERGED),
-        (False, [7.0, 5.0, None], 0.2, None),
-        (False, [7.0, 5.0, None], 0.1, jaxhf.Stop.CONVERGED),
-        (False, [7.0, 5.0, None, None, None], 0.2, None),
-        (False, [7.0, 5.0, None, None], 0.1, jaxhf.Stop.STALLED),  # λ grew until no step counts
-        (True, [7.0, 5.0, None], 0.2, None),
-        (True, [7.0, 5.0, None, None], 0.2, jaxhf.Stop.STALLED),  # whole steps by factors are to come
-        (False, [math.nan], math.nan, jaxhf.Stop.NON_FINITE),
-        (False, [7.0 - 0.4 * k for k in range(15)], 1.0, jaxhf.Stop.MAX_STEPS),
+        (LAST, False, [7.0], 1.0, None),  # which only evaluates
+        (LAST, False, [7.0, 5.0], 1.0, None),
+        (LAST, False, [7.0, 5.0], 0.1, jaxhf.Stop.CONVERGED),  # a step counts that gains 0.001 for each of 144 heights
+        (LAST, False, [7.0, 6.9], 1.0, jaxhf.Stop.CONVERGED),
+        (LAST, False, [7.0, 5.0, None], 0.2, None),
+        (LAST, False, [7.0, 5.0, None], 0.1, jaxhf.Stop.CONVERGED),
+        (LAST, False, [7.0, 5.0, None, None, None], 0.2, None),
+        (LAST, False, [7.0, 5.0, None, None], 0.1, jaxhf.Stop.STALLED),  # λ grew until no step counts
+        (LAST, True, [7.0, 5.0, None], 0.2, None),
+        (LAST, True, [7.0, 5.0, None, None], 0.2, jaxhf.Stop.STALLED),  # whole steps by factors are to come
+        (LAST, False, [math.nan], math.nan, jaxhf.Stop.NON_FINITE),
+        (LAST, False, [7.0 - 0.4 * k for k in range(15)], 1.0, jaxhf.Stop.MAX_STEPS),
+        # Steps by factors end where they are no shorter.
+        (BY_FACTORS, True, [], 0.02, jaxhf.Stop.CONVERGED),  # of 144 heights
+        (BY_FACTORS, True, [], 1.0, None),
+        (BY_FACTORS, True, [5.0, 6.0], 1.0, None),  # a loss may rise
+        (BY_FACTORS, True, [5.0, 6.0], 0.02, jaxhf.Stop.CONVERGED),
+        (BY_FACTORS, True, [5.0, None], 1.0, jaxhf.Stop.CONVERGED),
+        (BY_FACTORS, True, [None], 1.0, jaxhf.Stop.STALLED),
+        (BY_FACTORS, True, [5.0] * 10, 1.0, jaxhf.Stop.CONVERGED),
     ],
     ids=str,
 )
-def test_a_fit_ends_where_no_step_counts_any_more(factors, steps, predicted, stop):
-    """Losses of accepted steps, None for those that were rejected, in the last stage."""
-    assert why(3, steps, predicted, factors) is stop
-
-
-def why(stage: int, steps: list[float | None], predicted: float, factors: bool) -> jaxhf.Stop | None:
+def test_a_fit_ends_where_no_step_counts_any_more(stage, factors, steps, predicted, stop):
+    """Losses of accepted steps, None for those that were rejected."""
     problem, unknowns = make_problem(scenes(), [np.zeros((SIZE, SIZE))] * 3, given_with(settings=SMALL))
     history, loss = [], 0.0
     for number, given in enumerate(steps, 1):
         loss = loss if given is None else given
         history.append(jaxhf.Step(number, 12, loss, given is not None, 1.0, 0.1, 1.0))
     state = dataclasses.replace(first_state(problem, unknowns), stage=stage, predicted=predicted, history=tuple(history))
-    return why_ended(state, [problem], 15, factors)
-
-
-@pytest.mark.parametrize(
-    ("steps", "predicted", "stop"),
-    [
-        ([], 0.02, jaxhf.Stop.CONVERGED),  # of 144 heights
-        ([], 1.0, None),
-        ([5.0, 6.0], 1.0, None),  # a loss may rise
-        ([5.0, 6.0], 0.02, jaxhf.Stop.CONVERGED),
-        ([5.0, None], 1.0, jaxhf.Stop.CONVERGED),
-        ([None], 1.0, jaxhf.Stop.STALLED),
-        ([5.0] * 10, 1.0, jaxhf.Stop.CONVERGED),
-    ],
-    ids=str,
-)
-def test_steps_by_factors_end_where_they_are_no_shorter(steps, predicted, stop):
-    assert why(4, steps, predicted, True) is stop
+    assert why_ended(state, [problem], 15, factors) is stop
 
 
 def test_rejections_in_a_row_damp_ever_faster():

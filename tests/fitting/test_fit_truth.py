@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_fits import rms
 
 import jaxhf
 
@@ -20,10 +21,6 @@ FOLDER = Path(__file__).parents[1] / "references"
 @functools.cache
 def case(name: str) -> dict[str, np.ndarray]:
     return dict(np.load(FOLDER / f"{name}.npz"))
-
-
-def rms(values: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def scenes(known: dict[str, np.ndarray]) -> list[jaxhf.Scene]:

@@ -61,10 +61,6 @@ def moonlit(scene: jaxhf.Scene, normal: np.ndarray) -> np.ndarray:
     return 0.3 / np.pi * 2 * incident / (incident + emitted)
 
 
-# One picture is where heights explain most; three compile another program.
-COUNTS = pytest.mark.parametrize("count", [1, pytest.param(3, marks=pytest.mark.deep)])
-
-
 @pytest.mark.deep  # the noise of common pictures is in test_fit_truth.py
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("seed", [1, 2])
@@ -77,7 +73,7 @@ def test_noise_is_found_where_heights_explain_a_part_of_it(count, seed):
 
 
 @pytest.mark.deep
-@COUNTS
+@pytest.mark.parametrize("count", [1, 3])
 def test_noise_is_found_in_spite_of_shadows_that_stand_elsewhere(count):
     """No points on edges move them, so a part of the pictures is never explained; chi2 says so."""
     found = fitted(0, 1.2, count)

@@ -121,25 +121,6 @@ def test_pictures_hold_heights(tmp_path, ending):
         load_heights(tmp_path / f"rgb{ending}")
 
 
-BAD_FILES = [
-    ("cut.asc", b"ncols 3\nnrows 2\ncellsize 1\n1 2 3 4", "3 x 2 heights take 6 numbers, it holds 4"),
-    ("comma.asc", b"ncols 2\nnrows 2\ncellsize 1\n1,5 2 3 4", "not all of its heights are numbers"),
-    ("bomb.asc", b"ncols 99999\nnrows 99999\ncellsize 1\n", "it declares 99999 x 99999"),
-    ("tile.hgt", b"12", "its name must begin with its south-western corner"),
-    ("N01E002.hgt", b"12", "its size is 2 bytes"),
-    ("bomb.hfield", np.array([99999, 99999], "<i4").tobytes(), "it declares 99999 x 99999"),
-    ("short.bin", b"123", "it must begin with the numbers of rows and columns"),
-]
-
-
-@pytest.mark.parametrize(("name", "content", "message"), BAD_FILES, ids=[name for name, _, _ in BAD_FILES])
-def test_what_is_no_grid_is_refused_by_name(tmp_path, name, content, message):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=re.escape(message)) as error:
-        load_heights(tmp_path / name)
-    assert str(tmp_path / name) in str(error.value)
-
-
 def test_what_a_format_cannot_hold_is_refused(tmp_path):
     """And a world file that is none."""
     for heights, message in (

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from alike import placed
 from PIL import Image
-from test_images import png
+from test_images import png, raw
 
 from jaxhf import Terrain, jacksboro, load_heights, load_image, save_heights, save_image, save_mesh
 from jaxhf.io.files import MAX_PIXELS
@@ -22,75 +22,16 @@ from jaxhf.io.files import MAX_PIXELS
 NORTH_FIRST = np.array([[1, 2, 3], [4, 5, 6]], np.uint16)
 SOUTH_FIRST = NORTH_FIRST[::-1]
 
-IS_AREA, IS_POINT = 1, 2
-PROJECTED, GEOGRAPHIC = 1, 2
 
-
-def write_tiff(
-    path, heights, *, raster=IS_AREA, model=PROJECTED, scale=(30.0, 20.0, 0.0), tie=None, nodata=None, keys=None, metadata=None,
-    **options
-):  # fmt: skip
-    """A GeoTIFF by hand: ModelPixelScale 33550, ModelTiepoint 33922; GTModelTypeGeoKey 1024, GTRasterTypeGeoKey 1025.
-
-    Of further `keys`, floats stand in a tag of their own.
-    """
-    tifffile = pytest.importorskip("tifffile")
-    tags = []
-    if scale is not None:
-        tags.append((33550, "d", 3, scale, True))
-    if tie is not None:
-        tags.append((33922, "d", 6, tie, True))
-        named = {2048: 4326} if model == GEOGRAPHIC and keys is None else {}
-        keys = {1024: model, 1025: raster, **named, **(keys or {})}
-        doubles = [value for value in keys.values() if isinstance(value, float)]
-        directory = [1, 1, 0, len(keys)]
-        for key, value in sorted(keys.items()):
-            directory += (key, 34736, 1, doubles.index(value)) if isinstance(value, float) else (key, 0, 1, value)
-        tags += [(34735, "H", len(directory), directory, True), (34736, "d", len(doubles), doubles, True)][: 1 + bool(doubles)]
-    if nodata is not None:
-        tags.append((42113, "s", 0, nodata, True))
-    if metadata is not None:
-        tags.append((42112, "s", 0, f"<GDALMetadata>{metadata}</GDALMetadata>", True))
-    tifffile.imwrite(path, heights, extratags=tags, photometric="minisblack", **options)
-
-
-def test_png_is_flipped(tmp_path):
-    Image.fromarray(NORTH_FIRST * 10000).save(tmp_path / "x.png")
-    terrain = load_heights(tmp_path / "x.png", z_scale=0.5, dx=30.0, dy=20.0, x0=5e6, y0=-7.0)
-    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST * 5000.0)
-    assert terrain.heights.dtype == np.float32
-    assert placed(terrain) == (30, 20, 5e6, -7)
-
-
-@pytest.mark.parametrize("dtype", [np.int16, np.uint16, np.float32, ">f4", np.float64])
-def test_tiff_is_flipped(tmp_path, dtype):
-    for compression in (None, "zlib"):
-        write_tiff(tmp_path / "x.tif", NORTH_FIRST.astype(dtype), scale=None, compression=compression)
-        terrain = load_heights(tmp_path / "x.tif")
-        np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
-        assert terrain.heights.dtype == (np.float64 if dtype is np.float64 else np.float32)
-        assert placed(terrain) == (1, 1, 0, 0)
-
-
-@pytest.mark.parametrize(
-    ("raster", "tie", "x0", "y0"),
-    [
-        # The tie point is the corner of the north-western pixel: its centre is half a pixel to the south-east of it, and
-        # the southern row one pixel further down.
-        (IS_AREA, (0, 0, 0, 500000, 4100000, 0), 500015, 4100000 - 10 - 20),
-        # It is that pixel's centre.
-        (IS_POINT, (0, 0, 0, 500000, 4100000, 0), 500000, 4100000 - 20),
-        # It is the south-western corner of the raster, or the centre of its south-eastern pixel.
-        (IS_AREA, (0, 2, 0, 500000, 4100000, 0), 500015, 4100010),
-        (IS_POINT, (2, 1, 0, 500000, 4100000, 0), 499940, 4100000),
-    ],
-)
-def test_tiff_is_placed_by_its_tags(tmp_path, raster, tie, x0, y0):
-    write_tiff(tmp_path / "x.tiff", NORTH_FIRST, raster=raster, tie=tie)
-    terrain = load_heights(tmp_path / "x.tiff")
-    np.testing.assert_array_equal(terrain.heights, SOUTH_FIRST)
-    assert placed(terrain) == (30, 20, x0, y0)
-    assert placed(load_heights(tmp_path / "x.tiff", x0=0.0, dy=7.0)) == (30, 7, 0, y0)
+def write_degrees(path, keys):
+    """A GeoTIFF by hand, 60 degrees north, with GeoKeys that rasterio does not write; floats stand in tag 34736."""
+    keys = {1024: 2, 1025: 1, **keys}  # geographic, of pixels that are areas
+    doubles = tuple(value for value in keys.values() if isinstance(value, float))
+    directory = (1, 1, 0, len(keys))
+    for key, value in sorted(keys.items()):
+        directory += (key, 34736, 1, doubles.index(value)) if isinstance(value, float) else (key, 0, 1, value)
+    tags = {33550: (0.01, 0.01, 0.0), 33922: (0.0, 0.0, 0.0, 10.0, 60.01, 0.0), 34735: directory, 34736: doubles or (0.0,)}
+    Image.fromarray(NORTH_FIRST).save(path, tiffinfo=tags)
 
 
 MOON, MARS = 1737400.0, 3396190.0
@@ -103,7 +44,6 @@ def ellipse_at_60(a, c):
 
 
 EARTH_AT_60 = ellipse_at_60(6378137.0, 6356752.314245)
-IN_DEGREES = {"model": GEOGRAPHIC, "scale": (0.01, 0.01, 0), "tie": (0, 0, 0, 10, 60.01, 0)}  # in the middle 60 degrees north
 
 
 @pytest.mark.parametrize(
@@ -121,7 +61,7 @@ IN_DEGREES = {"model": GEOGRAPHIC, "scale": (0.01, 0.01, 0), "tie": (0, 0, 0, 10
     ],
 )
 def test_degrees_are_those_of_the_files_globe(tmp_path, keys, along_x, along_y):
-    write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
+    write_degrees(tmp_path / "x.tif", keys)
     terrain = load_heights(tmp_path / "x.tif")
     np.testing.assert_allclose((terrain.dx, terrain.dy), np.radians(0.01) * np.array((along_x, along_y)), rtol=1e-7)
     assert placed(terrain)[2:] == (0, 0)
@@ -129,31 +69,19 @@ def test_degrees_are_those_of_the_files_globe(tmp_path, keys, along_x, along_y):
 
 def test_a_globe_of_unknown_size_needs_a_cell_size(tmp_path):
     for keys in ({2048: 32767}, {2048: 30100}, {}):
-        write_tiff(tmp_path / "x.tif", NORTH_FIRST, keys=keys, **IN_DEGREES)
+        write_degrees(tmp_path / "x.tif", keys)
         with pytest.raises(ValueError, match=r"x\.tif: its degrees are on a globe of unknown size: dx and dy must be given"):
             load_heights(tmp_path / "x.tif", dx=3.0)
         assert placed(load_heights(tmp_path / "x.tif", dx=3.0, dy=4.0)) == (3, 4, 0, 0)
 
 
-SCALED = '<Item name="OFFSET" sample="0" role="offset">-500</Item><Item name="SCALE" sample="0" role="scale">0.25</Item>'
-
-
-def test_gdals_scale_and_offset_are_applied(tmp_path):
-    """To the stored value, which is also what nodata means; other items and other bands do not count."""
-    others = '<Item name="AREA">Point</Item><Item name="SCALE" sample="1" role="scale">9</Item>'
-    write_tiff(tmp_path / "x.tif", NORTH_FIRST, scale=None, nodata="5", metadata=SCALED + others)
-    terrain = load_heights(tmp_path / "x.tif", z_scale=2.0)
-    np.testing.assert_array_equal(terrain.heights, [[-998, np.nan, -997], [-999.5, -999, -998.5]])
-    assert terrain.heights.dtype == np.float32
-
-
 HOLES = [
     ("-9999", np.float32, -9999.0, {}),
     ("-3.4028235e+38", np.float32, np.finfo(np.float32).min, {}),
-    ("-32768", np.int16, -32768, {}),
+    ("65535", np.uint16, 65535, {}),
     ("-9999", np.uint16, None, {}),  # a tag whose value the type cannot hold
-    (None, np.int16, -1, {"nodata": -1.0}),
-    ("-32768", np.int16, 0, {"nodata": 0.0}),  # the argument overrules the tag
+    (None, np.uint16, 7, {"nodata": 7.0}),
+    ("65535", np.uint16, 0, {"nodata": 0.0}),  # the argument overrules the tag
     (None, np.float32, np.nan, {}),
     (None, np.float32, np.inf, {}),
 ]
@@ -165,10 +93,12 @@ def test_what_means_no_data_is_a_hole(tmp_path, tag, dtype, hole, arguments):
     expected = stored.astype(np.float32) * 2
     if hole is not None:
         stored[0, 1], expected[0, 1] = hole, np.nan
-    write_tiff(tmp_path / "x.tif", stored, scale=None, nodata=tag)
+    Image.fromarray(stored).save(tmp_path / "x.tif", tiffinfo={} if tag is None else {42113: tag})
     terrain = load_heights(tmp_path / "x.tif", z_scale=2.0, **arguments)
     np.testing.assert_array_equal(terrain.heights, expected[::-1])
     np.testing.assert_array_equal(terrain.nodata, np.isnan(expected[::-1]))
+    assert terrain.heights.dtype == np.float32
+    assert placed(terrain) == (1, 1, 0, 0)
 
 
 def test_npz_by_its_names(tmp_path):
@@ -198,8 +128,8 @@ def test_jacksboro():
 
 
 def test_extras_are_named(tmp_path, monkeypatch):
-    tiff(NORTH_FIRST)(tmp_path / "x.tif")
-    (tmp_path / "x.exr").touch()
+    for name in ("x.tif", "x.exr"):
+        (tmp_path / name).touch()
     for library, call, said in (
         (
             "rasterio",
@@ -237,8 +167,8 @@ def lying_tiff(path, side):
     path.write_bytes(data)
 
 
-def tiff(values: np.ndarray = NORTH_FIRST, **tags):
-    return lambda path: write_tiff(path, values, **tags)
+def raster(values: np.ndarray = NORTH_FIRST, **options):
+    return lambda path: geotiffs.write(path, values, **options)
 
 
 SQUARE = np.zeros((2, 2))
@@ -264,19 +194,21 @@ BAD_FILES = [
     ("bomb.png", png((40000, 40000, 16, 0, 0, 0, 0), b""), {}, f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000"),
     ("lying.tif", lambda path: lying_tiff(path, 16000), {}, "it is cut off, damaged or of another kind"),
     ("bomb.tif", lambda path: lying_tiff(path, 40000), {}, f"at most {MAX_PIXELS} pixels, it declares 40000 x 40000"),
-    ("rgb.tif", tiff(np.zeros((3, 4, 4), np.uint8), planarconfig="separate"), {}, "must be one band, it has 3"),
-    ("scale.tif", tiff(scale=None, metadata=SCALED.replace("0.25", "x")), {}, "the scale not zero; they are 0.0 and -500.0"),
-    ("grads.tif", tiff(keys={2054: 9105}, **IN_DEGREES), {}, "must be in degrees, their unit is grad"),
-    (
-        "rotated.tif",
-        lambda path: geotiffs.write(path, NORTH_FIRST, (30, 5, 0, 0, -20, 0)),
-        {},
-        "its pixels must lie along x and y",
-    ),
+    ("rgb.tif", raster(np.zeros((3, 4, 4), np.uint8)), {}, "must be one band, it has 3"),
+    ("scale.tif", raster(about={"scales": (0,), "offsets": (-500,)}), {}, "the scale not zero; they are 0.0 and -500.0"),
+    ("grads.tif", lambda path: write_degrees(path, {2054: 9105}), {}, "must be in degrees, their unit is grad"),
+    ("rotated.tif", raster(place=(30, 5, 0, 0, -20, 0)), {}, "its pixels must lie along x and y"),
     ("high.npy", save(a=np.full((2, 2), 1e300)), {"z_scale": 1e10}, "heights times z_scale must fit into float64"),
+    ("cut.asc", raw(b"ncols 3\nnrows 2\ncellsize 1\n1 2 3 4"), {}, "3 x 2 heights take 6 numbers, it holds 4"),
+    ("comma.asc", raw(b"ncols 2\nnrows 2\ncellsize 1\n1,5 2 3 4"), {}, "not all of its heights are numbers"),
+    ("bomb.asc", raw(b"ncols 99999\nnrows 99999\ncellsize 1\n"), {}, "it declares 99999 x 99999"),
+    ("tile.hgt", raw(b"12"), {}, "its name must begin with its south-western corner"),
+    ("N01E002.hgt", raw(b"12"), {}, "its size is 2 bytes"),
+    ("bomb.hfield", raw(np.array([99999, 99999], "<i4").tobytes()), {}, "it declares 99999 x 99999"),
+    ("short.bin", raw(b"123"), {}, "it must begin with the numbers of rows and columns"),
     ("x.npy", save(a=SQUARE), {"dx": 0.0}, "dx must be positive and finite, it is 0.0"),
     ("x.npy", save(a=SQUARE), {"z_scale": 0.0}, "z_scale must be finite and not zero, it is 0.0"),
-    ("x.tfi", lambda path: path.touch(), {}, "cannot read heights from the ending '.tfi'; did you mean '.tif'?"),
+    ("x.tfi", raw(b""), {}, "cannot read heights from the ending '.tfi'; did you mean '.tif'?"),
 ]
 
 
@@ -307,7 +239,7 @@ def test_a_terrain_becomes_a_heightfield():
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_written_heights_are_read_back(tmp_path, ending, dtype):
     if ending == ".tif":
-        pytest.importorskip("tifffile")
+        pytest.importorskip("rasterio")
     heights = np.array([[1, np.nan, 3], [4, 5, np.pi]], dtype)
     terrain = Terrain(heights, 30.0, 20.5, 500000.25, 4.1e6)
     save_heights(tmp_path / f"x{ending}", terrain)
@@ -318,12 +250,13 @@ def test_written_heights_are_read_back(tmp_path, ending, dtype):
     assert [path.name for path in tmp_path.iterdir()] == [f"x{ending}"]
 
 
-@pytest.mark.parametrize("model", [PROJECTED, GEOGRAPHIC])
-@pytest.mark.parametrize("raster", [IS_AREA, IS_POINT])
-def test_a_geotiff_may_take_over_the_place_of_another(tmp_path, model, raster):
+@pytest.mark.parametrize("crs", ["EPSG:32616", "EPSG:4326"])
+@pytest.mark.parametrize("kind", ["Area", "Point"])
+def test_a_geotiff_may_take_over_the_place_of_another(tmp_path, crs, kind):
     """The rows are flipped back, and its place is the other's."""
     rasterio = pytest.importorskip("rasterio")
-    write_tiff(tmp_path / "a.tif", NORTH_FIRST, model=model, raster=raster, scale=(0.5, 0.25, 0), tie=(0, 1, 0, 7, 40, 0))
+    with rasterio.open(geotiffs.write(tmp_path / "a.tif", NORTH_FIRST, (0.5, 0, 7, 0, -0.25, 40), crs), "r+") as a:
+        a.update_tags(AREA_OR_POINT=kind)
     first = load_heights(tmp_path / "a.tif")
     save_heights(tmp_path / "b.tif", Terrain(first.heights * 2), like=tmp_path / "a.tif")
     second = load_heights(tmp_path / "b.tif")
@@ -332,7 +265,7 @@ def test_a_geotiff_may_take_over_the_place_of_another(tmp_path, model, raster):
     assert placed(second) != (1, 1, 0, 0)
     with rasterio.open(tmp_path / "a.tif") as a, rasterio.open(tmp_path / "b.tif") as b:
         assert (a.transform, a.crs) == (b.transform, b.crs)
-        assert a.tags()["AREA_OR_POINT"] == b.tags()["AREA_OR_POINT"] == ("Area" if raster == IS_AREA else "Point")
+        assert a.tags()["AREA_OR_POINT"] == b.tags()["AREA_OR_POINT"] == kind
     with pytest.raises(ValueError, match=r"a\.tif: it must have the shape of the heights, \(3, 3\); it has \(2, 3\)"):
         save_heights(tmp_path / "c.tif", Terrain(np.zeros((3, 3))), like=tmp_path / "a.tif")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "b.tif"]

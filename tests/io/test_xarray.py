@@ -1,5 +1,6 @@
 """Arrays with coordinates, as xarray and rioxarray have them."""
 
+import geotiffs
 import numpy as np
 import pytest
 from alike import placed
@@ -31,10 +32,11 @@ def test_as_the_file_itself(tmp_path):
     """rioxarray's way of a GeoTIFF in degrees, with holes, scale and offset: what it puts into coordinates and attributes."""
     rasterio = pytest.importorskip("rasterio")
     stored = np.array([[1, 2, 3], [4, -9, 6]], np.int16)
-    profile = {"crs": "EPSG:4269", "transform": rasterio.Affine(0.01, 0, -85, 0, -0.01, 37), "nodata": -9, "dtype": "int16"}
-    with rasterio.open(tmp_path / "x.tif", "w", driver="GTiff", height=2, width=3, count=1, **profile) as dataset:
-        dataset.write(stored, 1)
-        dataset.scales, dataset.offsets, wkt = (0.5,), (100,), dataset.crs.to_wkt()
+    about = {"scales": (0.5,), "offsets": (100,)}
+    with rasterio.open(
+        geotiffs.write(tmp_path / "x.tif", stored, (0.01, 0, -85, 0, -0.01, 37), "EPSG:4269", about, nodata=-9)
+    ) as x:
+        wkt = x.crs.to_wkt()
     place = xarray.DataArray(0, attrs={"crs_wkt": wkt})
     coords = {"x": -85 + 0.01 * np.array([0.5, 1.5, 2.5]), "y": 37 - 0.01 * np.array([0.5, 1.5]), "spatial_ref": place}
     attrs = {"_FillValue": -9, "scale_factor": 0.5, "add_offset": 100.0}

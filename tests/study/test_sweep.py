@@ -267,22 +267,6 @@ def test_a_real_sweep(tmp_path, sweep):
     assert float(base["peak_mb"]) > 100
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--error", "-1"], "--error must be positive, it is -1"), (["--knobs", "x"], "one is 'x'"),
-        (["--width", "0"], "--width must be positive, it is 0"), (["--devices", "-1"], "--devices must be positive, it is -1"),
-    ],
-)  # fmt: skip
-def test_options_are_checked_first(tmp_path, monkeypatch, capsys, options, message):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "scene.toml").write_text(SCENE)
-    assert main(["tradeoff", "scene.toml", *options]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert message in line
-    assert [path.name for path in tmp_path.iterdir()] == ["scene.toml"]
-
-
 @pytest.mark.slow
 def test_two_sweeps_agree(tmp_path):
     """In every error; and in the order of times that are at least a fifth apart."""

@@ -203,18 +203,6 @@ def test_identity(tmp_path):
     assert len({one, *others}) == 7
 
 
-def test_plan_refuses_an_unknown_knob():
-    with pytest.raises(ValueError, match=r"knobs must be among .*'sample'"):
-        plan(SCENES / "texture.toml", knobs=("sample",))
-
-
-def test_plan_refuses_a_scene_without_terrain(tmp_path):
-    text = SCENE[: SCENE.index("[[objects]]")] + '[[objects]]\nshape = "cylinder"\n'
-    (tmp_path / "a.toml").write_text(text)
-    with pytest.raises(ValueError, match=r"a\.toml: there is no heightfield"):
-        plan(tmp_path / "a.toml")
-
-
 def test_derivatives_are_measured_in_a_small_picture(tmp_path):
     scene = jaxhf.load_scene(SCENES / "texture.toml")  # 480 x 360
     small = shrunk(scene, DERIVATIVE_PIXELS)
