@@ -61,7 +61,7 @@ def test_maps_are_in_their_place(tmp_path, capsys):
 
 
 def test_a_relief_lies_in_shadow_where_rays_say_so(tmp_path):
-    """By all triangles; there the colour is darkened as by the least of 255 shades, elsewhere it is that without shadows."""
+    """By the oracle; there the colour is darkened as by the least of 255 shades, elsewhere it is that without shadows."""
     rng = np.random.default_rng(5)
     terrain = Terrain(rng.uniform(0, 400, (13, 17)).astype(np.float32), 100.0, 150.0)
     jaxhf.save_heights(tmp_path / "in.npz", terrain)
@@ -75,7 +75,7 @@ def test_a_relief_lies_in_shadow_where_rays_say_so(tmp_path):
     y, x = np.indices(terrain.heights.shape)
     z = terrain.heights.astype(float)
     vertices = np.stack([100.0 * x, 150.0 * y, z + 1e-6], -1).reshape(-1, 3)
-    t, _ = oracle.cast_triangles(z, 100.0, 150.0, 0.0, 0.0, vertices, np.tile(towards, (z.size, 1)))
+    t = oracle.cast(z, 100.0, 150.0, 0.0, 0.0, vertices, np.tile(towards, (z.size, 1))).t
     dark = np.isfinite(t).reshape(terrain.heights.shape)
     assert 40 < dark.sum() < 180
     level = 1 + 254 * np.sin(altitude)  # the shade of level ground, which keeps its colour
