@@ -220,23 +220,6 @@ def test_boundary_pixels_are_looked_at_again():
     assert np.abs(finer - jaxhf.render(scene, INTERIOR)[..., 0] / 0.7).max() > 0.1 * LIT
 
 
-@pytest.mark.deep  # each agrees with a truth: here forwards, in rendering/test_users.py in reverse
-def test_forward_and_reverse_agree():
-    scene = shadow_scene()
-    rng = np.random.default_rng(0)
-    direction = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), scene)
-    weights = rng.normal(size=(SIZE, SIZE))
-    forward = np.vdot(weights, sum(changes(scene, direction, KEY)))
-
-    @jax.jit
-    def gradient(scene):
-        return jax.grad(lambda scene: jnp.vdot(jnp.asarray(weights), jaxhf.render(scene, EDGES)[..., 0]))(scene)
-
-    dots = jax.tree.leaves(jax.tree.map(np.vdot, gradient(scene), direction))
-    np.testing.assert_allclose(sum(dots), forward, rtol=2e-5)
-    assert abs(forward) > 1
-
-
 def test_picture_keeps_its_bits():
     scene = shadow_scene()
     np.testing.assert_array_equal(jaxhf.render(scene, EDGES), jaxhf.render(scene, INTERIOR))
@@ -274,22 +257,14 @@ BUMPS = 0.12 * np.exp(-((X - 0.4) ** 2 + (Y - 0.6) ** 2) / 0.02) + 0.15 * np.exp
 SUN = (-0.8, 0.2, 0.45)
 
 
-@pytest.mark.parametrize(
-    ("leaf", "change"),
-    [
-        pytest.param(heights_of, 0.3 * BUMPS, id="heights"),
-        pytest.param(world_of, shift(0.1, 0.05, 0.05), id="place", marks=pytest.mark.deep),
-        pytest.param(camera_of, shift(0.1, -0.05, 0.05), id="camera", marks=pytest.mark.deep),
-    ],
-)
-def test_bumps_against_central_differences(leaf, change):
+def test_bumps_against_central_differences():
     """Silhouettes, shadows, terminators and the border at once, and the light between them."""
     camera = jaxhf.Orthographic.look_at((0.6, -0.9, 0.5), (0.5, 0.5, 0.05), (0, 0, 1), 1.1, width=SIZE, height=SIZE)
     scene = small_scene(BUMPS, camera, SUN)
-    direction = moved(leaf, change)(scene)
+    direction = moved(heights_of, 0.3 * BUMPS)(scene)
     interior, boundary = changes(scene, direction, KEY)
     whole, without = against_differences(scene, direction, 0.05, 32, interior + boundary, interior)
-    assert whole < 0.1, (whole, without)  # 0.042, 0.077 and 0.060, without the boundaries 0.36 to 1.33
+    assert whole < 0.1, (whole, without)  # 0.042, without the boundaries 0.36 or more
     assert without > 0.3
 
 

@@ -172,16 +172,6 @@ def test_an_offset_costs_no_bit():
         np.testing.assert_array_equal(far_aovs[name], value, name)
 
 
-@pytest.mark.deep
-@pytest.mark.x64  # of the whole picture, with smooth normals and three lights
-def test_single_precision_agrees_with_double():
-    single, single_aovs = rendered()
-    double, double_aovs = rendered(np.float64)
-    inside = (single_aovs["status"] == double_aovs["status"]) & (single_aovs["shadow"] == double_aovs["shadow"]).all(-1)
-    assert inside.mean() > 0.98  # edges
-    assert np.abs(single - double)[inside].max() < 1e-4
-
-
 @pytest.mark.optimised  # two programs, whose bits are the same as users compile them
 @pytest.mark.parametrize("transformation", [jax.jit, jax.jacfwd, jax.vmap])
 def test_there_is_no_progress_within_a_transformation(transformation):
@@ -217,26 +207,6 @@ def test_progress_gives_the_same_bits():
 
 
 # Samples and steps.
-
-
-@pytest.mark.deep  # test_references.py has means of samples by pbrt and Mitsuba
-def test_samples_are_those_of_a_larger_picture():
-    """The picture, and its derivative."""
-    large = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=2 * WIDTH, height=2 * HEIGHT)
-    weights = np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
-
-    def loss(heights, scene, weights):
-        image = jaxhf.render(scene.with_heights(heights), PLAIN)
-        return jnp.vdot(weights, image), image
-
-    value_and_grad = jax.value_and_grad(loss, has_aux=True)
-    (_, image), gradient = value_and_grad(scene().heights, scene(samples=4), weights)
-    repeated = weights.repeat(2, axis=0).repeat(2, axis=1) / 4
-    (_, large_image), large_gradient = value_and_grad(scene().heights, scene(camera=large), repeated)
-    blocks = np.asarray(large_image).reshape(HEIGHT, 2, WIDTH, 2, 3)
-    np.testing.assert_allclose(image, blocks.mean((1, 3)), rtol=ROUNDING)
-    np.testing.assert_allclose(gradient, large_gradient, atol=1e-4 * np.abs(gradient).max())
-    assert np.abs(gradient).max() > 1
 
 
 def test_samples_round_up_to_a_square():
