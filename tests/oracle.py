@@ -74,7 +74,7 @@ class _Sheet(NamedTuple):
     Attributes:
       z: heights from the lowest; vertex (ix, iy) of the field is at [iy + 1, ix + 1].
       there: cells that belong to the field.
-      steepness: no height in the neighbourhood changes by more when x or y or both change by one cell.
+      steepness: see the function.
     """
 
     z: Float[np.ndarray, "rows columns"]
@@ -90,9 +90,14 @@ def _sheet(heights: np.ndarray) -> tuple[_Sheet, float]:
     known = np.where(finite, heights - lowest, 0)
     totals, counts = (_windows(np.pad(value.astype(float), 1), 3).sum((2, 3)) for value in (known, finite))
     z = np.pad(np.where(finite, known, totals / np.maximum(counts, 1)), 1, mode="edge")
-    along_x, along_y = np.abs(np.diff(z, axis=1)), np.abs(np.diff(z, axis=0))
-    steepness = np.maximum(along_x[:-1], along_x[1:]) + np.maximum(along_y[:, :-1], along_y[:, 1:])
-    return _Sheet(z, np.pad(there, 1), _windows(np.pad(steepness, 1), 3).max((2, 3))), lowest
+    return _Sheet(z, np.pad(there, 1), steepness(z)), lowest
+
+
+def steepness(heights: np.ndarray) -> np.ndarray:
+    """For each cell, what no height in it or in a neighbour changes by more when x or y or both change by one cell."""
+    along_x, along_y = np.abs(np.diff(heights, axis=1)), np.abs(np.diff(heights, axis=0))
+    found = np.maximum(along_x[:-1], along_x[1:]) + np.maximum(along_y[:, :-1], along_y[:, 1:])
+    return _windows(np.pad(found, 1), 3).max((2, 3))
 
 
 def _windows(values: np.ndarray, size: int) -> np.ndarray:
@@ -187,17 +192,10 @@ def _nodes(sheet: _Sheet, o: np.ndarray, d: np.ndarray, shift: np.ndarray, depth
     is followed as far as `depth`.
     """
     rows, columns = sheet.there.shape
-    near, far = np.zeros(len(o)), np.full(len(o), np.inf)
-    slabs = ((-1.0, columns - 1.0), (-1.0, rows - 1.0), (-depth, sheet.z.max() + depth))
+    near, far = within_slabs(o, d, [(-1.0, columns - 1.0), (-1.0, rows - 1.0), (-depth, sheet.z.max() + depth)])
+    passes = near <= far
+    near, far = np.where(passes, near, 0)[:, None], np.where(passes, far, 0)[:, None]
     with np.errstate(all="ignore"):
-        for axis, (low, high) in enumerate(slabs):
-            one, two = (low - o[:, axis]) / d[:, axis], (high - o[:, axis]) / d[:, axis]
-            within = (low <= o[:, axis]) & (o[:, axis] <= high)
-            parallel = d[:, axis] == 0
-            near = np.maximum(near, np.where(parallel, np.where(within, 0, np.inf), np.minimum(one, two)))
-            far = np.minimum(far, np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(one, two)))
-        passes = near <= far
-        near, far = np.where(passes, near, 0)[:, None], np.where(passes, far, 0)[:, None]
         lines = [(np.arange(-1, columns), 0, 0), (np.arange(-1, rows), 1, 1), (np.arange(-rows, columns + 1), 0, 2)]
         crossings = [near, far]
         for numbers, first, kind in lines:
@@ -209,6 +207,19 @@ def _nodes(sheet: _Sheet, o: np.ndarray, d: np.ndarray, shift: np.ndarray, depth
     t = np.sort(np.clip(np.where(np.isfinite(t), t, near), near, far), axis=1)
     x, y = o[:, :1] + t * d[:, :1], o[:, 1:2] + t * d[:, 1:2]
     return t, o[:, 2:] + t * d[:, 2:] - _height(sheet, x, y)[0]
+
+
+def within_slabs(o: np.ndarray, d: np.ndarray, slabs: list[tuple]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """t >= 0 between which rays are in all slabs, one to an axis; in the wrong order where they never are."""
+    near, far = np.zeros(len(o)), np.full(len(o), np.inf)
+    with np.errstate(all="ignore"):
+        for axis, (low, high) in enumerate(slabs):
+            one, two = (low - o[:, axis]) / d[:, axis], (high - o[:, axis]) / d[:, axis]
+            within = (low <= o[:, axis]) & (o[:, axis] <= high)
+            parallel = d[:, axis] == 0
+            near = np.maximum(near, np.where(parallel, np.where(within, 0, np.inf), np.minimum(one, two)))
+            far = np.minimum(far, np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(one, two)))
+    return near, far
 
 
 def _first_change(t: np.ndarray, g: np.ndarray, open_: np.ndarray, rise: np.ndarray) -> np.ndarray:
