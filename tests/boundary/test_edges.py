@@ -385,8 +385,3 @@ def test_distribution_is_exact_in_single_precision():
     np.testing.assert_allclose(integers[::65536], 2**30 / 16, rtol=2e-3)
     assert 1000 * int(guiding.stratum) >= integers.sum()
     assert integers.sum() < 2**31
-
-
-def test_a_number_of_points_is_whole_and_not_negative():
-    with pytest.raises(ValueError, match="edge_samples must be a whole number from 0 on"):
-        jaxhf.Settings(edge_samples=-1)

@@ -1,4 +1,4 @@
-"""Horizon angles and sky-view factors, against all crossings one by one, closed forms, cast rays and differences."""
+"""Horizon angles and sky-view factors, against all crossings one by one, closed forms and differences."""
 
 import jax
 import jax.numpy as jnp
@@ -112,22 +112,6 @@ def test_sky_view_is_the_mean_over_every_crossing_at_any_size():
             np.testing.assert_allclose(found, expected, atol=2e-6, err_msg=str((scale, cell, weighting)))
             for kind in (jaxhf.Heightfield, jaxhf.Terrain) if scale == 1 else ():
                 np.testing.assert_array_equal(jaxhf.sky_view(kind(z, cell, 1.5 * cell), 8, weighting=weighting), found)
-
-
-def test_rays_just_above_the_horizon_meet_nothing_and_rays_just_below_do():
-    """A tenth of a degree is 0.0035 at the next vertex; rays start 0.002 above theirs, as single precision moves them."""
-    rng = np.random.default_rng(7)
-    z = (np.cumsum(np.cumsum(rng.normal(size=SHAPE), 0), 1) / 8).astype(np.float32)
-    field = jaxhf.Heightfield(z, 3.0, 2.0, 100.0, -7.0)
-    # Not along edges and the border, where rounding decides.
-    for azimuth, angle in zip(np.deg2rad(AZIMUTHS), np.asarray(jaxhf.horizon(field, AZIMUTHS)), strict=True):
-        rises = (angle > 0.2) & (angle < 89.8)
-        assert rises.mean() > 0.2
-        o = np.stack([100 + 3 * X, -7 + 2 * Y, z + 2e-3], -1)[rises][:256]
-        for off, status in ((0.1, jaxhf.Status.MISS), (-0.1, jaxhf.Status.HIT)) if azimuth % (np.pi / 4) else ():
-            h = np.deg2rad(angle + off)[rises][:256]
-            d = np.stack([np.sin(azimuth) * np.cos(h), np.cos(azimuth) * np.cos(h), np.sin(h)], -1)
-            assert np.all(np.asarray(jaxhf.cast(field, o, d).status) == int(status))
 
 
 def test_derivatives_are_differences_of_every_crossing():

@@ -5,7 +5,6 @@ stands for the rounding of some ten operations in float32.
 """
 
 import aimed
-import crossings
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,7 +103,6 @@ def test_sky(side):
     assert 0 < met.mean() < 1
 
 
-ROUGH = aimed.Ground(aimed.random_heights((17, 33), 2.0, seed=3))
 WALL = np.where(np.arange(33) < 3.5, 0.0, 1.0) * np.ones((17, 1))  # a plain, a wall between x = 3 and x = 4, a plateau
 
 
@@ -143,37 +141,6 @@ def test_light_before_the_wall_is_not_blocked():
         assert not shadow.any()
         expected = ALBEDO / np.pi * from_point(np.stack([x, y, 0 * x], -1), UP, np.array(p), 10.0)
         np.testing.assert_allclose(image, expected, rtol=ROUNDING)
-
-
-def hidden(p, d, before):
-    """Whether the terrain is above the line p + t d at a crossing of lines or diagonals before t."""
-    course = crossings.Course(ROUGH, p, d, 1e-9)
-    return crossings.has_changed_sides(course, np.ones(len(p), int), np.zeros(len(p)), np.full(len(p), before))
-
-
-@pytest.mark.parametrize("kind", [jaxhf.Directional, jaxhf.Point])
-def test_shadows_of_rough_terrain(kind):
-    """At each pixel by hand: the triangle below it, the light's cosine, and all that may stand in the light's way."""
-    at = np.array([-0.8, 0.3, 0.4]) if kind is jaxhf.Directional else np.array([13.0, 8.0, 3.0])
-    image, shadow = shadows(ROUGH.heights, vertical(16.03, 8.01, 15.7), kind(at, 1.0))
-    o = np.stack([*(values.ravel() for values in places(16.03, 8.01, 15.7)), np.full(256, 9.0)], axis=1)
-    below = oracle.cast(*ROUGH, o, np.tile(-UP, (256, 1))).place
-
-    def seen(at):
-        to = at - below.p if kind is jaxhf.Point else at + 0 * below.p
-        return to, hidden(below.p, to, 1 if kind is jaxhf.Point else np.inf)
-
-    (to, dark), lower, higher = (seen(at + dz * UP) for dz in (0, -1e-3, 1e-3))
-    distance = np.linalg.norm(to, axis=1)
-    cosine = (to * below.n).sum(1) / distance
-    facing, sure = cosine > 0.01, lower[1] == higher[1]
-    np.testing.assert_array_equal(shadow.ravel()[facing & sure], dark[facing & sure])
-    irradiance = np.where(dark | (cosine < 0), 0, cosine) / (distance**2 if kind is jaxhf.Point else 1)
-    sure &= facing | (cosine < -0.01)
-    expected = irradiance[sure, None] * ALBEDO / np.pi
-    np.testing.assert_allclose(image.reshape(256, 3)[sure], expected, rtol=1e-4, atol=1e-6)
-    assert min((dark & facing & sure).mean(), (~dark & facing).mean()) > 0.1
-    assert sure.mean() > 0.9
 
 
 @pytest.mark.parametrize(
