@@ -64,7 +64,7 @@ def terrain(name: str, which: int) -> tuple[jaxhf.Scene, np.ndarray, dict[str, n
 
 def met_and_towards(ref: dict[str, np.ndarray], which: int) -> tuple[np.ndarray, np.ndarray]:
     """The places that Mitsuba's rays met, and the vectors to the light from there (unit: the sun's), in double precision."""
-    d = oracle.view_rays(ref["eye"], ref["target"], ref["fov"], 96, 96)
+    d = oracle.view_rays(ref["eye"], ref["target"], float(ref["fov"]), 96, 96)
     p = ref["eye"] + np.where(np.isfinite(ref["t"]), ref["t"], 0)[..., None] * d
     return p, np.broadcast_to(ref["towards"], p.shape) if which == 0 else ref["lamp"][:3] - p
 
