@@ -40,6 +40,16 @@ class Ground(NamedTuple):
         return np.array(self.heights.shape[::-1]) - 1
 
     @property
+    def corner(self) -> np.ndarray:
+        """Of the surface's box, at the lowest."""
+        return np.array([self.x0, self.y0, self.low])
+
+    @property
+    def size(self) -> np.ndarray:
+        """Of the box."""
+        return np.array([*(self.cells * [self.dx, self.dy]), self.range])
+
+    @property
     def low(self) -> float:
         return float(np.nanmin(self.heights))
 
@@ -66,8 +76,7 @@ class Ground(NamedTuple):
 
     def anywhere(self, generator: np.random.Generator, count: int, beyond: float = 1.0) -> np.ndarray:
         """Points in the box of the surface, and round it as far as `beyond` times its size."""
-        size = np.array([*(self.cells * [self.dx, self.dy]), self.range])
-        return [self.x0, self.y0, self.low] + size * generator.uniform(-beyond, 1 + beyond, (count, 3))
+        return self.corner + self.size * generator.uniform(-beyond, 1 + beyond, (count, 3))
 
 
 def random_heights(shape: tuple[int, int], scale: float, seed: int) -> np.ndarray:
@@ -118,22 +127,14 @@ def _fraction(generator: np.random.Generator, count: int) -> np.ndarray:
 def x_edges(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
     """At edges that run along x."""
     nx, ny = ground.cells
-    return _aim(
-        ground,
-        generator,
-        generator.integers(0, nx, count) + _fraction(generator, count),
-        generator.integers(0, ny + 1, count) + 0.0,
-    )
+    x = generator.integers(0, nx, count) + _fraction(generator, count)
+    return _aim(ground, generator, x, generator.integers(0, ny + 1, count) + 0.0)
 
 
 def y_edges(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
     nx, ny = ground.cells
-    return _aim(
-        ground,
-        generator,
-        generator.integers(0, nx + 1, count) + 0.0,
-        generator.integers(0, ny, count) + _fraction(generator, count),
-    )
+    x = generator.integers(0, nx + 1, count) + 0.0
+    return _aim(ground, generator, x, generator.integers(0, ny, count) + _fraction(generator, count))
 
 
 def diagonals(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
@@ -228,28 +229,22 @@ def border(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
 
 def through_side(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
     """From outside into the box: through its sides, its lid and its floor."""
-    nx, ny = ground.cells
-    size = np.array([nx * ground.dx, ny * ground.dy, ground.range])
     inside, outside = generator.random((count, 3)), generator.random((count, 3))
     axis = generator.integers(0, 3, count)
     outside[np.arange(count), axis] = np.where(generator.random(count) < 0.5, -1, 1) * generator.uniform(1.01, 3, count)
-    corner = np.array([ground.x0, ground.y0, ground.low])
-    o = corner + size * outside
-    return Rays(o, corner + size * inside - o, np.full(count, OPEN))
+    o = ground.corner + ground.size * outside
+    return Rays(o, ground.corner + ground.size * inside - o, np.full(count, OPEN))
 
 
 def miss(ground: Ground, generator: np.random.Generator, count: int) -> Rays:
     """Past the box, and away from it."""
-    nx, ny = ground.cells
-    size = np.array([nx * ground.dx, ny * ground.dy, ground.range])
-    corner = np.array([ground.x0, ground.y0, ground.low])
     one, two = generator.uniform(-1, 2, (2, count, 3))
     axis, side = generator.integers(0, 3, count), generator.choice([-1, 1], count)
     for point in (one, two):  # a line whose ends are both beyond the same face; beyond its second end it goes further off
         point[np.arange(count), axis] = 0.5 + side * generator.uniform(0.51, 1, count)
     swap = side * (two - one)[np.arange(count), axis] < 0
     one, two = np.where(swap[:, None], two, one), np.where(swap[:, None], one, two)
-    return Rays(corner + size * one, size * (two - one), np.full(count, MISS))
+    return Rays(ground.corner + ground.size * one, ground.size * (two - one), np.full(count, MISS))
 
 
 def random(ground: Ground, generator: np.random.Generator, count: int) -> Rays:

@@ -33,11 +33,13 @@ def numpied(hit):
     return {name: value.astype(np.float64) if value.dtype.kind == "f" else value for name, value in arrays.items()}
 
 
-def every_family(ground: aimed.Ground, seed: int) -> tuple[aimed.Rays, np.ndarray]:
+def every_family(
+    ground: aimed.Ground, seed: int, count: int = PER_FAMILY, stretched: bool = True
+) -> tuple[aimed.Rays, np.ndarray]:
     """Rays of each family, one after the other, as float32 numbers, and the names that go with them."""
-    parts = [aimed.aimed(name, ground, PER_FAMILY, seed, roundable=True) for name in aimed.FAMILIES]
+    parts = [aimed.aimed(name, ground, count, seed, roundable=True, stretched=stretched) for name in aimed.FAMILIES]
     o, d, expect = (np.concatenate(values) for values in zip(*parts, strict=True))
-    return aimed.Rays(o, d, expect), np.repeat(list(aimed.FAMILIES), PER_FAMILY)
+    return aimed.Rays(o, d, expect), np.repeat(list(aimed.FAMILIES), count)
 
 
 def assert_none(wrong, names, rays):

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import aimed
 import numpy as np
+import oracle
 from jaxtyping import Bool, Float, Int
 
 Parameters = Float[np.ndarray, "n k"]
@@ -31,7 +32,7 @@ class Course:
         self.reach = np.maximum(np.abs(self.o[:, :2]).max(1), ground.cells.max())
         self.tall = np.maximum(np.ptp(ground.heights), np.abs(self.o[:, 2]))
         self.slack = slack
-        self.steepness = _steepness(ground.heights)
+        self.steepness = oracle.steepness(ground.heights)
 
     def place(self, t: Parameters) -> tuple[Parameters, Parameters]:
         return self.o[:, :1] + t * self.d[:, :1], self.o[:, 1:2] + t * self.d[:, 1:2]
@@ -48,15 +49,8 @@ class Course:
 
     def over_footprint(self) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
         """t >= 0 between which the rays are surely over the footprint; in the wrong order where they never are."""
-        near, far = np.zeros(len(self.o)), np.full(len(self.o), np.inf)
         inset = self.slack * self.reach
-        for o, d, cells in zip(self.o.T, self.d.T, self.ground.cells, strict=False):
-            with np.errstate(divide="ignore", invalid="ignore"):
-                ends = (inset - o) / d, (cells - inset - o) / d
-            within = (o >= inset) & (o <= cells - inset)
-            near = np.maximum(near, np.where(d == 0, np.where(within, 0, np.inf), np.minimum(*ends)))
-            far = np.minimum(far, np.where(d == 0, np.where(within, np.inf, -np.inf), np.maximum(*ends)))
-        return near, far
+        return oracle.within_slabs(self.o, self.d, [(inset, cells - inset) for cells in self.ground.cells])
 
     def crossings(self) -> Parameters:
         """t at which the rays cross lines and diagonals, unordered; not finite where they never do."""
@@ -68,14 +62,6 @@ class Course:
         )
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.concatenate([(number - o[:, None]) / d[:, None] for number, o, d in lines], axis=1)
-
-
-def _steepness(heights: np.ndarray) -> np.ndarray:
-    """For each cell, what no height in it or in a neighbour changes by more when x or y or both change by one cell."""
-    along_x, along_y = np.abs(np.diff(heights, axis=1)), np.abs(np.diff(heights, axis=0))
-    steepness = np.pad(np.maximum(along_x[:-1], along_x[1:]) + np.maximum(along_y[:, :-1], along_y[:, 1:]), 1)
-    rows = np.maximum(np.maximum(steepness[:-2], steepness[1:-1]), steepness[2:])
-    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
 
 
 class Crossing(NamedTuple):

@@ -1,8 +1,7 @@
 """Where rays meet a heightfield, and the normals there: slow, plain NumPy in double precision, written apart from jaxhf.
 
-There are two ways to the answer, which share nothing but the grid. `cast` follows g(t) = height of the ray - height of the
-surface: between two crossings of lines x = i, y = j and diagonals g is linear, so its values at all the crossings settle
-everything, also how close the answer is to another one. `cast_triangles` tries every triangle.
+`cast` follows g(t) = height of the ray - height of the surface: between two crossings of lines x = i, y = j and diagonals g is
+linear, so its values at all the crossings settle everything, also how close the answer is to another one.
 """
 
 from typing import NamedTuple
@@ -10,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-MISS, HIT, INVALID = 0, 1, 3
+MISS, HIT = 0, 1
 
 Vectors = Float[np.ndarray, "n 3"]
 
@@ -19,8 +18,8 @@ class Place(NamedTuple):
     """Points on the surface, one to a ray; without meaning where there is no hit.
 
     Attributes:
-      p: world frame.
-      n: unit normals of the triangles, on the surface's +z side, world frame.
+      p: in the frame of the rays.
+      n: unit normals of the triangles, on the surface's +z side.
       uv: position in the whole footprint, 0..1.
       cell: (ix, iy).
       triangle: 0 for (00, 10, 11), 1 for (00, 11, 01).
@@ -43,7 +42,7 @@ class OracleHit(NamedTuple):
     from the lowest.
 
     Attributes:
-      status: MISS, HIT or INVALID.
+      status: MISS or HIT.
       t: the smallest t > 0; infinite without a hit.
       place: what stands there.
       decided: whether no such shift turns a hit into a miss or a miss into a hit.
@@ -75,7 +74,7 @@ class _Sheet(NamedTuple):
     Attributes:
       z: heights from the lowest; vertex (ix, iy) of the field is at [iy + 1, ix + 1].
       there: cells that belong to the field.
-      steepness: no height in the neighbourhood changes by more when x or y or both change by one cell.
+      steepness: see the function.
     """
 
     z: Float[np.ndarray, "rows columns"]
@@ -83,16 +82,22 @@ class _Sheet(NamedTuple):
     steepness: Float[np.ndarray, "cell_rows cell_columns"]
 
 
-def _sheet(heights: np.ndarray) -> _Sheet:
+def _sheet(heights: np.ndarray) -> tuple[_Sheet, float]:
+    """The field as a sheet, and its lowest height."""
     finite = np.isfinite(heights)
     there = finite[:-1, :-1] & finite[:-1, 1:] & finite[1:, :-1] & finite[1:, 1:]
     lowest = heights[finite].min() if finite.any() else 0.0
     known = np.where(finite, heights - lowest, 0)
     totals, counts = (_windows(np.pad(value.astype(float), 1), 3).sum((2, 3)) for value in (known, finite))
     z = np.pad(np.where(finite, known, totals / np.maximum(counts, 1)), 1, mode="edge")
-    along_x, along_y = np.abs(np.diff(z, axis=1)), np.abs(np.diff(z, axis=0))
-    steepness = np.maximum(along_x[:-1], along_x[1:]) + np.maximum(along_y[:, :-1], along_y[:, 1:])
-    return _Sheet(z, np.pad(there, 1), _windows(np.pad(steepness, 1), 3).max((2, 3)))
+    return _Sheet(z, np.pad(there, 1), steepness(z)), lowest
+
+
+def steepness(heights: np.ndarray) -> np.ndarray:
+    """For each cell, what no height in it or in a neighbour changes by more when x or y or both change by one cell."""
+    along_x, along_y = np.abs(np.diff(heights, axis=1)), np.abs(np.diff(heights, axis=0))
+    found = np.maximum(along_x[:-1], along_x[1:]) + np.maximum(along_y[:, :-1], along_y[:, 1:])
+    return _windows(np.pad(found, 1), 3).max((2, 3))
 
 
 def _windows(values: np.ndarray, size: int) -> np.ndarray:
@@ -134,7 +139,6 @@ def cast(
     y0: float,
     o: Vectors,
     d: Vectors,
-    world_from_object: np.ndarray | None = None,
     slack: float = 1e-12,
 ) -> OracleHit:
     """The first hits of half-lines o + t d, t > 0, on the surface, by the sign of g at every crossing.
@@ -144,16 +148,14 @@ def cast(
     Args:
       heights: (ny, nx); a vertex that is not finite removes the four cells round it.
       dx, dy, x0, y0: vertex (ix, iy) is at x0 + ix dx, y0 + iy dy.
-      o, d: world frame, (n, 3) each.
-      world_from_object: 4x4; None: the identity.
+      o, d: (n, 3) each.
       slack: how large a rounding is to be allowed for, see `OracleHit`.
     """
-    frame = _Frame(heights, dx, dy, x0, y0, world_from_object)
-    sheet, valid = frame.sheet, _valid(o, d)
-    # Rays that are not valid go up from the corner, so that arithmetic stays quiet.
-    co, cd = frame.into_cells(np.where(valid[:, None], o, 0), np.where(valid[:, None], d, [0, 0, 1]))
-    ny, nx = np.shape(heights)
-    reach = np.maximum(np.abs(co[:, :2]).max(1), max(nx, ny))
+    heights = np.asarray(heights, np.float64)
+    sheet, lowest = _sheet(heights)
+    corner, unit = np.array([x0, y0, lowest]), np.array([dx, dy, 1.0])
+    co, cd = (o - corner) / unit, d / unit
+    reach = np.maximum(np.abs(co[:, :2]).max(1), max(heights.shape))
     tall = np.maximum(sheet.z.max(), np.abs(co[:, 2]))
     shift = slack * reach
     t, g = _nodes(sheet, co, cd, shift, 2 * tall)
@@ -168,25 +170,19 @@ def cast(
     latest = _first_change(t, g, to_gap > shift[:, None], rise)
     earliest = _first_within(t, g, to_field <= shift[:, None], rise)
 
-    decided = (np.isfinite(latest) | np.isinf(earliest)) & valid
-    hit = np.isfinite(nominal) & valid
-    status = np.where(valid, np.where(hit, HIT, MISS), INVALID)
+    hit = np.isfinite(nominal)
     found = np.where(hit, nominal, 0)
     nearest = np.argmin(np.abs(middle - found[:, None]), axis=1)
     return OracleHit(
-        status=status,
-        t=np.where(hit, nominal, np.inf),
-        place=frame.place(co[:, :2] + found[:, None] * cd[:, :2]),
-        decided=decided,
-        earliest=np.where(valid, earliest, np.inf),
-        latest=np.where(valid, latest, np.inf),
+        status=np.where(hit, HIT, MISS),
+        t=nominal,
+        place=_place(sheet, corner, unit, co[:, :2] + found[:, None] * cd[:, :2]),
+        decided=np.isfinite(latest) | np.isinf(earliest),
+        earliest=earliest,
+        latest=latest,
         shift=shift,
         rise=rise[np.arange(len(rise)), nearest],
     )
-
-
-def _valid(o: np.ndarray, d: np.ndarray) -> np.ndarray:
-    return np.isfinite(o).all(1) & np.isfinite(d).all(1) & (d != 0).any(1)
 
 
 def _nodes(sheet: _Sheet, o: np.ndarray, d: np.ndarray, shift: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -196,17 +192,10 @@ def _nodes(sheet: _Sheet, o: np.ndarray, d: np.ndarray, shift: np.ndarray, depth
     is followed as far as `depth`.
     """
     rows, columns = sheet.there.shape
-    near, far = np.zeros(len(o)), np.full(len(o), np.inf)
-    slabs = ((-1.0, columns - 1.0), (-1.0, rows - 1.0), (-depth, sheet.z.max() + depth))
+    near, far = within_slabs(o, d, [(-1.0, columns - 1.0), (-1.0, rows - 1.0), (-depth, sheet.z.max() + depth)])
+    passes = near <= far
+    near, far = np.where(passes, near, 0)[:, None], np.where(passes, far, 0)[:, None]
     with np.errstate(all="ignore"):
-        for axis, (low, high) in enumerate(slabs):
-            one, two = (low - o[:, axis]) / d[:, axis], (high - o[:, axis]) / d[:, axis]
-            within = (low <= o[:, axis]) & (o[:, axis] <= high)
-            parallel = d[:, axis] == 0
-            near = np.maximum(near, np.where(parallel, np.where(within, 0, np.inf), np.minimum(one, two)))
-            far = np.minimum(far, np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(one, two)))
-        passes = near <= far
-        near, far = np.where(passes, near, 0)[:, None], np.where(passes, far, 0)[:, None]
         lines = [(np.arange(-1, columns), 0, 0), (np.arange(-1, rows), 1, 1), (np.arange(-rows, columns + 1), 0, 2)]
         crossings = [near, far]
         for numbers, first, kind in lines:
@@ -218,6 +207,19 @@ def _nodes(sheet: _Sheet, o: np.ndarray, d: np.ndarray, shift: np.ndarray, depth
     t = np.sort(np.clip(np.where(np.isfinite(t), t, near), near, far), axis=1)
     x, y = o[:, :1] + t * d[:, :1], o[:, 1:2] + t * d[:, 1:2]
     return t, o[:, 2:] + t * d[:, 2:] - _height(sheet, x, y)[0]
+
+
+def within_slabs(o: np.ndarray, d: np.ndarray, slabs: list[tuple]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """t >= 0 between which rays are in all slabs, one to an axis; in the wrong order where they never are."""
+    near, far = np.zeros(len(o)), np.full(len(o), np.inf)
+    with np.errstate(all="ignore"):
+        for axis, (low, high) in enumerate(slabs):
+            one, two = (low - o[:, axis]) / d[:, axis], (high - o[:, axis]) / d[:, axis]
+            within = (low <= o[:, axis]) & (o[:, axis] <= high)
+            parallel = d[:, axis] == 0
+            near = np.maximum(near, np.where(parallel, np.where(within, 0, np.inf), np.minimum(one, two)))
+            far = np.minimum(far, np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(one, two)))
+    return near, far
 
 
 def _first_change(t: np.ndarray, g: np.ndarray, open_: np.ndarray, rise: np.ndarray) -> np.ndarray:
@@ -247,88 +249,23 @@ def _first_within(t: np.ndarray, g: np.ndarray, open_: np.ndarray, rise: np.ndar
     return np.where(comes, t[:, :-1] + along * np.diff(t, axis=1), np.inf).min(axis=1)
 
 
-def cast_triangles(
-    heights: np.ndarray,
-    dx: float,
-    dy: float,
-    x0: float,
-    y0: float,
-    o: Vectors,
-    d: Vectors,
-    world_from_object: np.ndarray | None = None,
-) -> tuple[np.ndarray, Place]:
-    """t of the first hits (infinite without one) and their places, out of all triangles (Möller and Trumbore, JGT 2(1), 1997).
-
-    Triangles are taken a little larger than they are, so that nothing passes between two: by 1e-12 of their size, and
-    more where the ray is nearly parallel.
-    """
-    frame = _Frame(heights, dx, dy, x0, y0, world_from_object)
-    co, cd = frame.into_cells(o, d)
-    z = frame.sheet.z[1:-1, 1:-1]
-    tallest = z.max() or 1.0
-    ny, nx = z.shape
-    vertices = np.stack([*np.meshgrid(np.arange(float(nx)), np.arange(float(ny))), z / tallest], axis=-1)
-    corner = [
-        vertices[j : ny - 1 + j, i : nx - 1 + i][frame.sheet.there[1:-1, 1:-1]] for j, i in ((0, 0), (0, 1), (1, 1), (1, 0))
-    ]
-    a, b, c = (np.concatenate(pair) for pair in ((corner[0],) * 2, (corner[1], corner[2]), (corner[2], corner[3])))
-    unit_height = np.array([1, 1, tallest])
-    t = np.array([_nearest_triangle(a, b - a, c - a, *ray) for ray in zip(co / unit_height, cd / unit_height, strict=True)])
-    return t, frame.place((co + np.where(np.isfinite(t), t, 0)[:, None] * cd)[:, :2])
-
-
-def _nearest_triangle(a: Vectors, e1: Vectors, e2: Vectors, o: np.ndarray, d: np.ndarray) -> float:
-    if len(a) == 0:
-        return np.inf
-    d_length = np.linalg.norm(d)
-    d = d / d_length
-    p, s = np.cross(d, e2), o - a
-    determinant = (e1 * p).sum(1)
-    parallel = determinant == 0
-    safe = np.where(parallel, 1, determinant)
-    q = np.cross(s, e1)
-    u, v, t = (s * p).sum(1) / safe, (q @ d) / safe, (e2 * q).sum(1) / safe
-    sizes = np.linalg.norm(e1, axis=1) * np.linalg.norm(e2, axis=1) + np.linalg.norm(s, axis=1)
-    tolerance = 1e-12 + 1e-15 * sizes / np.abs(safe)
-    met = ~parallel & (u >= -tolerance) & (v >= -tolerance) & (u + v <= 1 + tolerance) & (t > 0)
-    return np.where(met, t, np.inf).min() / d_length
-
-
-class _Frame:
-    """The field in cells by cells by heights from the lowest, and the way there and back."""
-
-    def __init__(self, heights, dx: float, dy: float, x0: float, y0: float, world_from_object: np.ndarray | None):
-        self.heights = np.asarray(heights, np.float64)
-        self.sheet = _sheet(self.heights)
-        finite = self.heights[np.isfinite(self.heights)]
-        self.corner = np.array([x0, y0, finite.min() if finite.size else 0.0])
-        self.unit = np.array([dx, dy, 1.0])
-        self.world = np.eye(4) if world_from_object is None else np.asarray(world_from_object, np.float64)
-        self.object = np.linalg.inv(self.world)
-
-    def into_cells(self, o: Vectors, d: Vectors) -> tuple[Vectors, Vectors]:
-        o = o @ self.object[:3, :3].T + self.object[:3, 3]
-        return (o - self.corner) / self.unit, (d @ self.object[:3, :3].T) / self.unit
-
-    def place(self, at: Float[np.ndarray, "n 2"]) -> Place:
-        """The surface over points given in cells."""
-        ny, nx = self.heights.shape
-        x, y = np.clip(at[:, 0], 0, nx - 1), np.clip(at[:, 1], 0, ny - 1)
-        z, a, b = _height(self.sheet, x, y)
-        ix, iy = np.clip(np.floor(x), 0, nx - 2), np.clip(np.floor(y), 0, ny - 2)
-        u, v = x - ix, y - iy
-        upper = v > u
-        inside = np.minimum(np.abs(u - v), np.where(upper, np.minimum(u, 1 - v), np.minimum(v, 1 - u)))
-        p = np.stack([x, y, z], axis=1) * self.unit + self.corner
-        n = np.stack([-a / self.unit[0], -b / self.unit[1], np.ones_like(a)], axis=1) @ self.object[:3, :3]
-        return Place(
-            p=p @ self.world[:3, :3].T + self.world[:3, 3],
-            n=n / np.linalg.norm(n, axis=1)[:, None],
-            uv=np.stack([x / (nx - 1), y / (ny - 1)], axis=1),
-            cell=np.stack([ix, iy], axis=1).astype(int),
-            triangle=upper.astype(int),
-            inside=inside,
-        )
+def _place(sheet: _Sheet, corner: np.ndarray, unit: np.ndarray, at: Float[np.ndarray, "n 2"]) -> Place:
+    """The surface over points given in cells."""
+    nx, ny = np.array(sheet.z.shape[::-1]) - 2
+    x, y = np.clip(at[:, 0], 0, nx - 1), np.clip(at[:, 1], 0, ny - 1)
+    z, a, b = _height(sheet, x, y)
+    ix, iy = np.clip(np.floor(x), 0, nx - 2), np.clip(np.floor(y), 0, ny - 2)
+    u, v = x - ix, y - iy
+    upper = v > u
+    n = np.stack([-a / unit[0], -b / unit[1], np.ones_like(a)], axis=1)
+    return Place(
+        p=np.stack([x, y, z], axis=1) * unit + corner,
+        n=n / np.linalg.norm(n, axis=1)[:, None],
+        uv=np.stack([x / (nx - 1), y / (ny - 1)], axis=1),
+        cell=np.stack([ix, iy], axis=1).astype(int),
+        triangle=upper.astype(int),
+        inside=np.minimum(np.abs(u - v), np.where(upper, np.minimum(u, 1 - v), np.minimum(v, 1 - u))),
+    )
 
 
 def _triangles_at(scheme: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
@@ -399,22 +336,21 @@ def _normals_round(heights: np.ndarray, ix: int, iy: int, dx: float, dy: float, 
 
 
 def shading_normals(
-    heights: np.ndarray, dx: float, dy: float, place: Place, scheme: str, world_from_object: np.ndarray | None = None
+    heights: np.ndarray, dx: float, dy: float, place: Place, scheme: str
 ) -> tuple[Vectors, np.ndarray, np.ndarray]:
-    """Interpolated unit normals (world), how far they turn over one cell, and how much of them cancels.
+    """Interpolated unit normals, how far they turn over one cell, and how much of them cancels.
 
     The interpolation is the barycentric mean of the triangle's three. The last value is the length of all that was added up
     over the length of the sum: rounding in the result grows by as much.
     """
     ny, nx = np.shape(heights)
     normals, lengths = vertex_normals(heights, dx, dy, scheme)
-    back = np.eye(3) if world_from_object is None else np.linalg.inv(world_from_object)[:3, :3]
     result, turns, cancels = [], [], []
     for (u, v), (ix, iy), upper in zip(place.uv * [nx - 1, ny - 1] - place.cell, place.cell, place.triangle, strict=True):
         other, weights = ((ix, iy + 1), (1 - v, u, v - u)) if upper else ((ix + 1, iy), (1 - u, v, u - v))
         corners = [(ix, iy), (ix + 1, iy + 1), other]
-        three = np.array([normals[row, column] for column, row in corners]) @ back
-        added = np.linalg.norm(back, 2) * np.dot(weights, [lengths[row, column] for column, row in corners])
+        three = np.array([normals[row, column] for column, row in corners])
+        added = np.dot(weights, [lengths[row, column] for column, row in corners])
         mean = np.dot(weights, three)
         length = np.linalg.norm(mean)
         result.append(mean / length)

@@ -1,11 +1,9 @@
-"""Horizon angles and sky-view factors, against all crossings one by one, closed forms, cast rays and differences."""
-
-import subprocess
-import sys
+"""Horizon angles and sky-view factors, against all crossings one by one, closed forms and differences."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracle
 import pytest
 
 import jaxhf
@@ -47,24 +45,14 @@ def every_crossing(z, azimuth, dx, dy, lowest):
 
 
 WEIGHTINGS = ("solid-angle", "horizontal", "slope")
-RING = ((1, 0), (1, 1), (0, 1), (-1, 0), (-1, -1), (0, -1))  # a vertex's neighbours, between each two a triangle
-
-
-def unit_normals(z, dx, dy):
-    """Of the triangles round each vertex, by area; those at holes and beyond the border count for nothing."""
-    (ny, nx), padded = z.shape, np.pad(z, 1, constant_values=np.nan)
-    around = [(x * dx, y * dy, padded[1 + y : 1 + y + ny, 1 + x : 1 + x + nx] - z) for x, y in RING]
-    spans = [np.stack(np.broadcast_arrays(*span), -1) for span in around]
-    crosses = [np.cross(one, other) for one, other in zip(spans, spans[1:] + spans[:1], strict=True)]
-    n = sum(np.where(np.isnan(cross[..., :1]), 0, cross) for cross in crosses)
-    return n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-300)
 
 
 def skies(z, count, dx, dy):
     """Sky-view factors by weighting, from every crossing: means over even azimuths of what the docstring says."""
     azimuths = 360 * np.arange(count) / count
     h, turns = (np.deg2rad(each) for each in (np.stack([every_crossing(z, a, dx, dy, 0.0) for a in azimuths]), azimuths))
-    n, east, north = unit_normals(z, dx, dy), np.sin(turns)[:, None, None], np.cos(turns)[:, None, None]
+    n, east, north = oracle.vertex_normals(z, dx, dy, "six")[0], np.sin(turns)[:, None, None], np.cos(turns)[:, None, None]
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
     aside = (n[..., 0] * east + n[..., 1] * north) * (np.pi / 2 - h - np.sin(h) * np.cos(h))
     shares = 1 - np.sin(h), np.cos(h) ** 2, n[..., 2] * np.cos(h) ** 2 + aside
     return dict(zip(WEIGHTINGS, (np.maximum(share.mean(0), 0) for share in shares), strict=True))
@@ -92,32 +80,6 @@ def test_horizon_is_that_of_every_crossing(lowest, tolerance):
     assert found.dtype == z.dtype
     for azimuth, angles in zip(AZIMUTHS, np.asarray(found), strict=True):
         np.testing.assert_allclose(angles, every_crossing(z.astype(float), azimuth, 2.0, 1.0, lowest), atol=tolerance)
-
-
-DEVICES = """
-import sys, jax, numpy as np
-jax.config.update("jax_num_cpu_devices", 4)
-import jaxhf
-
-heights, azimuths = np.load(sys.argv[1]).values()
-three = jax.make_mesh((3,), ("some",), axis_types=(jax.sharding.AxisType.Auto,), devices=jax.devices()[1:])
-maps = {"all": jaxhf.horizon(heights, azimuths, dx=2.0, dy=1.0, lowest=-90.0)}
-maps["three"] = jaxhf.horizon(heights, azimuths, dx=2.0, dy=1.0, lowest=-90.0, mesh=three)
-devices = [sorted(device.id for device in found.sharding.device_set) for found in maps.values()]
-assert devices == [[0, 1, 2, 3], [1, 2, 3]], devices
-np.savez(sys.argv[1], **maps)
-"""
-
-
-@pytest.mark.deep  # rendering/test_devices.py has that of pictures
-def test_any_number_of_devices_gives_the_same_bits(tmp_path):
-    """All four of a process, which is the default, and three by `mesh`, for twelve tiles."""
-    path = tmp_path / "maps.npz"
-    np.savez(path, heights=rough(), azimuths=AZIMUTHS)
-    subprocess.run([sys.executable, "-c", DEVICES, path], check=True, timeout=300)
-    one = jaxhf.horizon(rough(), AZIMUTHS, dx=2.0, dy=1.0, lowest=-90.0)
-    for found in np.load(path).values():
-        np.testing.assert_array_equal(found, one)
 
 
 def test_closed_forms():
@@ -150,22 +112,6 @@ def test_sky_view_is_the_mean_over_every_crossing_at_any_size():
             np.testing.assert_allclose(found, expected, atol=2e-6, err_msg=str((scale, cell, weighting)))
             for kind in (jaxhf.Heightfield, jaxhf.Terrain) if scale == 1 else ():
                 np.testing.assert_array_equal(jaxhf.sky_view(kind(z, cell, 1.5 * cell), 8, weighting=weighting), found)
-
-
-def test_rays_just_above_the_horizon_meet_nothing_and_rays_just_below_do():
-    """A tenth of a degree is 0.0035 at the next vertex; rays start 0.002 above theirs, as single precision moves them."""
-    rng = np.random.default_rng(7)
-    z = (np.cumsum(np.cumsum(rng.normal(size=SHAPE), 0), 1) / 8).astype(np.float32)
-    field = jaxhf.Heightfield(z, 3.0, 2.0, 100.0, -7.0)
-    # Not along edges and the border, where rounding decides.
-    for azimuth, angle in zip(np.deg2rad(AZIMUTHS), np.asarray(jaxhf.horizon(field, AZIMUTHS)), strict=True):
-        rises = (angle > 0.2) & (angle < 89.8)
-        assert rises.mean() > 0.2
-        o = np.stack([100 + 3 * X, -7 + 2 * Y, z + 2e-3], -1)[rises][:256]
-        for off, status in ((0.1, jaxhf.Status.MISS), (-0.1, jaxhf.Status.HIT)) if azimuth % (np.pi / 4) else ():
-            h = np.deg2rad(angle + off)[rises][:256]
-            d = np.stack([np.sin(azimuth) * np.cos(h), np.cos(azimuth) * np.cos(h), np.sin(h)], -1)
-            assert np.all(np.asarray(jaxhf.cast(field, o, d).status) == int(status))
 
 
 def test_derivatives_are_differences_of_every_crossing():

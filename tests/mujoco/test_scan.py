@@ -15,6 +15,7 @@ from jaxhf.mujoco import HField, grid_pattern, height_scan, ray
 GROUNDS = np.stack([heights(9, 6, seed) for seed in (1, 2)]).astype(np.float64)
 TURN, PLACE = (0.8, 0, 0, -0.6), np.array([[0.0, 0, 0], [7, -3, 0.4]])
 FIELDS = HField(GROUNDS.astype(np.float32), SIZE, PLACE, TURN)
+DOUBLE = [pytest.mark.x64, pytest.mark.deep]
 PLACES = grid_pattern()[:175]  # with 16 robots as many rays as in the tests of rays, and the same program
 
 
@@ -81,73 +82,34 @@ def test_look_up_has_the_walks_bits():
     np.testing.assert_array_equal(looked_up.n[~looked_up.mask], 0)
 
 
-def test_derivatives_on_a_plane():
-    """By hand: of heights along the robots' places and headings, the field's place and size, and its vertices.
-
-    Of those sums are known alone: a triangle's corners weigh 1 together, and their places are the ray's.
-    """
-    (nrow, ncol), (rx, ry, top, _), place = GROUNDS.shape[1:], SIZE, PLACE[1]
-    x, y = np.linspace(-rx, rx, ncol)[None] + np.zeros((nrow, 1)), np.linspace(-ry, ry, nrow)[:, None] + np.zeros((1, ncol))
-    data, turn = (0.5 + 0.1 * x - 0.05 * y).astype(np.float32), matrix(TURN)[:2, :2]
-    random = np.random.default_rng(4)
-    pos = place + random.uniform([-1, -2, 0.5], [1, 2, 1], (16, 3))
-    quat, weights = random.normal(size=(16, 4)) * [1, 0.2, 0.2, 1], random.normal(size=(16, 175))
-
-    def weighted(data, size, stands, pos, quat):
-        scan = height_scan(HField(data, size, stands, TURN), pos, quat, PLACES)
-        return jnp.sum(scan.heights * weights.astype(np.float32)), scan
-
-    program = jax.jit(jax.grad(weighted, argnums=(0, 1, 2, 3, 4), has_aux=True), compiler_options=jaxhf.compiler_options())
-    numbers = [np.asarray(value, np.float32) for value in (data, SIZE, place, pos, quat)]
-    (of_data, of_size, of_place, of_pos, of_quat), scan = program(*numbers)
-    assert np.all(scan.mask)
-    world, level = np.asarray(scan.p[..., :2], float) - place[:2], turn @ [0.1 * top, -0.05 * top]
-    local = world @ turn
-    np.testing.assert_allclose(scan.heights, place[2] + top / 2 + world @ level, atol=1e-5)
-    # Sums of some thousand numbers near 1.
-    alike = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=2e-4)
-    robot = weights.sum(1)
-    alike(of_pos, np.column_stack([robot[:, None] * level, 0 * robot]))
-    alike(of_place, [*-robot.sum() * level, robot.sum()])
-    aside = np.stack([-(world - (pos - place)[:, None, :2])[..., 1], (world - (pos - place)[:, None, :2])[..., 0]], -1)
-    w, i, j, k = quat.T
-    about_z = 0.5 * np.column_stack([-k, -j, i, w])  # (0, 0, 0, 1) times the quaternion, by half of the angle
-    alike((of_quat * about_z).sum(1), (weights * (aside @ level)).sum(1))
-    z = 0.5 + 0.1 * local[..., 0] - 0.05 * local[..., 1]
-    by_size = [-top * 0.1 * local[..., 0] / rx, top * 0.05 * local[..., 1] / ry, z, 0 * z]
-    alike(of_size, [(weights * part).sum() for part in by_size])
-    for of_vertex, of_ray in ((1, 1), (x, local[..., 0]), (y, local[..., 1])):
-        alike((of_data * of_vertex).sum(), top * (weights * of_ray).sum())
-
-
-@pytest.mark.x64  # central differences with steps of 1e-7
-@pytest.mark.deep
-def test_gradient_matches_central_differences():
-    """In the heights, size and place of the height fields and in the robots' poses."""
+@pytest.mark.parametrize(("dtype", "rtol"), [(np.float32, 1e-4), pytest.param(np.float64, 1e-6, marks=DOUBLE)])
+def test_gradient_matches_central_differences(dtype, rtol):
+    """In the heights, size and place of the height fields and in the robots' poses; the differences are in double precision."""
     pos, quat = robots(3)
-    numbers = tuple(map(jnp.asarray, (GROUNDS, np.tile(SIZE, (2, 1)), PLACE, np.tile(TURN, (2, 1)), pos, quat)))
-    weights = jnp.asarray(np.random.default_rng(1).normal(size=(2, 3, 187)))
+    numbers = GROUNDS, np.tile(SIZE, (2, 1)), PLACE, np.tile(TURN, (2, 1)), pos, quat
+    random, eps = np.random.default_rng(2), 1e-7
+    weights = random.normal(size=(2, 3, 187))
+    tangents = [random.normal(size=value.shape) for value in numbers]
+    tangents[3][:, 1:3] = 0  # else the field is upright no longer; its tilt is in the test of rays
     structure = jax.tree.structure(HField(GROUNDS, SIZE, PLACE, TURN))
 
     def weighted(numbers):
         fields = jax.tree.unflatten(structure, numbers[:4])
         assert fields.upright
         scan = height_scan(fields, numbers[4], numbers[5])
-        return (weights * (scan.heights + scan.n.sum(-1) - scan.dist)).sum(), scan.mask.mean()
+        return (jnp.asarray(weights, numbers[4].dtype) * (scan.heights + scan.n.sum(-1) - scan.dist)).sum(), scan.mask.mean()
 
-    program = jax.jit(jax.value_and_grad(weighted, has_aux=True), compiler_options=jaxhf.compiler_options())
-    (_, seen), slopes = program(numbers)
+    gradient = jax.jit(jax.grad(weighted, has_aux=True), compiler_options=jaxhf.compiler_options())
+    slopes, seen = gradient(tuple(value.astype(dtype) for value in numbers))
     assert 0.1 < seen < 0.95
-    random, eps = np.random.default_rng(2), 1e-7
-    tangents = [jnp.asarray(random.normal(size=value.shape)) for value in numbers]
-    tangents[3] = tangents[3].at[:, 1:3].set(0)  # else the field is upright no longer; its tilt is in the test of rays
-    along = [jnp.vdot(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True)]
+    along = [np.vdot(slope, tangent) for slope, tangent in zip(slopes, tangents, strict=True)]
     assert all(abs(part) > 1e-2 for part in along)
-    (ahead, _), (behind, _) = (
-        program(tuple(value + sign * eps * tangent for value, tangent in zip(numbers, tangents, strict=True)))[0]
-        for sign in (1, -1)
-    )
-    np.testing.assert_allclose(sum(along), (ahead - behind) / (2 * eps), rtol=1e-6)
+    with jax.enable_x64(True):
+        moved = (
+            tuple(value + sign * eps * tangent for value, tangent in zip(numbers, tangents, strict=True)) for sign in (1, -1)
+        )
+        (ahead, _), (behind, _) = map(jax.jit(weighted), moved)
+    np.testing.assert_allclose(sum(along), (float(ahead) - float(behind)) / (2 * eps), rtol=rtol)
 
 
 def test_rays_from_within_the_base_meet_its_bottom():

@@ -10,13 +10,8 @@ from hfields import SIZE, Reference, heights, matrix
 from jaxhf.core.errors import ArgumentError
 from jaxhf.mujoco import HField, depth_image, lidar, lidar_pattern
 
-GROUND = heights(9, 6, 1)
-FIELD = HField(GROUND, SIZE)
-REFERENCE = Reference(GROUND, SIZE)
+FIELD = HField(heights(9, 6, 1), SIZE)
 POS, QUAT = np.array([0.4, -0.3, 1.2]), np.array([0.8, 0.5, 0.1, -0.3])
-
-
-TURN = matrix(QUAT)
 
 
 def sensors(count):
@@ -42,6 +37,8 @@ def some(pos, quat, references, pattern):
 def test_batched_lidars_meet_what_rays_meet():
     fields, pos, quat, references = sensors(16)
     pattern = lidar_pattern(7, (-60.0, 0.0), (-180.0, 180.0), 14.4)
+    np.testing.assert_allclose(pattern[[0, -25]], [[-0.5, 0, -np.sqrt(0.75)], [-1, 0, 0]], atol=1e-12)
+    assert lidar_pattern(2, (-10.0, 10.0), (-45.0, 45.0), 30.0).shape == (8, 3)
     scan = lidar(fields, pos, quat, pattern)
     assert 0.2 < np.mean(scan.mask) < 0.8
     for at, d, t, n in some(pos, quat, references, pattern):
@@ -64,17 +61,11 @@ def test_batched_pictures_with_an_axis_off_their_middle_meet_what_rays_meet():
         np.testing.assert_allclose(dist[at], np.where(t < 0, -1, t * np.linalg.norm(d, axis=1)), rtol=1e-5, atol=1e-5)
 
 
-def test_depth_image_sees_what_rays_meet():
-    """70 x 40 pixels: as many rays as in the tests of rays, and the same program."""
+def test_an_angle_of_view_is_one_of_the_intrinsics():
     depth, dist = (np.asarray(value) for value in depth_image(FIELD, POS, QUAT, 70, 40, fovy=80.0))
     assert depth.shape == dist.shape == (40, 70)
-    f = 20 / np.tan(np.radians(40))
-    for row, column in ((0, 0), (39, 69), (20, 35), (30, 3), (38, 60)):
-        ray = TURN @ [(column + 0.5 - 35) / f, (20 - row - 0.5) / f, -1]
-        t = REFERENCE(POS[None], ray[None])[0][0]
-        np.testing.assert_allclose(depth[row, column], t, atol=1e-5)
-        np.testing.assert_allclose(dist[row, column], t * np.linalg.norm(ray) if t >= 0 else -1, atol=1e-5)
     assert 0.2 < (depth < 0).mean() < 0.8
+    f = 20 / np.tan(np.radians(40))
     same = depth_image(FIELD, POS, QUAT, 70, 40, intrinsics=(f, f, 35, 20))
     np.testing.assert_array_equal(same, (depth, dist))
     matrix = np.array([[f, 0, 35], [0, f, 20], [0, 0, 1]])
@@ -120,16 +111,3 @@ def test_sensors_say_what_is_wrong(call, message):
             call()
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
-
-
-def test_lidar_meets_what_rays_meet():
-    pattern = lidar_pattern(7, (-60.0, 0.0), resolution=0.9)
-    assert pattern.shape == (2800, 3)
-    np.testing.assert_allclose(pattern[[0, -400]], [[-0.5, 0, -np.sqrt(0.75)], [-1, 0, 0]], atol=1e-12)
-    scan = lidar(FIELD, POS, QUAT, pattern)
-    picked = np.arange(0, 2800, 41)
-    t, n = REFERENCE(np.tile(POS, (len(picked), 1)), pattern[picked] @ TURN.T)
-    np.testing.assert_allclose(scan.dist[picked], t, atol=1e-5)
-    np.testing.assert_allclose(scan.n[picked], n, atol=1e-4)
-    assert 0.1 < (t < 0).mean() < 0.9
-    assert lidar_pattern(2, (-10.0, 10.0), (-45.0, 45.0), 30.0).shape == (8, 3)

@@ -12,7 +12,6 @@ import jaxhf
 from jaxhf.core.affine import affine
 from jaxhf.core.ray import Ray
 from jaxhf.core.vector import dot, unit
-from jaxhf.preparation import world as worlds
 from jaxhf.preparation.ceiling import clears, make_ceiling
 from jaxhf.scene.procedural import fractal
 from jaxhf.trace.grid import make_grid
@@ -99,28 +98,3 @@ def test_no_walk_is_spared_that_meets_something(dtype):
 def test_a_square_terrain_of_many_cells():
     share = spared(fractal([300, 300], seed=5, exponent=2.2, range=(0.0, 0.25)), np.float32, dx=1 / 299, dy=1 / 299)
     assert np.all(share[3:6].mean(1) > (0.3, 0.8, 0.95))
-
-
-@pytest.mark.optimised  # to the bit
-@pytest.mark.deep  # no spared walk meets anything, by the test above
-def test_the_picture_keeps_its_bits(monkeypatch):
-    """Of two terrains, one of which shadows the other."""
-    heights = fractal([24, 24], seed=2, exponent=2.0, range=(0.0, 0.4)).astype(np.float32)
-    sheet = np.array([[0.5, 0, 0.1, 0.1], [0, 0.5, 0.2, 0.3], [-0.1, 0.1, 1, 0.5], [0, 0, 0, 1]])
-    field = jaxhf.Heightfield(heights)
-    scene = jaxhf.Scene(
-        [jaxhf.Object(field), jaxhf.Object(field, None, sheet)],
-        jaxhf.Perspective.look_at((0.5, -0.9, 1.1), (0.5, 0.4, 0.2), width=40, height=32),
-        [jaxhf.Directional((1, 0.3, 0.4)), jaxhf.Directional((-0.2, -0.5, 0.9))],
-    )
-    settings = jaxhf.Settings(chunk=256)
-    image, aovs = jaxhf.render(scene, settings, aovs=("shadow",))
-    prepared = jaxhf.render(jaxhf.prepare(scene, settings))
-    monkeypatch.setattr(worlds, "_make_ceiling", lambda *_: None)
-    jax.clear_caches()
-    plain, plain_aovs = jaxhf.render(scene, settings, aovs=("shadow",))
-    np.testing.assert_array_equal(image, plain)
-    np.testing.assert_array_equal(prepared, plain)
-    np.testing.assert_array_equal(aovs["shadow"], plain_aovs["shadow"])
-    shadow = np.mean(aovs["shadow"], (0, 1))
-    assert np.all((shadow > 0.05) & (shadow < 0.95))

@@ -1,18 +1,17 @@
-"""The same bits for the same ray, wherever it lies in a picture or a batch, and however often it is asked for, on the CPU.
+"""The same bits for the same ray, wherever it lies in a picture or a batch, on the CPU.
 
 Tiles and chunks have one fixed size, which makes them one compiled kernel. Two sizes are two kernels, and nothing is promised.
 """
 
-import dataclasses
-
 import aimed
-import jax
 import numpy as np
 import pytest
+from compare import every_family, heightfield, numpied
 
 import jaxhf
 
 GROUND = aimed.Ground(aimed.random_heights((33, 17), 0.6, seed=3), dx=0.3, dy=0.2)
+FIELD = heightfield(GROUND, np.float32)
 SETTINGS = jaxhf.Settings(chunk=64)  # tiles of 8 x 8
 AOVS = ("depth", "normal", "cell", "shadow")
 
@@ -21,8 +20,7 @@ SUN, LAMP = jaxhf.Directional((-1, 0.5, 0.5), (2, 3, 4)), jaxhf.Point((1.5, 0.25
 
 
 def seen(camera, *lights) -> dict[str, np.ndarray]:
-    field = jaxhf.Heightfield(GROUND.heights.astype(np.float32), *GROUND[1:])
-    scene = jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(0.7))], camera, lights)
+    scene = jaxhf.Scene([jaxhf.Object(FIELD, jaxhf.Matte(0.7))], camera, lights)
     image, aovs = jaxhf.render(scene, SETTINGS, aovs=AOVS)
     return {"image": np.asarray(image), **{name: np.asarray(value) for name, value in aovs.items()}}
 
@@ -55,24 +53,11 @@ def test_a_crop_has_the_bits_of_the_whole(camera, whole, crop, lights):
         np.testing.assert_array_equal(value, large[name][top : top + crop[1], left : left + crop[0]], name)
 
 
-def test_repeated_runs_have_the_same_bits():
-    """Also when everything has been compiled anew."""
-    first, again = (seen(perspective(64, 32), SUN) for _ in range(2))
-    jax.clear_caches()
-    anew = seen(perspective(64, 32), SUN)
-    for name, value in first.items():
-        np.testing.assert_array_equal(value, again[name], name)
-        np.testing.assert_array_equal(value, anew[name], name)
-
-
 def test_rays_have_the_same_bits_in_any_order_and_number():
-    parts = [aimed.aimed(name, GROUND, 100, seed=4, roundable=True) for name in aimed.FAMILIES]
-    o, d = np.concatenate([part.o for part in parts]), np.concatenate([part.d for part in parts])
-    field = jaxhf.Heightfield(GROUND.heights.astype(np.float32), *GROUND[1:])
-    whole = jaxhf.cast(field, o, d, SETTINGS)
+    (o, d, _), _ = every_family(GROUND, seed=4)
+    whole = numpied(jaxhf.cast(FIELD, o, d, SETTINGS))
     shuffled = np.random.default_rng(5).permutation(len(o))
     for chosen in (shuffled, shuffled[:65]):  # a single chunk is another program
-        part = jaxhf.cast(field, o[chosen], d[chosen], SETTINGS)
-        for field_ in dataclasses.fields(whole):
-            if (values := getattr(whole, field_.name)) is not None:
-                np.testing.assert_array_equal(getattr(part, field_.name), np.asarray(values)[chosen], field_.name)
+        part = numpied(jaxhf.cast(FIELD, o[chosen], d[chosen], SETTINGS))
+        for name, values in whole.items():
+            np.testing.assert_array_equal(part[name], values[chosen], name)

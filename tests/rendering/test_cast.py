@@ -67,19 +67,6 @@ def test_traversals_agree(dtype):
                 assert_none((one[name] != other[name]).reshape(COUNT, -1).any(1), names, rays)
 
 
-def test_float32_loses_no_ray():
-    """Many rays that hit, or miss, by construction, without a look at the oracle."""
-    for scale in (1e-6, 1.0, 1e6):
-        ground = aimed.Ground(aimed.random_heights((33, 17), scale, seed=7), dx=0.5, dy=2.0, x0=-3.0, y0=10.0)
-        for name in ("vertices", "x_edges", "y_edges", "diagonals", "vertical", "border", "miss"):
-            rays = aimed.aimed(name, ground, 8 * COUNT, seed=8, roundable=True)
-            parts = zip(np.split(rays.o, 8), np.split(rays.d, 8), strict=True)
-            status = np.concatenate([jaxhf.cast(heightfield(ground, SINGLE), *part).status for part in parts])
-            certain = rays.expect != aimed.OPEN
-            assert_none(certain & (status != rays.expect), np.full(len(status), name), rays)
-            assert certain.sum() > 3000, name
-
-
 @pytest.mark.parametrize(("traversal", "max_steps", "status"), [("dda", 19, [EXHAUSTED, HIT]), ("pyramid", 1, [EXHAUSTED] * 2)])
 def test_a_budget_that_runs_out_is_reported(traversal, max_steps, status):
     """Twenty cells to a wall or nineteen, none passed by its bounds; "dda" takes a step for each. The rest is as ever."""

@@ -60,6 +60,12 @@ view = jaxhf.Perspective.look_at((0.5, 0.5, 3.0), (0.5, 0.5, 0.0), up=(0, 1, 0),
 lights = [jaxhf.Directional(towards) for towards in ((1.0, 0.2, 0.7), (-0.4, 0.8, 0.7))]
 small = [jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights[:6, :6]))], view, [light]) for light in lights]
 settings = jaxhf.Settings(chunk=64, shading="flat", shadows=False)
+if "horizon" in parts:
+    rough = np.random.default_rng(4).uniform(size=(41, 165)).astype(np.float32)
+    rough[8:11, :9] = np.nan  # of twelve tiles
+    for name, each in (("all", None), ("three", meshes.get("three"))):
+        found = jaxhf.horizon(rough, [0, 45, 200, 333], dx=2.0, dy=1.0, lowest=-90.0, mesh=each)
+        results |= {f"horizon by {name}": found, f"devices by {name}": len(found.sharding.device_set)}
 if "fitted" in parts:
     import jaxhf.fitting.solve.run as run
     import jaxhf.xla.devices as devices
@@ -88,6 +94,8 @@ RUNS = {
     "four": (4, 1, ["pictures"]),
     "slope on four": (4, 1, ["slope"]),
     "some of four": (4, 1, ["pictures", "more meshes"]),
+    "horizon on one": (1, 1, ["horizon"]),
+    "horizon on four": (4, 1, ["horizon", "more meshes"]),
     "two processes": (2, 2, ["pictures", "slope"]),
     "more on one": (1, 1, ["slope with edges", "fitted"]),
     "more on four": (4, 1, ["slope with edges", "fitted"]),
@@ -155,6 +163,15 @@ def test_derivatives_of_boundaries_agree_over_devices(found):
     with_edges, slope = one["slope with edges"], found("slope on one")[0]["slope"]
     assert np.linalg.norm(four["slope with edges"] - with_edges) < 0.1 * np.linalg.norm(with_edges)
     assert np.linalg.norm(with_edges - slope) > 0.2 * np.linalg.norm(slope)
+
+
+@pytest.mark.deep
+def test_horizons_have_the_same_bits_on_any_number_of_devices(found):
+    """On all four of a process, which is the default, and on three by `mesh`."""
+    (one,), (four,) = found("horizon on one"), found("horizon on four")
+    assert (four["devices by all"], four["devices by three"]) == (4, 3)
+    for name in ("all", "three"):
+        np.testing.assert_array_equal(four[f"horizon by {name}"], one["horizon by all"], name)
 
 
 @pytest.mark.deep

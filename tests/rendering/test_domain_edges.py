@@ -58,8 +58,8 @@ def assert_right(fun: Callable[..., jax.Array], *args: Any, rtol: float = 1e-3) 
 # Pictures: all kinds of shapes, materials, lights and cameras; each edge of a domain is the same scene with other numbers.
 
 
-def scene_with(camera: Any, heights: np.ndarray = HEIGHTS) -> jaxhf.Scene:
-    field = jaxhf.Heightfield(heights)
+def scene_with(camera: Any) -> jaxhf.Scene:
+    field = jaxhf.Heightfield(HEIGHTS)
     return jaxhf.Scene(
         [
             jaxhf.Object(field, jaxhf.Matte(0.7)),
@@ -82,13 +82,8 @@ def from_above(across: float = 0.0) -> jaxhf.Orthographic:
     return jaxhf.Orthographic(frame, 1.3, width=PIXELS, height=PIXELS)
 
 
-def level(across: float, z: float) -> jaxhf.Perspective:
-    """Looks along y, but for so small an angle."""
-    frame = np.array([[1, 0, 0, 0.503], [0, 0, 1, -2], [0, 1, across, z], [0, 0, 0, 1.0]])
-    return jaxhf.Perspective(frame, 40.0, width=PIXELS, height=PIXELS)
-
-
-CAMERAS = {"orthographic": from_above(), "perspective": level(0.0, 0.15)}
+LEVEL = np.array([[1, 0, 0, 0.503], [0, 0, 1, -2], [0, 1, 0, 0.15], [0, 0, 0, 1.0]])
+CAMERAS = {"orthographic": from_above(), "perspective": jaxhf.Perspective(LEVEL, 40.0, width=PIXELS, height=PIXELS)}
 
 
 def put(where: Callable[[Any], Any], *value: Any) -> Callable[[jaxhf.Scene], jaxhf.Scene]:
@@ -151,15 +146,6 @@ def brightness(scene: jaxhf.Scene, edge_samples: int = 0) -> jax.Array:
 def test_pictures(kind):
     for change in PICTURES.values():
         assert_right(brightness, change(scene_with(CAMERAS[kind])))
-
-
-@pytest.mark.slow
-def test_pictures_of_rays_beside_an_axis_or_a_plane():
-    """Beside the cylinder's axis, and in the planes of walls and of flat terrain."""
-    for across in (0.0, *TINY):
-        assert_right(brightness, scene_with(from_above(across)))
-        for z in (0.1, 0.11):
-            assert_right(brightness, scene_with(level(across, z), 0 * HEIGHTS + 0.1))
 
 
 @pytest.mark.slow
@@ -254,9 +240,8 @@ def skies(heights: jax.Array, cell: float, weighting: Any) -> jax.Array:
 @pytest.mark.parametrize(
     ("fun", "kinds"),
     [
-        (directions, ("six-angle",)),
-        pytest.param(directions, ("central", "four", "six", "six-equal"), marks=pytest.mark.deep),
-        pytest.param(skies, ("solid-angle", "horizontal", "slope", "degrees"), marks=pytest.mark.deep),
+        (directions, ("six-angle", "central", "four", "six", "six-equal")),
+        (skies, ("solid-angle", "horizontal", "slope", "degrees")),
     ],
 )
 def test_maps_in_any_unit(fun, kinds):

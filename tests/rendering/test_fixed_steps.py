@@ -33,7 +33,7 @@ def mirrors(heights) -> jaxhf.Scene:
     ("scene", "aovs", "knobs"),
     [
         (terrain, AOVS, {"traversal": "pyramid"}),
-        pytest.param(terrain, AOVS, {"traversal": "dda", "max_steps": 5}, marks=pytest.mark.deep),
+        (terrain, AOVS, {"traversal": "dda", "max_steps": 5}),
         pytest.param(mirrors, (), {"max_depth": 1}, marks=pytest.mark.slow),
     ],
 )

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.cli.main import main
 
 THIN = (2, 2050)
 OTHERS = [(2, 2), (2050, 2), (1025, 3), (1023, 1023), (1024, 1024), (1201, 1201), (700, 1800), (2049, 2049)]
@@ -82,19 +81,3 @@ def test_rays_and_maps(shape):
     ]
     assert all(values.shape == shape for values in maps)
     np.testing.assert_array_equal(np.isnan(maps[4]), np.isnan(z))
-
-
-@pytest.mark.deep  # they call the same pictures and maps
-@pytest.mark.parametrize("shape", SIZES)
-def test_commands(shape, tmp_path, monkeypatch):
-    """`view` of 1024 x 1024 heights and more ended in a traceback, for a sum of XLA's library within a kernel."""
-    monkeypatch.setattr("jaxhf.cli.limits.set_up_jax", lambda options: None)  # JAX is set up already
-    np.save(tmp_path / "z.npy", heights(*shape))
-    source, out = str(tmp_path / "z.npy"), str(tmp_path)
-    picture = ["--size", "32x20", "--preset", "draft"]
-    assert main(["view", source, "-o", f"{out}/view.png", *picture]) == 0
-    assert main(["view", source, "-o", f"{out}/film.gif", "--frames", "2", *picture]) == 0
-    for command in ("hillshade", "slope", "aspect", "relief", "skyview", "info"):
-        output = [] if command == "info" else ["-o", f"{out}/{command}.{'tif' if command in ('slope', 'aspect') else 'png'}"]
-        assert main([command, source, *output]) == 0, command
-    assert np.ptp(jaxhf.load_image(f"{out}/view.png")) > 0.1

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxhf
+from jaxhf.core.affine import translate
 
 SIZE, DIAMETER, LOW = 24, 4.0, 12.0
 TOWARDS = jaxhf.Directional.from_angles(270, LOW).towards
@@ -126,11 +127,7 @@ def sheet(patch, cells):
     x0, x1, y0, y1, z, along_x, along_y = patch
     dx, dy = (x1 - x0) / cells, (y1 - y0) / cells
     y, x = np.mgrid[0 : cells + 1, 0 : cells + 1] * np.array([dy, dx])[:, None, None]
-    return jaxhf.Heightfield(along_x * x + along_y * y, dx, dy), place(x0, y0, z + along_x * x0 + along_y * y0)
-
-
-def place(x, y, z):
-    return np.array([[1, 0, 0, x], [0, 1, 0, y], [0, 0, 1, z], [0, 0, 0, 1.0]])
+    return jaxhf.Heightfield(along_x * x + along_y * y, dx, dy), translate(x0, y0, z + along_x * x0 + along_y * y0)
 
 
 def sheets(moved=(0.0, 0.0, 0.0, 0.0, 0.0)):
@@ -216,7 +213,7 @@ def test_a_lid_hides_a_sun_overhead():
     @jax.jit
     def draw(corner):
         objects = [jaxhf.Object(ground, jaxhf.Matte(1.0), place_of_ground)]
-        objects += [jaxhf.Object(lid, jaxhf.Matte(1.0), jnp.asarray(place(0, 0, 0), jnp.float32).at[:3, 3].set(corner))]
+        objects += [jaxhf.Object(lid, jaxhf.Matte(1.0), jnp.eye(4).at[:3, 3].set(corner))]
         return jaxhf.render(jaxhf.Scene(objects, camera, [jaxhf.Sun((0, 0, 1), np.pi, WIDE)]), FLAT)[..., 0]
 
     np.testing.assert_array_equal(draw(jnp.array([-20.0, -20, 2])), 0)

@@ -32,15 +32,6 @@ def field_of(heights: np.ndarray, dtype=np.float32, **corner: float) -> jaxhf.He
 
 
 @aimed.PRECISIONS
-@pytest.mark.parametrize("scale", [1e-20, 1e20])
-def test_extreme_heights(scale, dtype):
-    ground = AT_ZERO._replace(heights=aimed.random_heights((33, 17), scale, seed=5))
-    rays, names = every_family(ground, seed=6)
-    expected, _ = compare_with_oracle(ground, rays, names, dtype)
-    assert np.sum(expected.decided & (expected.status == oracle.HIT)) > 300
-
-
-@aimed.PRECISIONS
 def test_invalid_rays(dtype):
     bad = [np.nan, np.inf, -np.inf]
     o, d = np.tile([0.0, 11.0, 5.0], (COUNT, 1)), np.tile(DOWN, (COUNT, 1))
@@ -54,19 +45,9 @@ def test_invalid_rays(dtype):
         assert np.all(np.isposinf(value[:19]) if name == "t" else np.isfinite(value)), name
 
 
-def test_a_hole_lets_rays_through():
-    heights = np.zeros((33, 17))
-    heights[1, 2], heights[:, 3:] = np.nan, 2.0
-    x, y = (values.ravel() for values in np.meshgrid(np.arange(4) + 0.5, np.arange(3) + 0.25))
-    o = np.stack([x / 2, 2 * y, np.full(12, 3.0)], axis=1)
-    # Across the hole, over and under the sheet behind it: the side on which the ray stands is found anew.
-    across = np.array([[0.25, 1.0, 2.75], [0.25, 1.0, 0.5]]), np.array([[0.5, 0.0, -0.25], [0.5, 0.0, 0.0]])
-    hit = cast(field_of(heights), np.concatenate([o, across[0]]), np.concatenate([np.tile(DOWN, (12, 1)), across[1]]))
-    np.testing.assert_array_equal(hit["status"][:12].reshape(3, 4), [[1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]])
-    np.testing.assert_array_equal(hit["status"][12:14], [HIT, MISS])
-    np.testing.assert_allclose(hit["t"][12], 3, rtol=4 * float(np.finfo(np.float32).eps))
-    nothing = cast(field_of(np.full((33, 17), np.nan)), every_family(AT_ZERO, seed=21)[0].o, DOWN)
-    np.testing.assert_array_equal(nothing["status"], MISS)
+def test_where_all_are_holes_nothing_is_met():
+    hit = cast(field_of(np.full((33, 17), np.nan)), every_family(AT_ZERO, seed=21)[0].o, DOWN)
+    np.testing.assert_array_equal(hit["status"], MISS)
 
 
 @aimed.PRECISIONS
@@ -94,23 +75,6 @@ def test_where_the_ray_starts(dtype):
     hit = cast(field, o, d)
     np.testing.assert_array_equal(hit["status"][: len(t)], np.where(np.isfinite(t), HIT, MISS))
     np.testing.assert_allclose(hit["t"][: len(t)], t, rtol=4 * float(np.finfo(dtype).eps))
-
-
-@aimed.PRECISIONS
-def test_flat_field(dtype):
-    """z = 7, where the box of the surface has no height."""
-    generator = np.random.default_rng(15)
-    target = np.column_stack([generator.uniform(-0.9, 6.9, 200), generator.uniform(3.1, 66.9, 200), np.full(200, 7.0)])
-    o = target + generator.uniform(-4, 4, (200, 3))
-    beside = np.array([[-3.0, 5.0, 7.0], [0.0, 5.0, 7.0], [-3.0, 5.0, 7.5], [0.0, 5.0, 8.0], [0.0, 5.0, 6.0]])
-    away = np.array([[1.0, 0.1, 0.0], [1.0, 0.1, 0.0], [1.0, 0.1, 0.0], [0.0, 0.0, 1.0], [1.0, 2.0, -1.0]])
-    field = field_of(np.full((33, 17), 7), dtype, x0=-1.0, y0=3.0)
-    hit = cast(field, np.concatenate([o, beside]), np.concatenate([target - o, away]))
-    np.testing.assert_array_equal(hit["status"][:205], np.repeat([HIT, MISS], [200, 5]))
-    # o is rounded relative to the largest distance, 70, over the smallest step towards the plane.
-    np.testing.assert_allclose(hit["t"][:200], 1, rtol=float(np.finfo(dtype).eps) * 70 / np.abs(o[:, 2] - 7).min())
-    np.testing.assert_array_equal(hit["n"][:200], [[0, 0, 1]] * 200)
-    np.testing.assert_array_equal(hit["side"][:200], np.where(o[:, 2] > 7, 1, -1))
 
 
 @aimed.PRECISIONS
@@ -236,14 +200,19 @@ def test_heights_of_random_bits(traversal):
                 assert np.isfinite(hit[name][present]).all(), name
 
 
+# Random bits as far as the range of heights leaves float32 room for slopes and areas.
+EXTREMES = {f"{scale:g} high": aimed.random_heights((33, 17), scale, seed=5) for scale in (1e-20, 1e20)}
+EXTREMES["flat"] = np.full((33, 17), 7.0)  # where the box of the surface has no height
+EXTREMES["random bits"] = np.where(np.abs(random_bits(0)) < 2.0**110, random_bits(0), 0).astype(np.float64)
+
+
 @aimed.PRECISIONS
-def test_rays_over_random_bits(dtype):
-    """As far as the range of heights leaves float32 room for slopes and areas."""
-    heights = random_bits(0).astype(np.float64)
-    ground = AT_ZERO._replace(heights=np.where(np.abs(heights) < 2.0**110, heights, 0))
+@pytest.mark.parametrize("heights", EXTREMES.values(), ids=EXTREMES)
+def test_extreme_heights(heights, dtype):
+    ground = AT_ZERO._replace(heights=heights)
     rays, names = every_family(ground, seed=24)
     expected, _ = compare_with_oracle(ground, rays, names, dtype)
-    assert np.sum(expected.decided & (expected.status == oracle.HIT)) > 200
+    assert np.sum(expected.decided & (expected.status == oracle.HIT)) > (300 if np.isfinite(heights).all() else 200)
 
 
 @aimed.PRECISIONS

@@ -8,6 +8,7 @@ import aimed
 import crossings
 import numpy as np
 import pytest
+from compare import assert_none, every_family, heightfield
 
 import jaxhf
 
@@ -22,7 +23,6 @@ ON_PLANE, ON_RAY = 2.0, 3.0
 
 SHAPES = [(2, 2), (2, 17), (17, 2), (33, 17), (1025, 1025)]
 SCALES = (1e-6, 1.0, 1e6)  # heights beside cells of 0.3 x 2
-FAMILIES = [name for name in aimed.FAMILIES if name != "miss"]
 TRAVERSALS = ("pyramid", "dda")
 PER_FAMILY = 2048
 
@@ -33,37 +33,29 @@ def terrain(shape: tuple[int, int], scale: float, seed: int) -> aimed.Ground:
 
 def check(ground: aimed.Ground, seed: int) -> np.ndarray:
     """Asserts that no ray of `PER_FAMILY` of each family leaks; returns how many of each had to hit."""
-    parts = [aimed.aimed(name, ground, PER_FAMILY, seed, roundable=True, stretched=False) for name in FAMILIES]
-    o, d = (np.concatenate([getattr(part, name) for part in parts]) for name in ("o", "d"))
+    rays, names = every_family(ground, seed, PER_FAMILY, stretched=False)
+    o, d, _ = rays
     course = crossings.Course(ground, o, d, SLACK)
     sure = crossings.must_hit(course)
-    field = jaxhf.Heightfield(ground.heights.astype(np.float32), ground.dx, ground.dy)
+    field = heightfield(ground, np.float32)
     hits = {traversal: jaxhf.cast(field, o, d, jaxhf.Settings(traversal=traversal, shading="flat")) for traversal in TRAVERSALS}
     one, other = (np.column_stack([hit.status, hit.cell, hit.triangle, hit.t]) for hit in hits.values())
-    assert_none((one != other).any(1), ground, o, d, "not the same by both")
-    for traversal, hit in hits.items():
-        assert_none(sure.must & (np.asarray(hit.status) != jaxhf.Status.HIT), ground, o, d, f"lost by {traversal}")
+    assert_none((one != other).any(1), names, rays)
+    for hit in hits.values():
+        assert_none(sure.must & (np.asarray(hit.status) != jaxhf.Status.HIT), names, rays)
         t = np.where(sure.must, np.asarray(hit.t, np.float64), 0)
         cell, triangle, p = np.asarray(hit.cell), np.asarray(hit.triangle), np.asarray(hit.p, np.float64)
         off_plane, off_ray = crossings.residuals(course, cell, triangle, p, t)
-        assert_none(sure.must & (off_plane > ON_PLANE), ground, o, d, "not on the surface")
-        assert_none(sure.must & (off_ray > ON_RAY), ground, o, d, "not on the ray")
-        assert_none(sure.must & (t > sure.by * (1 + SLACK)), ground, o, d, "behind the surface")
+        assert_none(sure.must & (off_plane > ON_PLANE), names, rays)
+        assert_none(sure.must & (off_ray > ON_RAY), names, rays)
+        assert_none(sure.must & (t > sure.by * (1 + SLACK)), names, rays)  # else it is behind the surface
         # Before `since` a ray may have hit at the very border already.
-        assert_none(sure.must & (np.asarray(hit.side) != sure.side) & (t > sure.since), ground, o, d, "on the other side")
+        assert_none(sure.must & (np.asarray(hit.side) != sure.side) & (t > sure.since), names, rays)
         some = np.flatnonzero(sure.must)[:: 1 if ground.heights.size < 1000 else 300]  # 2 ms a ray at 1025 x 1025
         before = crossings.Course(ground, o[some], d[some], SLACK)
         early = crossings.has_changed_sides(before, sure.side[some], sure.since[some], t[some])
-        assert_none(early, ground, o[some], d[some], "has hit before")
-    return sure.must.reshape(len(FAMILIES), -1).sum(1)
-
-
-def assert_none(wrong: np.ndarray, ground: aimed.Ground, o: np.ndarray, d: np.ndarray, what: str):
-    where = np.flatnonzero(wrong)
-    assert len(where) == 0, (
-        f"{len(where)} rays: {what}; heights {ground.heights.shape}, {ground.range:g} high; "
-        f"the first has o = {o[where[0]].tolist()}, d = {d[where[0]].tolist()}"
-    )
+        assert_none(early, names[some], aimed.Rays(*(value[some] for value in rays)))
+    return sure.must[names != "miss"].reshape(-1, PER_FAMILY).sum(1)
 
 
 @pytest.mark.optimised

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compare import DOWN, SLACK
+from compare import DOWN, SLACK, heightfield
 
 import jaxhf
 
@@ -27,7 +27,7 @@ def hits_all_over(ground: aimed.Ground, dtype: type[np.floating], margin: float)
     u, v = np.where((kind == 1) | (kind == 4), 1, u), np.where((kind == 2) | (kind == 4), 1, np.where(kind == 3, u, v))
     x, y = generator.integers(0, ground.cells, (HITS, 2)).T + np.stack([u, v])
     up = np.where(np.arange(HITS) % 2, 1, -1)[:, None]
-    field = jaxhf.Heightfield(ground.heights.astype(dtype), *ground[1:])
+    field = heightfield(ground, dtype)
     hit = jaxhf.cast(field, ground.points(x, y) + up * [0, 0, 3 * ground.range], up * DOWN, FLAT)
     np.testing.assert_array_equal(hit.status, jaxhf.Status.HIT)
     return field, hit

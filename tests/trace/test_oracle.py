@@ -1,4 +1,4 @@
-"""The two ways of the oracle against each other and against closed forms: whatever is tested with it rests on this."""
+"""The oracle against closed forms, and rays that hit by construction: whatever is tested with it rests on this."""
 
 import aimed
 import numpy as np
@@ -8,8 +8,6 @@ import pytest
 GRIDS = [(2, 2), (9, 2), (2, 7), (17, 33)]
 SCALES = pytest.mark.parametrize("scales", [(1.0,), pytest.param((1e-6, 1e6), marks=pytest.mark.deep)], ids=["one", "far"])
 COUNT = 150
-# Double precision has a rounding of 1.1e-16; a few tens of operations lie behind each g.
-SLACK = 1e-13
 
 
 def ground(shape, scale=1.0, **placement):
@@ -18,37 +16,6 @@ def ground(shape, scale=1.0, **placement):
 
 def grounds(scales):
     return [ground(shape, scale, dx=0.5, dy=2.0, x0=-3.0, y0=10.0) for shape in GRIDS for scale in scales]
-
-
-def compare_both_ways(field: aimed.Ground, rays: aimed.Rays, name: str) -> np.ndarray:
-    """Asserts that the sweep and the triangles agree wherever rounding has no say; returns for how many rays it has none."""
-    swept = oracle.cast(*field, rays.o, rays.d, slack=SLACK)
-    t, place = oracle.cast_triangles(*field, rays.o, rays.d)
-    decided = swept.decided
-    np.testing.assert_array_equal(np.isfinite(t)[decided], (swept.status == oracle.HIT)[decided])
-    hit = decided & np.isfinite(t)
-    # The triangles' tolerance of 1e-12 of an edge, and what cancels in their products; in units of the ray's way to the hit.
-    tolerance = 1e-10 * t[hit]
-    assert np.all(t[hit] >= swept.earliest[hit] - tolerance)
-    assert np.all(t[hit] <= swept.latest[hit] + tolerance)
-    narrow = hit & (swept.spread < 1e-9 * t)
-    # Of the smallest grids and of grazing rays too few hits are away from borders and silhouettes.
-    assert min(field.heights.shape) == 2 or name in ("grazing", "skimming") or narrow.sum() >= 0.75 * hit.sum()
-    np.testing.assert_allclose(swept.t[narrow], t[narrow], rtol=1e-9)
-    sharp = narrow & (swept.place.inside > 1e-6)
-    for leaf, atol in (("cell", 0), ("triangle", 0), ("n", 1e-14), ("uv", 1e-7)):
-        found, expected = (getattr(each, leaf)[sharp] for each in (place, swept.place))
-        np.testing.assert_allclose(found, expected, rtol=0, atol=atol, err_msg=leaf)
-    return decided
-
-
-@SCALES
-@pytest.mark.parametrize("name", aimed.FAMILIES)
-def test_sweep_and_triangles_agree(name, scales):
-    for field in grounds(scales):
-        decided = compare_both_ways(field, aimed.aimed(name, field, COUNT, seed=1), name)
-        # On the border rounding decides: for a third of that family, and for most vertices of the smallest grids.
-        assert decided.mean() > (0 if min(field.heights.shape) == 2 else 0.6 if name == "border" else 0.75)
 
 
 @SCALES
@@ -68,16 +35,8 @@ def test_holes_let_rays_through():
     field = ground((17, 33))
     heights = field.heights.copy()
     heights[4, 5], heights[10, 20], heights[16, 32], heights[0, :3] = np.nan, np.inf, -np.inf, np.nan
-    heights[6:16:3, 1:16:3] = np.nan
-    holed = field._replace(heights=heights)
-    rays = [aimed.aimed(name, field, 200, seed=3) for name in ("vertical", "random", "through_side", "axis_aligned")]
-    o, d = (np.concatenate([getattr(part, end) for part in rays]) for end in ("o", "d"))
-    decided = compare_both_ways(holed, aimed.Rays(o, d, np.zeros(len(o), int)), "holes")
-    assert decided.mean() > 0.8
-    whole, pierced = (oracle.cast(*each, o, d).status for each in (field, holed))
-    assert np.sum(whole != pierced) >= 10
     o = np.array([[4.5, 3.5, -5.0], [5.5, 4.5, -5.0], [19.5, 9.2, -5.0], [6.5, 4.5, -5.0], [3.2, 0.5, -5.0]])
-    hit = oracle.cast(*holed, o, np.tile([0.0, 0.0, 1.0], (5, 1)))
+    hit = oracle.cast(*field._replace(heights=heights), o, np.tile([0.0, 0.0, 1.0], (5, 1)))
     np.testing.assert_array_equal(hit.status, np.repeat([oracle.MISS, oracle.HIT], [3, 2]))
     assert hit.decided.all()
 
@@ -121,19 +80,6 @@ def test_pyramid():
     assert np.sum(expected < 0.999) > 50
     assert np.all(hit.decided)
     np.testing.assert_allclose(hit.t, expected, rtol=1e-12)
-    np.testing.assert_allclose(oracle.cast_triangles(heights, 1, 1, -2, -2, o, d)[0], expected, rtol=1e-10)
-
-
-def test_vertical_ray_over_known_points():
-    heights = np.array([[0.0, 1.0, 4.0], [2.0, 5.0, 3.0]])
-    x, y = np.array([0, 2, 1, 0.5, 1, 0.5, 0.75, 0.25]), np.array([0, 0, 1, 0, 0.5, 0.5, 0.25, 0.75])
-    z = np.array([0, 4, 5, 0.5, 3, 2.5, 1.75, 2.25])
-    for height, d_z in ((10, -2.0), (-1, 0.5)):
-        o = np.stack([7 + 2 * x, -3 + 4 * y, np.full(8, height)], axis=1)
-        hit = oracle.cast(heights, 2, 4, 7, -3, o, np.tile([0.0, 0.0, d_z], (8, 1)))
-        np.testing.assert_allclose(hit.t, (z - height) / d_z, rtol=1e-14)
-        np.testing.assert_allclose(hit.place.uv, np.stack([x / 2, y], axis=1), atol=1e-15)
-        assert np.all(hit.place.n[:, 2] > 0)
 
 
 def test_starts_on_the_surface_and_touches():
@@ -156,45 +102,6 @@ def test_decided_knows_silhouettes_and_the_border():
     hit = oracle.cast(wall, 1, 1, 0, 0, np.array([[-3.0, 0.7, 1 + 1e-9]]), np.array([[1.0, 0.1, 0.0]]), slack=1e-6)
     assert hit.decided[0]
     assert [hit.earliest[0], hit.t[0], hit.latest[0]] == pytest.approx([4, 5.5, 5.5], abs=1e-4)
-
-
-def test_frame():
-    """Rays through a rotated, sheared and mirrored field meet it where the same rays meet it in its own frame."""
-    field = ground((9, 5), dx=0.5, dy=2.0, x0=1.0, y0=-1.0)
-    world = np.array([[0.0, -2.0, 0.3, 5.0], [1.0, 0.2, 0.0, -1.0], [0.1, 0.0, -3.0, 2.0], [0.0, 0.0, 0.0, 1.0]])
-    rays = aimed.aimed("random", field, 300, seed=6)
-    local = oracle.cast(*field, rays.o, rays.d)
-    o, d = rays.o @ world[:3, :3].T + world[:3, 3], rays.d @ world[:3, :3].T
-    moved = oracle.cast(*field, o, d, world_from_object=world)
-    hit = local.decided & moved.decided & (local.place.inside > 1e-6) & (local.status == oracle.HIT)
-    assert hit.sum() > 100
-    np.testing.assert_array_equal(local.status[local.decided], moved.status[local.decided])
-    np.testing.assert_allclose(moved.t[hit], local.t[hit], rtol=1e-9)
-    np.testing.assert_allclose(moved.place.p[hit], (o + moved.t[:, None] * d)[hit], atol=1e-9)
-    # The image of the triangle's plane is orthogonal to the normal, whose side is that of the image of +z.
-    for step in np.eye(3):
-        tangent = np.cross(local.place.n[hit], step) @ world[:3, :3].T
-        np.testing.assert_allclose((tangent * moved.place.n[hit]).sum(1), 0, atol=1e-12)
-    assert np.all(moved.place.n[hit] @ world[:3, 2] > 0)
-
-
-def test_invalid_rays():
-    o, d = np.zeros((5, 3)), np.ones((5, 3))
-    o[0, 1], o[1, 2], d[2, 0], d[3, 2], d[4] = np.nan, np.inf, np.nan, -np.inf, 0
-    np.testing.assert_array_equal(oracle.cast(np.zeros((3, 3)), 1, 1, 0, 0, o, d).status, oracle.INVALID)
-
-
-SCHEMES = ("central", "four", "six", "six-angle", "six-equal")
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_normals_of_a_plane(scheme):
-    x, y = np.meshgrid(np.arange(5) * 0.5, np.arange(4) * 2.0)
-    normals, lengths = oracle.vertex_normals(1 + x / 2 - y / 4, 0.5, 2.0, scheme)
-    size = np.linalg.norm(normals, axis=-1)
-    plane = np.broadcast_to(np.array([-2, 1, 4]) / np.sqrt(21), (4, 5, 3))
-    np.testing.assert_allclose(normals / size[..., None], plane, atol=1e-14)
-    np.testing.assert_allclose(lengths, size)
 
 
 def test_normals_of_one_cell_by_hand():
@@ -221,7 +128,7 @@ def test_normals_of_one_cell_by_hand():
     np.testing.assert_allclose(normals[..., 0], np.tile(expected, (4, 1)), atol=1e-14)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize("scheme", ["central", "four", "six", "six-angle", "six-equal"])
 def test_normals_beside_holes(scheme):
     heights = np.array([[0.0, 1.0, 5.0], [np.nan, 3.0, 4.0], [7.0, 9.0, 2.0]])
     normals, _ = oracle.vertex_normals(heights, 1, 1, scheme)
@@ -249,7 +156,3 @@ def test_shading_normal_is_the_barycentric_mean():
     np.testing.assert_allclose(ns, mean / np.linalg.norm(mean, axis=1)[:, None], atol=1e-14)
     assert np.all(cancels >= 1 - 1e-12)
     assert np.all(turn > 0)
-    world = np.diag([2.0, -1.0, 0.5, 1.0])
-    flipped, _, _ = oracle.shading_normals(heights, 0.5, 2.0, place, "six", world)
-    mean = mean / [2, -1, 0.5]
-    np.testing.assert_allclose(flipped, mean / np.linalg.norm(mean, axis=1)[:, None], atol=1e-14)

@@ -1,14 +1,10 @@
 """Walls and floor under a terrain, against triangles in double precision; and that with them a terrain is closed."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.core.ray import Ray
 from jaxhf.preparation.localise import localise
-from jaxhf.preparation.world import first_hit, make_world
 
 RNG = np.random.default_rng(7)
 HEIGHTS = RNG.uniform(0, 2, (6, 9)).astype(np.float32)
@@ -52,17 +48,7 @@ def nearest(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def cast_turned(skirt: jaxhf.Skirt, o: np.ndarray, d: np.ndarray):
     """Rays in the frame of a skirt that is turned, padded to 3000, as any other number would be compiled anew."""
     o, d = (np.concatenate([v, np.tile(v[:1], (3000 - len(v), 1))]) @ TURN[:3, :3].T for v in (o, d))
-    return cast(scene(jaxhf.Object(skirt, world_from_object=TURN)), o + TURN[:3, 3], d)
-
-
-def cast(seen: jaxhf.Scene, o: np.ndarray, d: np.ndarray):
-    return _cast(*jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), (localise(seen), o, d)))
-
-
-@jax.jit
-def _cast(seen: jaxhf.Scene, o: jax.Array, d: jax.Array):
-    world = make_world(seen, jaxhf.Settings())
-    return jax.vmap(lambda o, d: first_hit(world, Ray(o, d)))(o, d)
+    return jaxhf.cast(scene(jaxhf.Object(skirt, world_from_object=TURN)), o + TURN[:3, 3], d)
 
 
 def test_walls_stand_where_their_triangles_do():
@@ -98,7 +84,7 @@ def test_a_terrain_with_walls_is_closed():
     away = RNG.normal(size=(20000, 3))
     o = middle + 20 * away / np.linalg.norm(away, axis=1, keepdims=True)
     seen = scene(jaxhf.Object(FIELD), jaxhf.Object(jaxhf.Skirt.of(FIELD, BASE)))
-    hit = cast(seen, o, target - o)
+    hit = jaxhf.cast(seen, o, target - o)
     met = np.asarray(hit.status) == 1
     assert met.mean() > 0.6
     np.testing.assert_array_equal(np.asarray(hit.side)[met], 1)

@@ -160,11 +160,8 @@ def scenes() -> dict[str, tuple[jaxhf.Scene, jaxhf.Settings]]:
     return made | {name: (made["plain"][0], settings) for name, settings in knobs.items()}
 
 
-FAST = ("sun",)
-
-
 @pytest.mark.deep
-@pytest.mark.parametrize("name", [name if name in FAST else pytest.param(name, marks=pytest.mark.deep) for name in scenes()])
+@pytest.mark.parametrize("name", scenes())
 def test_tiles_of_every_scene_are_kernels(name):
     """In pictures, and as the value within a gradient. Else frames take twice the time, and nobody notices."""
     scene, settings = scenes()[name]
