@@ -218,6 +218,23 @@ def test_boundary_pixels_are_looked_at_again():
     assert np.abs(finer - jaxhf.render(scene, INTERIOR)[..., 0] / 0.7).max() > 0.1 * LIT
 
 
+@pytest.mark.deep  # each agrees with a truth: here forwards, in rendering/test_users.py in reverse
+def test_forward_and_reverse_agree():
+    scene = shadow_scene()
+    rng = np.random.default_rng(0)
+    direction = jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), scene)
+    weights = rng.normal(size=(SIZE, SIZE))
+    forward = np.vdot(weights, whole_change(scene, direction))
+
+    @jax.jit
+    def gradient(scene):
+        return jax.grad(lambda scene: jnp.vdot(jnp.asarray(weights), jaxhf.render(scene, EDGES)[..., 0]))(scene)
+
+    dots = jax.tree.leaves(jax.tree.map(np.vdot, gradient(scene), direction))
+    np.testing.assert_allclose(sum(dots), forward, rtol=2e-5)
+    assert abs(forward) > 1
+
+
 def test_picture_keeps_its_bits():
     scene = shadow_scene()
     np.testing.assert_array_equal(jaxhf.render(scene, EDGES), jaxhf.render(scene, INTERIOR))
