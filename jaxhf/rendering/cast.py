@@ -23,8 +23,7 @@ from ..trace.grid import Grid, joined
 from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
 from ..xla.compilation import compiled
-from ..xla.devices import prepared_mesh, where_called
-from ..xla.transfers import takes_numbers
+from ..xla.devices import prepared_mesh, takes_numbers, where_called
 from .chunks import trace_batch, trace_chunks
 from .render import Prepared, PreparedHeightfield, heightfield_grid, prepared_world
 

@@ -11,9 +11,9 @@ from jaxtyping import Float, Int, Shaped
 
 from ..core.affine import Affine
 from ..core.errors import UserError
-from ..core.powers import floor_to_power_of_two
 from ..core.settings import NormalScheme
 from ..core.types import MOST_PLACES, Flag, Index, Scalar
+from ..core.vector import floor_to_power_of_two
 from ..scene.heightfield import Heightfield
 from .normals import vertex_normals
 from .pyramid import Pyramid, make_pyramid

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
 
-from ..core.powers import next_power_of_two
 from ..core.types import Flag, Index, Scalar
+from ..scene.heightfield import next_power_of_two
 
 
 class Pyramid(eqx.Module):

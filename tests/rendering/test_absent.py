@@ -143,12 +143,12 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
     "cylinder": (
         "plain",
         case(jaxhf.Object(jaxhf.Cylinder())),
-        [everywhere(cylinder.make_tube), everywhere(cylinder.tube_distance), everywhere(cylinder.hit_on_tube)],
+        [everywhere(cylinder.make_tube), within(cylinder.Tube, "distance"), within(cylinder.Tube, "hit")],
     ),
     "skirt": (
         "plain",
         case(jaxhf.Object(jaxhf.Skirt.of(FIELD, -1))),
-        [*map(everywhere, (skirt.make_walls, skirt.hit_on_side))],
+        [everywhere(skirt.make_walls), within(skirt.Walls, "hit")],
     ),
     "second heightfield": (
         "smooth normals",
