@@ -123,8 +123,7 @@ def meet(
         way, earlier = ray, jnp.zeros_like(back)
         if len(world.surfaces) > 1:
             way, earlier = select(sample.surface, [(number, (way, earlier))], (beside, back))
-        steps, until = world.settings.max_steps, t_max + earlier
-        hit = intersect(surface, number, way, max_steps=steps, leaving=leaving, active=active, t_max=until)
+        hit = intersect(surface, number, way, leaving=leaving, active=active, t_max=t_max + earlier)
         hits.append(dataclasses.replace(hit, t=hit.t - earlier))
     hit = nearest_hit(hits)
     return hit, active & ~((hit.status == int(Status.HIT)) & (hit.t < t_max))

@@ -17,9 +17,8 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
 from ..core.vector import finite, quotient, unit
 from ..rendering.chunks import trace_batch
-from ..rendering.render import heightfield_grid
 from ..scene.heightfield import Heightfield
-from ..trace.grid import Grid, joined
+from ..trace.grid import Grid, joined, make_grid
 from ..trace.hit import Status
 from ..trace.intersect import plane_distance, ray_in_grid
 from ..trace.search import first_triangle
@@ -120,7 +119,7 @@ def one_axis(hfield: HField) -> HField:
 
 def _searchable(hfield: HField) -> Ground:
     field = lax.stop_gradient(hfield)
-    return ground_of(hfield, field._grid or heightfield_grid(Heightfield(field.data, 1.0, 1.0), SEARCHED))
+    return ground_of(hfield, field._grid or make_grid(Heightfield(field.data, 1.0, 1.0), None, SEARCHED))
 
 
 def _joined(grounds: Ground) -> tuple[Ground, Ground]:
@@ -144,7 +143,7 @@ def _one(ground: Ground, ray: Ray) -> Scan:
     faces = base_faces(ground, local, within)
     limit = lax.stop_gradient(jnp.where(faces[0].met, faces[0].t, jnp.where(faces[1].met, faces[1].t, jnp.inf)))
     scaled, scale = ray_in_grid(grid, in_cells(ground, local))
-    found = first_triangle(grid, scaled, max_steps=None, t_max=limit * scale)
+    found = first_triangle(grid, scaled, t_max=limit * scale)
     found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
     found = stored(materialise(found))
     walls = (wall(ground, local, side, found.side < 0) for side in within)

@@ -103,12 +103,10 @@ def _make_ceiling(surface: Surface, light: Light, wanted: bool) -> Ceiling | Non
 
 
 def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: Settings) -> Surface:
-    """A shape made ready for tracing; the scheme of its normals and the levels of its bounds are those of the settings."""
+    """A shape made ready for tracing."""
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
-        normals = (settings.normals or "six") if settings.shading == "smooth" else None
-        levels = 0 if settings.traversal == "dda" else None
-        return make_grid(shape, world, normals, levels, settings.early_exit)
+        return make_grid(shape, world, settings)
     return make_walls(shape, world) if isinstance(shape, Skirt) else make_tube(shape, world)
 
 
@@ -124,14 +122,7 @@ def first_hit(
 
     The arguments are those of `intersect`.
     """
-    meet = functools.partial(
-        intersect,
-        max_steps=world.settings.max_steps,
-        leaving=leaving,
-        active=active,
-        count_steps=count_steps,
-        tangents=tangents,
-    )
+    meet = functools.partial(intersect, leaving=leaving, active=active, count_steps=count_steps, tangents=tangents)
     return nearest_hit([meet(surface, number, ray) for number, surface in enumerate(world.surfaces)])
 
 
@@ -163,7 +154,7 @@ def unblocked(world: World, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar 
     surfaces, ray, leaving, t_max = lax.stop_gradient((world.surfaces, ray, leaving, t_max))
     free, exhausted = active, jnp.zeros((), jnp.int32)
     for number, surface in enumerate(surfaces):
-        search = functools.partial(blocked, number=number, max_steps=world.settings.max_steps)
+        search = functools.partial(blocked, number=number)
         ceiling = world.ceilings[light][number]
         if ceiling is None or not isinstance(surface, Grid):
             met, ran_out = search(surface, ray, leaving, free, t_max)

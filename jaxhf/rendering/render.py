@@ -21,12 +21,12 @@ from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
 from ..preparation.localise import anchor, localise, localise_camera, localise_lights, precision
-from ..preparation.world import World, make_ceilings, make_surface, make_world, resolve_settings
+from ..preparation.world import World, make_ceilings, make_world, resolve_settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light
 from ..scene.scene import Scene
-from ..trace.grid import Grid
+from ..trace.grid import Grid, make_grid
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, map_over, on_every_device, prepared_mesh, takes_numbers, where_called
 from ..xla.kernel import in_turn, one_kernel
@@ -281,17 +281,10 @@ def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, 
     return with_tangent(lax.stop_gradient(image), change.reshape(image.shape))
 
 
-def heightfield_grid(field: Heightfield, settings: Settings) -> Grid:
-    """A heightfield whose x0 and y0 are 0, made ready for rays that are alone on it."""
-    surface = make_surface(field, None, settings)
-    assert isinstance(surface, Grid)
-    return surface
-
-
 @functools.partial(compiled, newer=True, static_argnames=("dx", "dy", "settings"))
 def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float, settings: Settings) -> Grid:
     """Of heightfields that differ in their heights only."""
-    return lax.map(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights)
+    return lax.map(lambda z: make_grid(Heightfield(z, dx, dy), None, settings), heights)
 
 
 _trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))

@@ -152,7 +152,7 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[Scalar, Vecto
             slope = greater(own[1], lowest)
             if world.settings.shadows:
                 number, grid = ground
-                slope, more = skyline_slope(grid, number, hit.p, level, hit, lit, (slope, highest), world.settings.max_steps)
+                slope, more = skyline_slope(grid, number, level, hit, lit, (slope, highest))
                 exhausted = exhausted + more.astype(jnp.int32)
             parts = [(angle(slope), half)]
         upwards = jnp.stack([*(-centre[2] * level[:2]), dot(centre, level)])
@@ -171,7 +171,7 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[Scalar, Vecto
     for number, surface in enumerate(world.surfaces):
         if world.settings.shadows and isinstance(surface, Tube):
             fixed = lax.stop_gradient((surface, Ray(hit.p, wi), hit))
-            met, _ = blocked(*fixed, lit, None, number=number, max_steps=None)
+            met, _ = blocked(*fixed, lit, None, number=number)
             share, mean = jnp.where(met, 0, share), jnp.where(met, 0, mean)
     return share, mean, exhausted
 
@@ -195,10 +195,10 @@ def _hidden(
     hidden, exhausted = [], jnp.zeros((), jnp.int32)
     for number, surface in enumerate(world.surfaces if world.settings.shadows else ()):
         if isinstance(surface, Grid):
-            slopes, more = hidden_slopes(surface, number, hit.p, level, hit, active, between, world.settings.max_steps)
+            slopes, more = hidden_slopes(surface, number, level, hit, active, between)
             hidden, exhausted = [*hidden, slopes], exhausted + more
         elif isinstance(surface, Walls):
-            hidden = [*hidden, wall_slopes(surface, number, hit.p, level, hit)]
+            hidden = [*hidden, wall_slopes(surface, number, level, hit)]
     return hidden, exhausted
 
 

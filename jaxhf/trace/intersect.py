@@ -35,7 +35,6 @@ def intersect(
     number: int,
     ray: Ray,
     *,
-    max_steps: int | None,
     leaving: Hit | None = None,
     active: Flag | None = None,
     t_max: Scalar | None = None,
@@ -48,7 +47,7 @@ def intersect(
       surface: a prepared shape.
       number: of its object, for `Hit.object`.
       ray: one that is not finite, or whose `d` is zero, ends as INVALID.
-      max_steps, leaving, active, t_max, count_steps: see `first_triangle`; `leaving` may lie on another surface.
+      leaving, active, t_max, count_steps: see `first_triangle`; `leaving` may lie on another surface.
       tangents: whether the hit is to have its tangents, and the derivatives of `ns`.
     """
     valid = finite(ray.o) & finite(ray.d)
@@ -68,7 +67,6 @@ def intersect(
     found = first_triangle(
         surface,
         local,
-        max_steps=max_steps,
         active=active,
         leaving=leaving,
         number=number,
@@ -86,9 +84,7 @@ def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
     return surface_hit(grid, number, local, scale, WalkResult(met, ix, iy, at.triangle == 1, at.side, zero, zero, None))
 
 
-def blocked(
-    surface: Surface, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, *, number: int, max_steps: int | None
-) -> tuple[Flag, Flag]:
+def blocked(surface: Surface, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, *, number: int) -> tuple[Flag, Flag]:
     """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out.
 
     Neither has a derivative: the arguments come under `stop_gradient`, see `unblocked`.
@@ -98,7 +94,7 @@ def blocked(
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
     local, scale = ray_in_grid(surface, ray)
     t_max = None if t_max is None else t_max * scale
-    found = first_triangle(surface, local, max_steps=max_steps, active=active, leaving=leaving, number=number, t_max=t_max)
+    found = first_triangle(surface, local, active=active, leaving=leaving, number=number, t_max=t_max)
     met = found.status == int(Status.HIT)
     if t_max is not None:
         met = met & _is_through(triangle_plane(surface, found.ix, found.iy, found.upper), local, found, t_max)

@@ -112,7 +112,7 @@ def _tops(walls: Walls, first: int, position: Scalar, cells: int) -> tuple[Scala
     return walls.tops[first + cell], walls.tops[first + cell + 1], position - cell.astype(position.dtype)
 
 
-def wall_slopes(walls: Walls, number: int, p: Vector, level: Vector, leaving: Hit) -> tuple[Scalar, Scalar]:
+def wall_slopes(walls: Walls, number: int, level: Vector, leaving: Hit) -> tuple[Scalar, Scalar]:
     """The lowest and the highest slope that a skirt hides from a point; differentiable. (inf, -inf) where it hides none.
 
     In a vertical plane the floor and the walls at its ends are one line, as a sheet is, see `hidden_slopes`.
@@ -120,6 +120,7 @@ def wall_slopes(walls: Walls, number: int, p: Vector, level: Vector, leaving: Hi
     The arguments are those of `skyline_slope`; the skirt is upright. If the hit lies on the outside of these walls, they hide
     nothing beside what its own side does.
     """
+    p = leaving.p
     o, d = walls.object_from_world.point(p), walls.object_from_world.vector(level)
     wide, own = _WIDE * float(jnp.finfo(o.dtype).eps) * (largest_component(o[:2]) + max(walls.size)), leaving.object == number
     low, high = jnp.full_like(walls.base, jnp.inf), jnp.full_like(walls.base, -jnp.inf)
