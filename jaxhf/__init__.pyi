@@ -34,7 +34,6 @@ from .scene.scene import Object as Object, Scene as Scene
 from .scene.skirt import Skirt as Skirt
 from .scene.sun import sun as sun
 from .scene.texture import ImageTexture as ImageTexture
-from .trace.hit import Hit as Hit
+from .trace.hit import Hit as Hit, Status as Status
 from .trace.normals import vertex_normals as vertex_normals
-from .trace.status import Status as Status
 from .xla.compilation import compiler_options as compiler_options

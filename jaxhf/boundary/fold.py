@@ -12,9 +12,8 @@ from ..preparation.world import World, nearest_hit, no_hit
 from ..scene.camera import Camera
 from ..trace.edges import whole_cells
 from ..trace.grid import Grid, triangle_plane
-from ..trace.hit import Hit
+from ..trace.hit import Hit, Status
 from ..trace.intersect import intersect
-from ..trace.status import Status
 from ..xla.materialise import materialise
 from .sample import BoundarySample, between_ends, end_heights, on_edge, ways_to_lights
 
@@ -111,36 +110,20 @@ def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
     return materialise((x == ix) & (y == iy) & whole_cells(grid.z)[y, x])
 
 
-class Probe(eqx.Module):
-    """A ray from a hit, and how far it looks.
+def meet(
+    world: World, sample: BoundarySample, ray: Ray, beside: Ray, back: Scalar, leaving: Hit, active: Flag, t_max: Scalar
+) -> tuple[Hit, Flag]:
+    """What a ray from the hit `leaving` meets, and whether it is active and meets nothing before `t_max`.
 
-    Attributes:
-      ray: by which the edge's own surface is met.
-      beside: by which others are; it begins `back` earlier, so that one which touches the edge is met at a t between -`back`
-        and `back`.
-      back: in the units of the rays.
-      leaving: the hit.
-      active: whether it looks at all.
-      t_max: how far.
+    By `ray` the edge's own surface is met, by `beside` others are. That begins `back` earlier, so that a surface which touches
+    the edge is met at a t between -`back` and `back`: t counts from the start of `ray`.
     """
-
-    ray: Ray
-    beside: Ray
-    back: Scalar
-    leaving: Hit
-    active: Flag
-    t_max: Scalar
-
-
-def meet(world: World, sample: BoundarySample, probe: Probe) -> tuple[Hit, Flag]:
-    """What a probe meets, t counted from the start of its `ray`; and whether an active one meets nothing before its `t_max`."""
     hits = []
     for number, surface in enumerate(world.surfaces):
-        ray, back = probe.ray, jnp.zeros_like(probe.back)
+        way, earlier = ray, jnp.zeros_like(back)
         if len(world.surfaces) > 1:
-            ray, back = select(sample.surface, [(number, (ray, back))], (probe.beside, probe.back))
-        steps, t_max = world.settings.max_steps, probe.t_max + back
-        hit = intersect(surface, number, ray, max_steps=steps, leaving=probe.leaving, active=probe.active, t_max=t_max)
-        hits.append(dataclasses.replace(hit, t=hit.t - back))
+            way, earlier = select(sample.surface, [(number, (way, earlier))], (beside, back))
+        hit = intersect(surface, number, way, leaving=leaving, active=active, t_max=t_max + earlier)
+        hits.append(dataclasses.replace(hit, t=hit.t - earlier))
     hit = nearest_hit(hits)
-    return hit, probe.active & ~((hit.status == int(Status.HIT)) & (hit.t < probe.t_max))
+    return hit, active & ~((hit.status == int(Status.HIT)) & (hit.t < t_max))

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError
-from ..core.powers import floor_to_power_of_two
 from ..core.settings import Shading
 from ..core.types import Index, Scalar
-from ..core.vector import unit
+from ..core.vector import floor_to_power_of_two, unit
 from ..preparation.world import World
 from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sun
@@ -91,7 +90,7 @@ def boundary_length(world: World, camera: Camera) -> Scalar:
     total = jnp.zeros((), camera.world_from_camera.dtype)
     for _, grid, _ in world.grids:
         lengths = seen_lengths(grid, camera)
-        total = total + jnp.sum(jnp.where(silhouettes(grid, Viewpoint(*camera.viewpoint())), lengths, 0))
+        total = total + jnp.sum(jnp.where(silhouettes(grid, camera.viewpoint()), lengths, 0))
         for _, light in sharp_lights(world) if world.settings.shadows else ():
             total = total + jnp.sum(jnp.where(folds(grid, _viewpoint(light)), lengths, 0))
     return total
@@ -101,14 +100,14 @@ def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], shading: Shad
     """Edges across which what is seen jumps at the edge itself; one that is a silhouette for several counts once."""
     if shading == "flat":
         return present_edges(grid.z)
-    flags = silhouettes(grid, Viewpoint(*camera.viewpoint()))
+    flags = silhouettes(grid, camera.viewpoint())
     for light in lights:
         flags = flags | silhouettes(grid, light)
     return flags
 
 
 def _viewpoint(light: Directional | Point) -> Viewpoint:
-    return Viewpoint(light.p, True) if isinstance(light, Point) else Viewpoint(unit(light.towards), False)
+    return (light.p, True) if isinstance(light, Point) else (unit(light.towards), False)
 
 
 def _ends_of(sun: Sun) -> list[Viewpoint]:
@@ -116,7 +115,7 @@ def _ends_of(sun: Sun) -> list[Viewpoint]:
     towards = unit(sun.towards)
     up, radius = jnp.array([0, 0, 1], towards.dtype), jnp.deg2rad(sun.angular_diameter) / 2
     up = unit(up - towards[2] * towards)
-    return [Viewpoint(towards + side * radius * up, False) for side in (-1, 1)]
+    return [(towards + side * radius * up, False) for side in (-1, 1)]
 
 
 class GuidingDistribution(eqx.Module):

@@ -19,12 +19,11 @@ from ..core.vector import dot, select
 from ..preparation.world import World, no_hit
 from ..scene.camera import Camera
 from ..shade.radiance import radiance_from, shadowed_radiance
-from ..trace.hit import Hit
+from ..trace.hit import Hit, Status
 from ..trace.intersect import hit_on_triangle
-from ..trace.status import Status
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
-from .fold import Fold, Probe, fold_at, meet, towards
+from .fold import Fold, fold_at, meet, towards
 from .sample import BoundarySample, picture_point
 
 
@@ -45,24 +44,12 @@ class BoundarySegment(eqx.Module):
     speed: Scalar
 
 
-class Passage(eqx.Module):
-    """What a ray past an edge meets.
-
-    Attributes:
-      fold: the edge's triangles.
-      beyond: the hit behind the edge; for a shadow, where it falls.
-    """
-
-    fold: Fold
-    beyond: Hit
-
-
-def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[BoundarySample, Passage]:
+def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[BoundarySample, Fold, Hit]:
     """Follows the ray past a sample's edge.
 
     Returns:
       The sample with the triangle on which its shadow falls; valid where nothing hides the boundary: not the edge from its
-      source nor, for a shadow, its place from the eye. And the passage.
+      source nor, for a shadow, its place from the eye. The edge's triangles; and the hit behind the edge, where a shadow falls.
     """
     fold = fold_at(world, camera, sample)
     casts, never, past, none = sample.light >= 0, jnp.zeros((), bool), fold.past, jnp.zeros_like(fold.back)
@@ -74,12 +61,12 @@ def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[Bou
         back, to_eye = Ray(past.o, -past.d), towards(world, camera, jnp.full((), -1, jnp.int32), beyond.p)
         up = Ray(beyond.p, to_eye[0])
         faces = dot(up.d, beyond.n) * beyond.side.astype(up.d.dtype) > 0
-        probes = (
-            Probe(back, back, none, fold.near, sample.valid & (fold.bends | ~casts), fold.distance),
-            Probe(past, fold.beside, fold.back, onwards, free & fold.bends, jnp.full_like(fold.back, jnp.inf)),
-            Probe(up, up, none, beyond, _falls(sample, fold, free, beyond) & faces, to_eye[1]),
+        ways = (
+            (back, back, none, fold.near, sample.valid & (fold.bends | ~casts), fold.distance),
+            (past, fold.beside, fold.back, onwards, free & fold.bends, jnp.full_like(fold.back, jnp.inf)),
+            (up, up, none, beyond, _falls(sample, fold, free, beyond) & faces, to_eye[1]),
         )
-        hit, clear = meet(world, sample, select(number, enumerate(probes)))
+        hit, clear = meet(world, sample, *select(number, enumerate(ways)))
         beyond = lax.cond(number == 1, lambda hits: hits[0], lambda hits: hits[1], (hit, beyond))  # no kernel, unlike `where`
         return (jnp.where(number == 0, clear, free), beyond, clear), None
 
@@ -95,7 +82,7 @@ def pass_edge(world: World, camera: Camera, sample: BoundarySample) -> tuple[Bou
         upper=beyond.triangle == 1,
         t=jnp.where(falls, beyond.t, 0),
     )
-    return sample, Passage(fold, beyond)
+    return sample, fold, beyond
 
 
 def _falls(sample: BoundarySample, fold: Fold, free: Flag, beyond: Hit) -> Flag:
@@ -119,20 +106,20 @@ def boundary_segment(world: World, camera: Camera, sample: BoundarySample, fold:
     return BoundarySegment(valid, jnp.where(valid, x, 0), across * jnp.sign(rate), speed)
 
 
-def radiance_jump(world: World, sample: BoundarySample, passage: Passage, active: Flag, side: Index) -> Vector:
+def radiance_jump(world: World, sample: BoundarySample, fold: Fold, beyond: Hit, active: Flag, side: Index) -> Vector:
     """One of two parts whose sum is the radiance beyond the boundary minus that on the side of `across`.
 
     Args:
       world: the scene.
-      sample, passage: from `pass_edge`.
+      sample, fold, beyond: from `pass_edge`.
       active: whether the sample counts.
       side: 1: what stands beyond; 0: what stands on the near side, with its sign.
     """
-    stands, fold = active & (sample.light < 0), passage.fold
-    light = only_where(stands, _side_radiance, world, fold, passage.beyond, side, stands)
+    stands = active & (sample.light < 0)
+    light = only_where(stands, _side_radiance, world, fold, beyond, side, stands)
     light = jnp.where(side == 0, -light, light)
     if world.settings.shadows:
-        shadow = only_where(active & ~stands, shadowed_radiance, world, sample.light, passage.beyond)
+        shadow = only_where(active & ~stands, shadowed_radiance, world, sample.light, beyond)
         light = jnp.where(stands, light, jnp.where(active & (side == 1), shadow, 0))
     return light
 

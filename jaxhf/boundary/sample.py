@@ -22,15 +22,14 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from ..core.affine import affine
-from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Point2, Scalar, Vector
-from ..core.vector import dot, largest_component, quotient, select, unit
+from ..core.vector import dot, floor_to_power_of_two, largest_component, quotient, select, unit
 from ..preparation.world import World
 from ..scene.camera import Camera
 from ..scene.light import Point
 from ..shade.lighting import sharp_lights
-from ..trace.cylinder import Tube, tube_distance
+from ..trace.cylinder import Tube
 from ..trace.edges import STEPS
 from ..trace.grid import Grid
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
@@ -193,7 +192,7 @@ def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Height
         return near + step * away
 
     def on_tube(tube: Tube) -> Vector:
-        t, found = tube_distance(tube, Ray(p, away), None)
+        t, found, _ = tube.distance(Ray(p, away), None, 0)
         return p + jnp.where(found, t, point.t) * away
 
     grids = [(k, on_triangle(grid)) for k, grid, _ in world.grids]

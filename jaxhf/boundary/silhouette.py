@@ -5,7 +5,6 @@ Arrays over edges are those of `trace.edges`; an edge that would leave the grid 
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
@@ -19,11 +18,8 @@ from ..xla.materialise import materialise
 EdgeWeights = Float[jax.Array, "3 ny nx"]
 
 
-class Viewpoint(eqx.Module):
-    """An eye or a light: at the point `v`, or infinitely far away in the direction `v`; world frame."""
-
-    v: Vector
-    at_place: bool = eqx.field(static=True)
+Viewpoint = tuple[Vector, bool]
+"""An eye or a light: at this point (True), or infinitely far away in this direction (False); world frame."""
 
 
 def silhouettes(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
@@ -42,11 +38,11 @@ def folds(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
 
 def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
     """1 where the viewpoint stands on the +z side of a triangle, -1 on the other, 0 where there is no triangle."""
-    to_grid = grid.grid_from_world
-    v = to_grid.point(viewpoint.v) if viewpoint.at_place else to_grid.vector(viewpoint.v)
+    (v, at_place), to_grid = viewpoint, grid.grid_from_world
+    v = to_grid.point(v) if at_place else to_grid.vector(v)
     z00, z10, z01, z11 = grid.z[:-1, :-1], grid.z[:-1, 1:], grid.z[1:, :-1], grid.z[1:, 1:]
     to_x, to_y, to_z = v[0], v[1], v[2]
-    if viewpoint.at_place:
+    if at_place:
         x, y = _vertices(grid)
         to_x, to_y, to_z = v[0] - x[:-1, :-1], v[1] - y[:-1, :-1], v[2] - z00
     present = whole_cells(grid.z)
@@ -123,17 +119,17 @@ def _inside(camera: Camera, at: Any) -> tuple[jax.Array, ...]:
 
 def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:
     """The length of every edge as seen from a light: projected across its direction; for a point light, as an angle."""
-    world, (x, y), (z, second) = grid.world_from_grid, _vertices(grid), _heights(grid)
+    world, (x, y), (z, second), (v, at_place) = grid.world_from_grid, _vertices(grid), _heights(grid), light
 
     def turned(vx: jax.Array, vy: jax.Array, vz: jax.Array) -> list[jax.Array]:
         return [world.linear[k, 0] * vx + world.linear[k, 1] * vy + world.linear[k, 2] * vz for k in range(3)]
 
     e = turned(*_steps(z.dtype), second - z[None])
-    to: list[Any] = [light.v[k] for k in range(3)]
-    if light.at_place:
-        to = [light.v[k] - world.offset[k] - p for k, p in enumerate(turned(x[None], y[None], z[None]))]
+    to: list[Any] = [v[k] for k in range(3)]
+    if at_place:
+        to = [v[k] - world.offset[k] - p for k, p in enumerate(turned(x[None], y[None], z[None]))]
     square = to[0] * to[0] + to[1] * to[1] + to[2] * to[2]
     cross = [e[i] * to[j] - e[j] * to[i] for i, j in ((1, 2), (2, 0), (0, 1))]
     across = jnp.sqrt(cross[0] * cross[0] + cross[1] * cross[1] + cross[2] * cross[2])
     square = jnp.where(square > 0, square, 1)
-    return across / (square if light.at_place else jnp.sqrt(square))
+    return across / (square if at_place else jnp.sqrt(square))

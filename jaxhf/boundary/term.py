@@ -90,10 +90,8 @@ def draw_boundaries(
     """Draws `edge_samples` samples of boundaries.
 
     Args:
-      world: what is seen.
-      camera: what sees it.
+      world, camera, mesh: as for `render`.
       key: of the random numbers; None: a fixed one.
-      mesh: the devices that share the work.
       resampled: how many pixels are resampled; None: as many as take `edge_samples` samples.
 
     Raises:
@@ -148,17 +146,17 @@ def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks
 
     def one(world: World, camera: Camera, guiding: GuidingDistribution, k: jax.Array, u: jax.Array):
         sample = materialise(draw(world, camera, guiding, k, u))
-        sample, passage = materialise(pass_edge(world, camera, sample))
-        return materialise((sample, passage, boundary_segment(world, camera, sample, passage.fold)))
+        sample, fold, beyond = materialise(pass_edge(world, camera, sample))
+        return materialise((sample, fold, beyond, boundary_segment(world, camera, sample, fold)))
 
     @traced_once  # it is also asked for its shapes
     def chunk(world: World, camera: Camera, guiding: GuidingDistribution, first: jax.Array, u: jax.Array):
         k = jnp.arange(size, dtype=jnp.int32)
         k = jnp.where(k < draws, first + k, (_ROUNDS - 1) * per_round)  # beyond the last stratum nothing is valid
-        samples, passages, segments = jax.vmap(functools.partial(one, world, camera, guiding))(k, u)
+        samples, folds, beyond, segments = jax.vmap(functools.partial(one, world, camera, guiding))(k, u)
 
         def one_side(side: jax.Array) -> jax.Array:
-            return jax.vmap(functools.partial(radiance_jump, world, side=side))(samples, passages, segments.valid)
+            return jax.vmap(functools.partial(radiance_jump, world, side=side))(samples, folds, beyond, segments.valid)
 
         # A `vmap` of a `vmap` would have to do all that `only_where` leaves out.
         light = lax.map(one_side, jnp.arange(2, dtype=jnp.int32))

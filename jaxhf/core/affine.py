@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float
 
 from .errors import UserError
-from .powers import floor_to_power_of_two
 from .ray import Ray
 from .types import AnyArray, Number, Vector, VectorLeaf
+from .vector import floor_to_power_of_two
 
 
 class Affine(eqx.Module):

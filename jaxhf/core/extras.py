@@ -7,15 +7,12 @@ from .errors import UserError
 
 
 def import_extra(package: str, use: str, extra: str) -> ModuleType:
-    """An optional package.
+    """An optional package; UserError where it is not installed.
 
     Args:
       package: its name.
       use: what needs it, with its verb, as in "a report needs".
       extra: the extra of jaxhf that installs it.
-
-    Raises:
-      UserError: it is not installed.
     """
     try:
         return importlib.import_module(package)

@@ -25,12 +25,12 @@ class Whole(NamedTuple):
 
 
 class OneOf(NamedTuple):
-    """One of the names of a `Literal`."""
+    """One of these names, or of those of a `Literal`."""
 
-    literal: Any
+    names: Any
 
     def __call__(self, value: Any) -> str | None:
-        names = get_args(self.literal)
+        names = get_args(self.names) or self.names
         return None if value in names else f"must be one of {', '.join(names)}; it is {value!r}"
 
 

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
 
-from .powers import floor_to_power_of_two
 from .types import Flag, Index, Scalar, Vector
 
 Tree = TypeVar("Tree")
@@ -22,6 +21,17 @@ Tree = TypeVar("Tree")
 # Along an axis in which it moves less than 1 / FAR, a ray counts as standing still; its distance to the next plane there is
 # then large, but finite in single precision whatever it is multiplied with later.
 FAR = 1e30
+
+
+def floor_to_power_of_two(value: Float[jax.Array, "*shape"]) -> Float[jax.Array, "*shape"]:
+    """The largest powers of two that are not above positive numbers, without a derivative: a division by them changes no bit.
+
+    They are clamped to 2^-100..2^100, so that their reciprocals are normal numbers, and exact.
+    """
+    value = jnp.clip(lax.stop_gradient(value), 2.0**-100, 2.0**100)
+    integer, exponent_bits = (jnp.uint32, 0x7F800000) if value.dtype == jnp.float32 else (jnp.uint64, 0x7FF0000000000000)
+    bits = lax.bitcast_convert_type(value, integer) & jnp.asarray(exponent_bits, integer)
+    return lax.bitcast_convert_type(bits, value.dtype)
 
 
 @jax.custom_jvp

@@ -15,8 +15,7 @@ from ..core.errors import ArgumentError, kind_of
 from ..core.settings import Settings
 from ..core.types import AnyArray
 from ..scene.scene import Scene
-from ..xla.devices import automatic_axes, on_every_device
-from ..xla.transfers import takes_numbers
+from ..xla.devices import automatic_axes, on_every_device, takes_numbers
 from .coarser import coarser, factors
 from .given import Checkpoint, Given, Prior, Unknown
 from .history import Draws, Step, Stop, printed_progress

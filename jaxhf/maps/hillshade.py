@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from ..core.errors import ArgumentError
+from ..core.rules import OneOf, require
 from .choices import ALGORITHMS, VARIANTS
 from .shadows import lit
-from .surface import Heights, require_one_of, require_positive, surface
+from .surface import Heights, require_positive, surface
 from .windows import Window, differences, over_windows, spans
 
 _SHADOW = 1  # the darkest byte that is not nodata
@@ -56,8 +57,8 @@ def hillshade(
       ArgumentError: a number is out of range, a name unknown, or there is no height.
     """
     owner = "hillshade"
-    require_one_of(owner, "algorithm", algorithm, ALGORITHMS)
-    require_one_of(owner, "variant", variant, VARIANTS)
+    require(owner, "algorithm", algorithm, OneOf(ALGORITHMS))
+    require(owner, "variant", variant, OneOf(VARIANTS))
     require_light(owner, azimuth, altitude)
     require_positive(owner, "z_factor", z_factor)
     ground = surface(owner, heights, dx, dy, scale)
@@ -90,14 +91,7 @@ def require_light(owner: str, azimuth: float, altitude: float) -> None:
 
 
 class _Light(NamedTuple):
-    """A light over cells, as the formulae of the variants take it.
-
-    Attributes:
-      dx, dy: the spacing.
-      z_scaled: what differences of heights over `spans` cells are multiplied by.
-      azimuth, altitude: radians.
-      algorithm: of the slope.
-    """
+    """A light over cells. Differences of heights over `spans` cells are multiplied by `z_scaled`; angles are in radians."""
 
     dx: float
     dy: float

@@ -1,7 +1,7 @@
 """Colour ramps: a colour for each height, from a colour file as gdaldem reads it, from matplotlib, or our own."""
 
 import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +12,6 @@ from ..core.extras import import_extra
 from ..io.errors import SceneError
 from ..io.files import PathLike
 from ..io.terrain.colours import Colour, load_colours
-from .choices import ENTRIES
 
 # Land from the lowest height to the highest, in shares of 1: green lowlands, yellow hills, brown mountains, pale heights.
 _LAND = (
@@ -89,37 +88,23 @@ def matplotlib_ramp(name: str, low: float, high: float) -> Ramp:
     return Ramp(np.linspace(low, high, 256), table)
 
 
-def _interpolated(ramp: Ramp, z: np.ndarray, above: np.ndarray) -> np.ndarray:
-    """0.45 in place of one half rounds as gdaldem does."""
-    before = np.maximum(above - 1, 0)
-    gap = ramp.heights[above] - ramp.heights[before]
-    share = np.where(gap > 0, (z - ramp.heights[before]) / np.where(gap > 0, gap, 1), 1)[..., None]
-    first, last = ramp.colours[before].astype(float), ramp.colours[above].astype(float)
-    return 0.45 + first + np.clip(share, 0, 1) * (last - first)
-
-
-def _nearest(ramp: Ramp, z: np.ndarray, above: np.ndarray) -> np.ndarray:
-    before = np.maximum(above - 1, 0)
-    return ramp.colours[np.where(z - ramp.heights[before] < ramp.heights[above] - z, before, above)]
-
-
-def _exact(ramp: Ramp, z: np.ndarray, above: np.ndarray) -> np.ndarray:
-    return np.where((ramp.heights[above] == z)[..., None], ramp.colours[above], np.array(ramp.default, np.uint8))
-
-
-_COLOURS: dict[str, Callable[[Ramp, np.ndarray, np.ndarray], np.ndarray]] = dict(
-    zip(ENTRIES, (_interpolated, _nearest, _exact), strict=True)
-)
-
-
 def coloured(ramp: Ramp, z: Float[np.ndarray, "k m"], entries: str) -> UInt8[np.ndarray, "k m 4"]:
-    """The colours of heights."""
+    """The colours of heights; `entries` is one of `ENTRIES`."""
     holes = np.isnan(z)
     z = np.where(holes, ramp.heights[0], z)
     above = np.minimum(np.searchsorted(ramp.heights, z), len(ramp.heights) - 1)
-    colours = _COLOURS[entries](ramp, z, above).astype(np.uint8)
+    before = np.maximum(above - 1, 0)
+    over, gap = z - ramp.heights[before], ramp.heights[above] - ramp.heights[before]
+    if entries == "exact":
+        colours = np.where((ramp.heights[above] == z)[..., None], ramp.colours[above], np.array(ramp.default, np.uint8))
+    elif entries == "nearest":
+        colours = ramp.colours[np.where(over < ramp.heights[above] - z, before, above)]
+    else:
+        share = np.where(gap > 0, over / np.where(gap > 0, gap, 1), 1)[..., None]
+        first, last = ramp.colours[before].astype(float), ramp.colours[above].astype(float)
+        colours = 0.45 + first + np.clip(share, 0, 1) * (last - first)  # not one half: so gdaldem rounds
     colours[holes] = ramp.nodata
-    return colours
+    return colours.astype(np.uint8)
 
 
 def as_ramp(ramp: str | PathLike | None, low: float, high: float) -> Ramp:

@@ -6,11 +6,12 @@ import numpy as np
 from jaxtyping import UInt8
 
 from ..core.precision import fitted
+from ..core.rules import OneOf, require
 from ..io.files import PathLike
 from .choices import ENTRIES
 from .hillshade import hillshade
 from .ramp import as_ramp, coloured
-from .surface import Heights, require_one_of, surface
+from .surface import Heights, surface
 from .windows import shared
 
 
@@ -30,7 +31,7 @@ def color_relief(
       ArgumentError: there is no height, or `entries` is another.
       ValueError, FileNotFoundError: there is no such file or name, or a line of the file is wrong.
     """
-    require_one_of("color_relief", "entries", entries, ENTRIES)
+    require("color_relief", "entries", entries, OneOf(ENTRIES))
     ground = surface("color_relief", heights, 1.0, scale=1.0)
     z = fitted(ground.heights, np.float32)
     table = as_ramp(ramp, float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights)))

@@ -33,11 +33,7 @@ def lit(
     others walk from row to row, from one crossing with an edge to the next, until a bound settles them too. As between edges
     ray and surface are straight, only crossings have to be looked at. Holes cast no shadow, terrain beside them does.
 
-    Args:
-      heights: nan where there is none; row 0 in the south.
-      dx, dy: the spacing, in the unit of the heights.
-      azimuth: of the light, degrees clockwise from north.
-      altitude: of the light, degrees above the horizon.
+    The arguments are those of `hillshade`; `dx` and `dy` are in the unit of the heights.
     """
     azimuth, altitude = math.radians(azimuth), math.radians(altitude)
     x, y = math.sin(azimuth) * math.cos(altitude) / dx, math.cos(azimuth) * math.cos(altitude) / dy

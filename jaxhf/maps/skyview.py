@@ -13,6 +13,7 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_progress
+from ..core.rules import OneOf, Whole, require
 from ..preparation.horizon import (
     HorizonView,
     Summary,
@@ -27,8 +28,7 @@ from ..preparation.sky import sky_vector
 from ..scene.heightfield import Heightfield
 from ..trace.normals import vertex_normals
 from ..xla.compilation import compiled, is_traced
-from ..xla.devices import chosen_mesh, on_every_device
-from ..xla.transfers import takes_numbers
+from ..xla.devices import chosen_mesh, on_every_device, takes_numbers
 from .choices import WEIGHTINGS
 from .surface import with_spacing
 
@@ -67,7 +67,8 @@ def horizon(
     """
     field = _field("horizon", terrain, dx, dy)
     if np.ndim(azimuths) == 0:
-        azimuths = even_azimuths(_count("horizon", azimuths))
+        require("horizon", "azimuths", azimuths, Whole(1))
+        azimuths = even_azimuths(int(azimuths))
     azimuths = np.asarray(azimuths, np.float64)
     if azimuths.ndim != 1 or not azimuths.size or not np.isfinite(azimuths).all():
         raise ArgumentError("horizon", "azimuths", f"must be a whole number or a list of finite numbers, they are {azimuths}")
@@ -108,9 +109,9 @@ def sky_view(
       Shape (ny, nx), nan where there is no height; differentiable in the heights.
     """
     field = _field("sky_view", terrain, dx, dy)
-    if weighting not in WEIGHTINGS:
-        raise ArgumentError("sky_view", "weighting", f"must be among {', '.join(WEIGHTINGS)}, it is {weighting!r}")
-    found = _mapped("sky_view", weighting, field, even_azimuths(_count("sky_view", azimuths)), 0.0, progress, mesh)
+    require("sky_view", "weighting", weighting, OneOf(WEIGHTINGS))
+    require("sky_view", "azimuths", azimuths, Whole(1))
+    found = _mapped("sky_view", weighting, field, even_azimuths(int(azimuths)), 0.0, progress, mesh)
     if weighting != "slope":
         return found
     normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
@@ -119,23 +120,14 @@ def sky_view(
     return jnp.maximum(received, 0)
 
 
-def _degrees(slopes: jax.Array) -> jax.Array:
-    return jnp.rad2deg(jnp.arctan(slopes))
-
-
-def _solid_angle(slopes: jax.Array) -> jax.Array:
-    return jnp.mean(1 - slopes * jax.lax.rsqrt(1 + slopes * slopes), 0)
-
-
-def _horizontal(slopes: jax.Array) -> jax.Array:
-    return jnp.mean(1 / (1 + slopes * slopes), 0)
-
-
 _PARTS = 64  # of a map that reports its progress
 _ROOM = 4  # heights and horizontal distances are divided by it, so that differences of heights stay numbers
-_SUMMARIES: dict[str, Summary] = dict(
-    zip(("degrees", *WEIGHTINGS), (_degrees, _solid_angle, _horizontal, sky_vector), strict=True)
-)
+_SUMMARIES: dict[str, Summary] = {
+    "degrees": lambda slopes: jnp.rad2deg(jnp.arctan(slopes)),
+    "solid-angle": lambda slopes: jnp.mean(1 - slopes * lax.rsqrt(1 + slopes * slopes), 0),
+    "horizontal": lambda slopes: jnp.mean(1 / (1 + slopes * slopes), 0),
+    "slope": sky_vector,
+}
 
 
 def _mapped(
@@ -190,9 +182,3 @@ def _field(owner: str, terrain: Any, dx: float | None, dy: float | None) -> Heig
         if value is not None:
             raise ArgumentError(owner, name, "must stand without a Heightfield, which has its own cell size")
     return terrain
-
-
-def _count(owner: str, azimuths: Any) -> int:
-    if isinstance(azimuths, bool) or not isinstance(azimuths, int | np.integer) or azimuths < 1:
-        raise ArgumentError(owner, "azimuths", f"must be a whole number from 1 on, it is {azimuths!r}")
-    return int(azimuths)

@@ -3,8 +3,9 @@
 import numpy as np
 from jaxtyping import Float32
 
+from ..core.rules import OneOf, require
 from .choices import ALGORITHMS
-from .surface import Heights, require_one_of, surface
+from .surface import Heights, surface
 from .windows import Window, differences, over_windows, spans
 
 NODATA = -9999.0
@@ -26,7 +27,7 @@ def slope(
       heights, dx, dy, scale, algorithm, compute_edges: see `hillshade`, whose errors it has, too.
       percent: rise over run, times 100.
     """
-    require_one_of("slope", "algorithm", algorithm, ALGORITHMS)
+    require("slope", "algorithm", algorithm, OneOf(ALGORITHMS))
     ground = surface("slope", heights, dx, dy, scale)
     run = spans(algorithm) * ground.scale
 
@@ -56,7 +57,7 @@ def aspect(
       trigonometric: counterclockwise from east.
       zero_for_flat: 0 in place of -9999.
     """
-    require_one_of("aspect", "algorithm", algorithm, ALGORITHMS)
+    require("aspect", "algorithm", algorithm, OneOf(ALGORITHMS))
     ground = surface("aspect", heights, 1.0, scale=1.0)
     nothing = np.float32(0.0 if zero_for_flat else NODATA)
 

@@ -34,15 +34,7 @@ class Surface(NamedTuple):
 def surface(
     owner: str, heights: Heights, dx: float | None = None, dy: float | None = None, scale: float | None = None
 ) -> Surface:
-    """Checks what a function of this folder got.
-
-    Args:
-      owner: that function, for messages.
-      heights, dx, dy, scale: see `hillshade`.
-
-    Raises:
-      ArgumentError: heights are not a grid of numbers, none is finite, a number is not positive, or an array has no spacing.
-    """
+    """Checks what a function of this folder, the `owner`, got; the other arguments are those of `hillshade`."""
     require_positive(owner, "scale", 1.0 if scale is None else scale)
     heights, dx, dy = with_spacing(owner, heights, dx, dy, in_metres=scale is None)
     return Surface(_numbers(owner, heights), dx, dy, 1.0 if scale is None else scale)
@@ -51,15 +43,7 @@ def surface(
 def with_spacing(
     owner: str, heights: Any, dx: float | None, dy: float | None, in_metres: bool = True
 ) -> tuple[Any, float, float]:
-    """The heights of an array or a `Terrain`, as they are, with dx and dy; see `surface`.
-
-    Args:
-      owner, heights, dx, dy: as for `surface`.
-      in_metres: whether degrees count as metres.
-
-    Raises:
-      ArgumentError: dx or dy is not positive, neither is given for an array, or that is xarray's.
-    """
+    """The heights of an array or a `Terrain` as they are, with dx and dy, see `surface`; `in_metres`: degrees become metres."""
     given = {name: value for name, value in (("dx", dx), ("dy", dy)) if value is not None}
     for name, value in given.items():
         require_positive(owner, name, value)
@@ -98,8 +82,3 @@ def require_positive(owner: str, name: str, value: float) -> None:
         raise ArgumentError(owner, name, f"must be positive and finite, it is {value}")
     if not 1e-30 <= value <= _MOST:
         raise ArgumentError(owner, name, f"must be from 1e-30 to {_MOST:g}, it is {value}")
-
-
-def require_one_of(owner: str, name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise ArgumentError(owner, name, f"must be one of {', '.join(known)}; it is {value!r}")

@@ -28,7 +28,6 @@ def over_windows(
     Args:
       heights: row 0 in the south, nan where there is none. They count in float32, in which GDAL reads all but short integers.
       formula: of a window's nine arrays; is called from several threads.
-      compute_edges: see above.
       nodata: stands where there is no value.
     """
     z = fitted(heights, np.float32)[::-1]  # in the order of GDAL's rows

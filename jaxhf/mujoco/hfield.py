@@ -15,8 +15,9 @@ from ..core.rules import require
 from ..core.settings import Settings
 from ..core.types import NUMBERS, AnyArray, Number, array_leaf, float_leaf, height_leaf
 from ..rendering.render import heightfield_grids
-from ..scene.heightfield import Heightfield
-from ..trace.grid import Grid, make_grid
+from ..trace.grid import Grid
+
+SEARCHED = Settings(shading="flat")  # for grids in which a triangle is searched for, cells by cells by data
 
 
 class HField(eqx.Module):
@@ -50,24 +51,23 @@ class HField(eqx.Module):
     _grid: Grid | None = eqx.field(init=False)
 
     def __init__(self, data: Any, size: Any, pos: Any = (0, 0, 0), quat: Any = (1, 0, 0, 0)):
-        self.data = data = height_leaf("HField", "data", data)
+        self.data = height_leaf("HField", "data", data)
         if self.data.ndim < 2 or min(self.data.shape[-2:]) < 2:
             rule = f"must have shape (..., nrow, ncol) of at least 2x2, its shape is {self.data.shape}"
             raise ArgumentError("HField", "data", rule)
-        if not isinstance(data, Tracer) and data.size:
-            low, high = np.asarray(self.data).min(), np.asarray(self.data).max()
-            if not (low >= 0 and high <= 1):
-                raise ArgumentError("HField", "data", f"must lie from 0 to 1, it goes from {low:g} to {high:g}")
         self.size, self.pos, self.quat = (
             self._numbers(name, value, length)
             for name, value, length in (("size", size, 4), ("pos", pos, 3), ("quat", quat, 4))
         )
-        if not isinstance(self.size, Tracer) and not (np.asarray(self.size) > 0).all():
-            raise ArgumentError("HField", "size", f"must be positive, it is {self.size.tolist()}")
-        if not isinstance(self.quat, Tracer) and not np.any(self.quat, axis=-1).all():
+        leaves = self.data, self.size, self.quat
+        data, size, quat = (None if isinstance(leaf, Tracer) else np.asarray(leaf) for leaf in leaves)
+        if data is not None and data.size and not (data.min() >= 0 and data.max() <= 1):
+            raise ArgumentError("HField", "data", f"must lie from 0 to 1, it goes from {data.min():g} to {data.max():g}")
+        if size is not None and not (size > 0).all():
+            raise ArgumentError("HField", "size", f"must be positive, it is {size.tolist()}")
+        if quat is not None and not quat.any(axis=-1).all():
             raise ArgumentError("HField", "quat", "must not be zero, it is (0, 0, 0, 0)")
-        self._grid = None
-        self.upright = not isinstance(self.quat, Tracer) and not np.asarray(self.quat)[..., 1:3].any()
+        self._grid, self.upright = None, quat is not None and not quat[..., 1:3].any()
 
     def _numbers(self, name: str, value: Any, length: int) -> Any:
         """That many numbers for each height field of the batch, from as many or from those for all alike."""
@@ -90,7 +90,7 @@ class HField(eqx.Module):
         For many calls with the same heights: other ones need an HField of their own. Bounds take 5 times the memory of heights.
         """
         data = lax.stop_gradient(self.data).reshape(-1, *self.data.shape[-2:])
-        grids = heightfield_grids(data, 1.0, 1.0, Settings(shading="flat"))
+        grids = heightfield_grids(data, 1.0, 1.0, SEARCHED)
         grids = jax.tree.map(lambda leaf: leaf.reshape(*self.batch, *leaf.shape[1:]), grids)
         return eqx.tree_at(lambda field: field._grid, self, grids, is_leaf=lambda leaf: leaf is None)
 
@@ -150,11 +150,6 @@ def number_pair(owner: str, name: str, value: Any) -> tuple[float, float]:
     """Two numbers that are known and finite."""
     first, second = known_numbers(owner, name, value, Number(shape=(2,), shape_words="be two numbers"))
     return float(first), float(second)
-
-
-def search_grid(data: Float[jax.Array, "nrow ncol"]) -> Grid:
-    """For the search of a triangle alone: cells by cells by data."""
-    return make_grid(Heightfield(lax.stop_gradient(data), 1.0, 1.0), None, None)
 
 
 _MJGEOM_HFIELD = 1  # mjtGeom's number of a height field

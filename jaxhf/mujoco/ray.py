@@ -17,16 +17,17 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
 from ..core.vector import finite, quotient, unit
 from ..rendering.chunks import trace_batch
-from ..trace.grid import Grid, joined
+from ..scene.heightfield import Heightfield
+from ..trace.grid import Grid, joined, make_grid
+from ..trace.hit import Status
 from ..trace.intersect import plane_distance, ray_in_grid
 from ..trace.search import first_triangle
-from ..trace.status import Status
 from ..trace.triangle import plane_through, triangle_corners
 from ..trace.walk import WalkResult
 from ..xla.compilation import compiled
-from ..xla.materialise import apart, materialise
-from ..xla.transfers import takes_numbers
-from .hfield import HField, as_numbers, search_grid
+from ..xla.devices import takes_numbers
+from ..xla.materialise import materialise
+from .hfield import SEARCHED, HField, as_numbers
 from .pose import pose
 from .solid import Ground, Side, base_faces, column, ground_of, wall
 
@@ -117,7 +118,8 @@ def one_axis(hfield: HField) -> HField:
 
 
 def _searchable(hfield: HField) -> Ground:
-    return ground_of(hfield, search_grid(hfield.data) if hfield._grid is None else lax.stop_gradient(hfield._grid))
+    field = lax.stop_gradient(hfield)
+    return ground_of(hfield, field._grid or make_grid(Heightfield(field.data, 1.0, 1.0), None, SEARCHED))
 
 
 def _joined(grounds: Ground) -> tuple[Ground, Ground]:
@@ -141,7 +143,7 @@ def _one(ground: Ground, ray: Ray) -> Scan:
     faces = base_faces(ground, local, within)
     limit = lax.stop_gradient(jnp.where(faces[0].met, faces[0].t, jnp.where(faces[1].met, faces[1].t, jnp.inf)))
     scaled, scale = ray_in_grid(grid, in_cells(ground, local))
-    found = first_triangle(grid, scaled, max_steps=None, t_max=limit * scale)
+    found = first_triangle(grid, scaled, t_max=limit * scale)
     found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
     found = stored(materialise(found))
     walls = (wall(ground, local, side, found.side < 0) for side in within)
@@ -166,11 +168,10 @@ def in_cells(ground: Ground, local: Ray) -> Ray:
 
 def triangle_heights(ground: Ground, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """The data at the vertices of a triangle, see `triangle_corners`."""
-
-    def heights(rows, first, ix, iy, upper):
-        return triangle_corners(rows, ground.shape[1], ix, iy, upper, first)
-
-    return apart(heights, ground.rows, ground.first, ix, iy, upper)
+    # XLA on the CPU fuses a gather into its only user; one with several users becomes a loop over its elements, some twenty
+    # times as slow.
+    rows, first, ix, iy, upper = materialise((ground.rows, ground.first, ix, iy, upper))
+    return materialise(triangle_corners(rows, ground.shape[1], ix, iy, upper, first))
 
 
 def nearest(ground: Ground, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Scan:

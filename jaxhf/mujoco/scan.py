@@ -16,12 +16,12 @@ from ..core.errors import ArgumentError, require_kind
 from ..core.ray import Ray
 from ..core.rules import OneOf, require
 from ..core.types import FINITE, POSITIVE, Point2, Scalar, Vector
-from ..trace.status import Status
+from ..trace.hit import Status
 from ..trace.triangle import plane_through
 from ..trace.walk import WalkResult
 from ..xla.compilation import compiled
+from ..xla.devices import takes_numbers
 from ..xla.materialise import materialise
-from ..xla.transfers import takes_numbers
 from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import Quaternion, pose, rotation, yaw
 from .ray import Scan, first_met, in_hfield, nearest, one_axis, triangle_heights
@@ -90,10 +90,6 @@ def on_sensors(
 
     Returns:
       Positions (..., 3) and orientations (..., 4), which begin with the axes of the height fields; the pattern (n, columns).
-
-    Raises:
-      ValueError: `hfields` is something else, shapes are others, or an orientation given as plain numbers is zero; `owner`
-        says so.
     """
     require_kind(owner, "hfields", hfields, HField, "a jaxhf.mujoco.HField")
     given, dtype, batch = quat, hfields.data.dtype, hfields.batch

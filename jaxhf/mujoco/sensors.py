@@ -12,7 +12,7 @@ from ..core.rules import Whole, require
 from ..core.types import ANGLE_OF_VIEW, POSITIVE
 from ..scene.camera import require_size
 from ..xla.compilation import compiled
-from ..xla.transfers import takes_numbers
+from ..xla.devices import takes_numbers
 from .hfield import HField, known_numbers, number_pair
 from .pose import rotation
 from .ray import Scan, first_met

@@ -91,8 +91,7 @@ def wall(ground: Ground, ray: Ray, side: Side, below: Flag) -> Side:
     """The wall in whose plane a side of the ray's column lies: met where that is over the floor and below the rim.
 
     Args:
-      ground: the height field.
-      ray: in its frame.
+      ground, ray: as for `column`.
       side: where the ray enters or leaves its column.
       below: whether the ray is below the surface, for where rounding cannot tell at the rim: so nothing gets in between a
         wall and the surface.

@@ -10,6 +10,7 @@ from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import largest_component
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit
+from ..trace.triangle import value_at
 from ..trace.walk import reciprocal
 from ..trace.walk_start import place_on_grid
 
@@ -129,10 +130,6 @@ def clears(ceiling: Ceiling, grid: Grid, number: int, hit: Hit) -> Flag:
     strip, along = jnp.where(ceiling.columns, ix, iy), jnp.where(ceiling.columns, x, y)
     strip, along = jnp.where(ceiling.back, strips - 1 - strip, strip), jnp.where(ceiling.back, strips - along, along)
     parallel = jnp.where(ceiling.columns, y, x) - ceiling.across * along
-    column = jnp.clip(jnp.floor(parallel).astype(jnp.int32) + _at(ceiling.first, strip), 0, cells + 2)
+    column = jnp.clip(jnp.floor(parallel).astype(jnp.int32) + value_at(ceiling.first, strip), 0, cells + 2)
     height = c + a * u + b * v - ceiling.rise * jnp.where(ceiling.columns, u, v)
-    return (hit.object == number) & (height > _at(ceiling.heights, strip * (cells + 3) + column))
-
-
-def _at(values: jax.Array, index: Index) -> jax.Array:
-    return values.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+    return (hit.object == number) & (height > value_at(ceiling.heights, strip * (cells + 3) + column))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 
 import equinox as eqx
 import jax
@@ -12,7 +13,6 @@ from jaxtyping import Float
 from ..core.affine import affine
 from ..core.errors import require_kind
 from ..core.ray import Ray
-from ..core.sampling import grid_side
 from ..core.settings import Settings
 from ..core.types import Flag, Index, MatrixLeaf, Scalar
 from ..core.vector import unit
@@ -23,10 +23,9 @@ from ..scene.scene import Scene, Shape
 from ..scene.skirt import Skirt
 from ..trace.cylinder import make_tube
 from ..trace.grid import Grid, make_grid
-from ..trace.hit import Hit
+from ..trace.hit import Hit, Status
 from ..trace.intersect import Surface, blocked, intersect
 from ..trace.skirt import make_walls
-from ..trace.status import Status
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
 from .ceiling import Ceiling, clears, make_ceiling
@@ -69,19 +68,21 @@ def resolve_settings(settings: Settings, scene: Scene) -> Settings:
     """The settings with what they leave to the scene filled in."""
     require_kind("", "settings", settings, Settings, "a jaxhf.Settings")
     samples = scene.samples if settings.samples is None else settings.samples
-    return dataclasses.replace(settings, samples=grid_side(samples) ** 2, edge_samples=settings.edge_samples or 0)
+    side = math.isqrt(samples - 1) + 1
+    return dataclasses.replace(settings, samples=side**2, edge_samples=settings.edge_samples or 0)
 
 
 def make_world(scene: Scene, settings: Settings) -> World:
     """Prepares what does not depend on the ray; `scene` must be `localise`d."""
     settings = resolve_settings(settings, scene)
     surfaces = tuple(make_surface(obj.shape, obj.world_from_object, settings) for obj in scene.objects)
+    azimuths = scene.sky_occlusion
     return World(
         surfaces=surfaces,
         materials=tuple(obj.material for obj in scene.objects),
         lights=scene.lights,
         ceilings=make_ceilings(surfaces, scene.lights, settings),
-        sky=tuple(_visible_sky(surface, scene) for surface in surfaces),
+        sky=tuple(visible_sky(surface, azimuths) if azimuths and isinstance(surface, Grid) else None for surface in surfaces),
         settings=settings,
     )
 
@@ -95,11 +96,6 @@ def make_ceilings(
     return tuple(tuple(_make_ceiling(surface, light, spared) for surface in surfaces) for light in lights)
 
 
-def _visible_sky(surface: Surface, scene: Scene) -> Float[jax.Array, "_ 3"] | None:
-    azimuths = scene.sky_occlusion
-    return None if azimuths is None or not isinstance(surface, Grid) else visible_sky(surface, azimuths)
-
-
 def _make_ceiling(surface: Surface, light: Light, wanted: bool) -> Ceiling | None:
     if not wanted or not isinstance(surface, Grid) or not isinstance(light, Directional) or isinstance(light, Sun):
         return None
@@ -107,12 +103,10 @@ def _make_ceiling(surface: Surface, light: Light, wanted: bool) -> Ceiling | Non
 
 
 def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: Settings) -> Surface:
-    """A shape made ready for tracing; the scheme of its normals and the levels of its bounds are those of the settings."""
+    """A shape made ready for tracing."""
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
-        normals = (settings.normals or "six") if settings.shading == "smooth" else None
-        levels = 0 if settings.traversal == "dda" else None
-        return make_grid(shape, world, normals, levels, settings.early_exit)
+        return make_grid(shape, world, settings)
     return make_walls(shape, world) if isinstance(shape, Skirt) else make_tube(shape, world)
 
 
@@ -128,14 +122,7 @@ def first_hit(
 
     The arguments are those of `intersect`.
     """
-    meet = functools.partial(
-        intersect,
-        max_steps=world.settings.max_steps,
-        leaving=leaving,
-        active=active,
-        count_steps=count_steps,
-        tangents=tangents,
-    )
+    meet = functools.partial(intersect, leaving=leaving, active=active, count_steps=count_steps, tangents=tangents)
     return nearest_hit([meet(surface, number, ray) for number, surface in enumerate(world.surfaces)])
 
 
@@ -154,9 +141,7 @@ def nearest_hit(hits: list[Hit]) -> Hit:
     return materialise(dataclasses.replace(nearest, object=number))
 
 
-def unblocked(
-    world: World, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, light: int | None = None
-) -> tuple[Flag, Index]:
+def unblocked(world: World, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, light: int) -> tuple[Flag, Index]:
     """Whether an active ray meets nothing before `t_max`, and how many walks ran out of steps; no derivative.
 
     Args:
@@ -164,13 +149,13 @@ def unblocked(
       ray: from the hit `leaving`.
       active: False spares the ray the search; it then counts as blocked.
       t_max: where to give up; None: nowhere.
-      light: the number of the light to which the ray goes, whose ceilings then spare walks; None: of no light.
+      light: the number of the light to which the ray goes, whose ceilings spare walks.
     """
     surfaces, ray, leaving, t_max = lax.stop_gradient((world.surfaces, ray, leaving, t_max))
     free, exhausted = active, jnp.zeros((), jnp.int32)
     for number, surface in enumerate(surfaces):
-        search = functools.partial(blocked, number=number, max_steps=world.settings.max_steps)
-        ceiling = None if light is None else world.ceilings[light][number]
+        search = functools.partial(blocked, number=number)
+        ceiling = world.ceilings[light][number]
         if ceiling is None or not isinstance(surface, Grid):
             met, ran_out = search(surface, ray, leaving, free, t_max)
         else:

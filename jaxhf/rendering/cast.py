@@ -19,14 +19,15 @@ from ..preparation.localise import anchor, localise, precision
 from ..preparation.world import World, first_hit, make_world, resolve_settings
 from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
-from ..trace.grid import Grid, joined
+from ..trace.grid import Grid, joined, make_grid
 from ..trace.hit import Hit
 from ..trace.intersect import intersect, leave
 from ..xla.compilation import compiled
-from ..xla.devices import prepared_mesh, where_called
-from ..xla.transfers import takes_numbers
+from ..xla.devices import prepared_mesh, takes_numbers, where_called
 from .chunks import trace_batch, trace_chunks
-from .render import Prepared, PreparedHeightfield, heightfield_grid, prepared_world
+from .render import Prepared, PreparedHeightfield, prepared_world
+
+_Traced = Grid | World
 
 
 def cast_camera(scene: Scene, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], settings: Settings | None = None) -> Hit:
@@ -98,11 +99,11 @@ def cast(
         require_kind("cast", "leaving", leaving, Hit, "the Hit that an earlier cast returned")
         if scene is not None:
             raise UserError("cast: leaving needs a heightfield alone, rays that meet a scene start at o")
-    given = settings if settings is None or scene is None else resolve_settings(settings, scene)
-    if ready and given not in (None, surface.settings):
+    chosen = settings or (surface.settings if ready else Settings())
+    chosen = chosen if scene is None else resolve_settings(chosen, scene)
+    if ready and chosen != surface.settings:
         what = "heightfield" if scene is None else "scene"
         raise UserError(f"cast: the {what} was prepared with {surface.settings}, it cannot be cast into with {settings}")
-    settings = surface.settings if ready else settings or Settings()
     if scene is not None:
         corner = np.array(surface._origin) if isinstance(surface, Prepared) else anchor(scene)
         dtype, batch = precision(scene), ()
@@ -140,12 +141,12 @@ def cast(
     starts = jax.tree.map(lambda leaf: in_a_row(leaf, leaf.shape[axes:]), start)
     rays = starts, in_a_row(d, (3,))
     if isinstance(surface, Scene):
-        hit = _cast_world(prepared_world(localise(surface.with_lights(())), settings), *rays)
+        shape = prepared_world(localise(surface.with_lights(())), chosen)
     elif isinstance(surface, Prepared):
-        hit = _cast_world(surface._world, *rays)
+        shape = surface._world
     else:
         shape = surface._grid if isinstance(surface, PreparedHeightfield) else _with_one_axis(field)
-        hit = (_cast_each if batch else _cast_one)(shape, *rays, settings)
+    hit = (_cast_each if batch else _cast_one)(shape, *rays, chosen)
     return jax.tree.map(lambda leaf: leaf.reshape(*many, *leaf.shape[rays[1].ndim - 1 :]), _moved(hit, corner))
 
 
@@ -165,33 +166,26 @@ def _moved(hit: Hit, offset: Float[np.ndarray, "3"]) -> Hit:
 
 
 @functools.partial(compiled, static_argnames=("settings",))
-def _cast_one(surface: Grid | Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
+def _cast_one(surface: _Traced | Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "n 3"], settings: Settings) -> Hit:
     """Rays from points (n, 3), or from hits with a leading axis n; chunk after chunk of one fixed size."""
-    grid = _ready(surface, settings)
-    return trace_chunks(lambda ray: _first(grid, ray, settings), (start, d), settings.chunk)
+    ready = _ready(surface, settings)
+    return trace_chunks(lambda ray: _first(ready, ray), (start, d), settings.chunk)
 
 
 @functools.partial(compiled, static_argnames=("settings",))
 def _cast_each(surfaces: Grid | Heightfield, start: jax.Array | Hit, d: Float[jax.Array, "m n 3"], settings: Settings) -> Hit:
-    """Surfaces with a leading axis m, each of which has rays of its own."""
-
-    def one(grid: Grid, ray: tuple[jax.Array | Hit, jax.Array]) -> Hit:
-        return _first(grid, ray, settings)
-
-    make = functools.partial(_ready, settings=settings)
-    return trace_batch(make, joined, one, surfaces, (start, d), settings.chunk)
+    """Heightfields with a leading axis m, each of which has rays of its own."""
+    return trace_batch(functools.partial(_ready, settings=settings), joined, _first, surfaces, (start, d), settings.chunk)
 
 
-def _ready(surface: Grid | Heightfield, settings: Settings) -> Grid:
-    return surface if isinstance(surface, Grid) else heightfield_grid(surface, settings)
+def _ready(surface: _Traced | Heightfield, settings: Settings) -> Any:
+    return make_grid(surface, None, settings) if isinstance(surface, Heightfield) else surface
 
 
-def _first(surface: Grid, ray: tuple[jax.Array | Hit, jax.Array], settings: Settings) -> Hit:
+def _first(surface: _Traced, ray: tuple[Any, jax.Array]) -> Hit:
+    """Of one ray that starts at a point or, on a grid, from a hit."""
     start, d = ray
+    if isinstance(surface, World):
+        return first_hit(surface, Ray(start, d), tangents=True)
     begin, leaving = leave(surface, 0, start, d) if isinstance(start, Hit) else (Ray(start, d), None)
-    return intersect(surface, 0, begin, max_steps=settings.max_steps, leaving=leaving, tangents=True)
-
-
-@compiled
-def _cast_world(world: World, o: Float[jax.Array, "n 3"], d: Float[jax.Array, "n 3"]) -> Hit:
-    return trace_chunks(lambda ray: first_hit(world, Ray(ray[0], ray[1]), tangents=True), (o, d), world.settings.chunk)
+    return intersect(surface, 0, begin, leaving=leaving, tangents=True)

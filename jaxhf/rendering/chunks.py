@@ -20,15 +20,21 @@ def trace_chunks(one: Callable[[Any], Any], rays: Any, chunk: int) -> Any:
       rays: a pytree of arrays whose leading axis counts the rays.
       chunk: how many rays are traced together; the last ones are made up by zeros.
     """
-    n = jax.tree.leaves(rays)[0].shape[0]
-    count = math.ceil(n / chunk)
+    return _map_groups(jax.vmap(one), rays, chunk, "constant")
 
-    def chunked(leaf: jax.Array) -> jax.Array:
-        tail = leaf.shape[1:]
-        return jnp.pad(leaf, ((0, count * chunk - n), *((0, 0) for _ in tail))).reshape(count, chunk, *tail)
 
-    results = lax.map(recomputed(jax.vmap(one)), jax.tree.map(chunked, rays))
-    return jax.tree.map(lambda leaf: leaf.reshape(count * chunk, *leaf.shape[2:])[:n], results)
+def _map_groups(fun: Callable[[Any], Any], items: Any, size: int, padding: Any) -> Any:
+    """`fun(items)` for groups of one size, one after the other; the last one is filled up by this mode of `jnp.pad`."""
+    n = jax.tree.leaves(items)[0].shape[0]
+    count, missing = math.ceil(n / size), -n % size
+
+    def grouped(leaf: jax.Array) -> jax.Array:
+        if missing:
+            leaf = jnp.pad(leaf, ((0, missing), *((0, 0) for _ in leaf.shape[1:])), padding)
+        return leaf.reshape(count, size, *leaf.shape[1:])
+
+    results = lax.map(recomputed(fun), jax.tree.map(grouped, items))
+    return jax.tree.map(lambda leaf: leaf.reshape(count * size, *leaf.shape[2:])[:n], results)
 
 
 # Heights, or numbers of what was made of them, in shapes that share a chunk. Bounds of heights are up to 16 times as many, and
@@ -79,16 +85,7 @@ def trace_batch(
         return jax.tree.map(lambda leaf: leaf[None], of_one(jax.tree.map(lambda leaf: leaf[0], (shapes, rays))))
     if together == 1:
         return lax.map(recomputed(of_one), (shapes, rays))
-    count = math.ceil(shape_count / together)
-    missing = count * together - shape_count
-
-    def grouped(leaf: jax.Array) -> jax.Array:
-        if missing:
-            leaf = jnp.pad(leaf, ((0, missing), *((0, 0) for _ in leaf.shape[1:])), mode="edge")
-        return leaf.reshape(count, together, *leaf.shape[1:])
-
-    results = lax.map(recomputed(of_several), jax.tree.map(grouped, (shapes, rays)))
-    return jax.tree.map(lambda leaf: leaf.reshape(count * together, *leaf.shape[2:])[:shape_count], results)
+    return _map_groups(of_several, (shapes, rays), together, "edge")
 
 
 def _together(count: int, wanted: int) -> int:

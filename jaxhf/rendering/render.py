@@ -21,17 +21,16 @@ from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
 from ..preparation.localise import anchor, localise, localise_camera, localise_lights, precision
-from ..preparation.world import World, make_ceilings, make_surface, make_world, resolve_settings
+from ..preparation.world import World, make_ceilings, make_world, resolve_settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light
 from ..scene.scene import Scene
-from ..trace.grid import Grid
+from ..trace.grid import Grid, make_grid
 from ..xla.compilation import compiled, is_traced
-from ..xla.devices import chosen_mesh, map_over, on_every_device, prepared_mesh, where_called
+from ..xla.devices import chosen_mesh, map_over, on_every_device, prepared_mesh, takes_numbers, where_called
 from ..xla.kernel import in_turn, one_kernel
 from ..xla.materialise import unfolded
-from ..xla.transfers import takes_numbers
 from .aovs import known_aovs
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, trace_tiles
@@ -204,7 +203,8 @@ def render(
         camera = localise_camera(scene.camera, scene._given.scene, np.array(scene._origin), precision(scene._form))
         camera = on_every_device(camera, here)
     if progress is None:
-        outputs = _trace(world, camera, aovs, here, _key(key, world.settings, here))
+        drawn = on_every_device(key, here) if world.settings.edge_samples else None  # else the settings draw nothing
+        outputs = _trace(world, camera, aovs, here, drawn)
     else:
         outputs = _trace_in_parts(world, camera, aovs, here, progress)
     image = outputs.pop("image")
@@ -233,19 +233,10 @@ def require_key(key: Any) -> None:
         raise ArgumentError("render", "key", f"must be one key of JAX's, as jax.random.key(0) makes it, it is {key!r}")
 
 
-def _key(key: jax.Array | None, settings: Settings, mesh: Mesh) -> jax.Array | None:
-    """None also where the settings draw nothing."""
-    return on_every_device(key, mesh) if settings.edge_samples else None
-
-
 def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Settings, mesh: Mesh) -> Float[jax.Array, "n h w 3"]:
     """Pictures of scenes that differ in numbers only, one after the other, in one program; for tracing.
 
-    Args:
-      scenes: one `localise`d scene, whose leaves have a leading axis of n scenes.
-      change: what is done to each before it is rendered.
-      settings: the knobs.
-      mesh: the devices that share the work.
+    They come as one `localise`d scene whose leaves have a leading axis; `change` is done to each before it is rendered.
     """
 
     def one(scene: Scene) -> jax.Array:
@@ -259,7 +250,9 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
 @functools.partial(compiled, static_argnames=("aovs", "mesh"))
 def _trace(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> dict[str, jax.Array]:
     def picture(world: World, camera: Camera, _: jax.Array | None = None) -> dict[str, jax.Array]:
-        return _trace_picture(world, camera, aovs, mesh)
+        tiling = Tiling(camera, world.settings)
+        tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
+        return jax.tree.map(tiling.assemble, tiles)
 
     def across_boundaries(world: World, camera: Camera, key: jax.Array | None) -> dict[str, jax.Array]:
         others = picture(world, camera) if aovs else {}
@@ -267,12 +260,6 @@ def _trace(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key:
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
 
     return in_turn(picture, world, camera, key, derivative_of=across_boundaries if has_edges(world) else None)
-
-
-def _trace_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh) -> dict[str, jax.Array]:
-    tiling = Tiling(camera, world.settings)
-    tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
-    return jax.tree.map(tiling.assemble, tiles)
 
 
 def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, mesh: Mesh) -> Float[jax.Array, "h w 3"]:
@@ -294,17 +281,10 @@ def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, 
     return with_tangent(lax.stop_gradient(image), change.reshape(image.shape))
 
 
-def heightfield_grid(field: Heightfield, settings: Settings) -> Grid:
-    """A heightfield whose x0 and y0 are 0, made ready for rays that are alone on it."""
-    surface = make_surface(field, None, settings)
-    assert isinstance(surface, Grid)
-    return surface
-
-
 @functools.partial(compiled, newer=True, static_argnames=("dx", "dy", "settings"))
 def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float, settings: Settings) -> Grid:
     """Of heightfields that differ in their heights only."""
-    return lax.map(lambda z: heightfield_grid(Heightfield(z, dx, dy), settings), heights)
+    return lax.map(lambda z: make_grid(Heightfield(z, dx, dy), None, settings), heights)
 
 
 _trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))

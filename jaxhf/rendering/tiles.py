@@ -1,5 +1,6 @@
 """A picture in tiles: how it is cut, and what is traced for each of them."""
 
+import functools
 import math
 from typing import Any
 
@@ -10,7 +11,6 @@ from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from ..core.autodiff import recomputed
-from ..core.sampling import sample_offset
 from ..core.settings import Settings
 from ..preparation.world import World
 from ..scene.camera import Camera
@@ -26,6 +26,7 @@ class Tiling:
 
     def __init__(self, camera: Camera, settings: Settings):
         self.width, self.height = camera.width, camera.height
+        self.samples = settings.samples or 1
         self.side = 1 << ((settings.chunk.bit_length() - 1) // 2)
         self.columns, self.rows = math.ceil(self.width / self.side), math.ceil(self.height / self.side)
 
@@ -50,14 +51,16 @@ def trace_tiles(
     mesh: Mesh, world: World, camera: Camera, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]
 ) -> dict[str, jax.Array]:
     """The picture ("image") and AOVs of tiles, traced one after the other; (n, side * side, ...) each."""
+    of_tile = functools.partial(_trace_tile, aovs)
+    return map_over(mesh, lambda seen, tile: one_kernel(of_tile, *seen, tile), (world, camera), tiles)
 
-    def of_tile(world: World, camera: Camera, tile: jax.Array) -> dict[str, jax.Array]:
-        return _trace_tile(world, camera, aovs, tile)
 
-    def one(seen: tuple[World, Camera], tile: jax.Array) -> dict[str, jax.Array]:
-        return one_kernel(of_tile, *seen, tile)
+def sample_offset(k: Int[jax.Array, "*n"], side: int, dtype: Any) -> tuple[Float[jax.Array, "*n"], Float[jax.Array, "*n"]]:
+    """The k-th sample's position in its pixel, 0..1 each way: the centres of a regular grid.
 
-    return map_over(mesh, one, (world, camera), tiles)
+    With the box filter of a pixel's width, the pixel is the mean of its samples.
+    """
+    return ((k % side).astype(dtype) + 0.5) / side, ((k // side).astype(dtype) + jnp.asarray(0.5, dtype)) / side
 
 
 @recomputed
@@ -68,7 +71,7 @@ def light_along(
     return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y))))(x, y)
 
 
-def _trace_tile(world: World, camera: Camera, aovs: tuple[str, ...], tile: jax.Array) -> dict[str, jax.Array]:
+def _trace_tile(aovs: tuple[str, ...], world: World, camera: Camera, tile: jax.Array) -> dict[str, jax.Array]:
     dtype = camera.world_from_camera.dtype
     columns, rows = (place.astype(dtype) for place in Tiling(camera, world.settings).pixels(tile))
     image, exhausted = _pixels(world, camera, columns, rows)
@@ -84,8 +87,7 @@ def _pixels(
     world: World, camera: Camera, x: Float[jax.Array, " n"], y: Float[jax.Array, " n"]
 ) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
     """The means over the samples of the pixels whose top left corners are (x, y), and how many walks ran out of steps."""
-    assert world.settings.samples is not None
-    side = math.isqrt(world.settings.samples)
+    side = math.isqrt(Tiling(camera, world.settings).samples)
 
     def sample(k: Int[jax.Array, ""]) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
         dx, dy = sample_offset(k, side, x.dtype)

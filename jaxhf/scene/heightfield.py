@@ -9,13 +9,17 @@ from jax.core import Tracer
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_kind
-from ..core.powers import next_power_of_two
 from ..core.types import AnyArray, height_leaf
 from .record import known, number, numbers
 
 # So that a walk's state fits into 32 bits; each side of the grid counts as the next power of two.
 MOST_CELLS = 2**28
 _FARTHEST = 1e18  # whose square and inverse square are numbers in single precision
+
+
+def next_power_of_two(count: int) -> int:
+    """The least power of two that is at least 2 and `count`."""
+    return 1 << max(1, (count - 1).bit_length())
 
 
 class Heightfield(eqx.Module):

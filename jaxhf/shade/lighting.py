@@ -1,17 +1,14 @@
 """Light that arrives at a hit: its direction, its irradiance, and whether something blocks it."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Bool, Float
 
-from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, greater, largest_component, quotient, select, unit, within
+from ..core.vector import dot, floor_to_power_of_two, greater, largest_component, quotient, select, unit, within
 from ..preparation.world import World, unblocked
 from ..scene.light import Directional, Point, Sky, Sun, casts_sharp_shadows
 from ..trace.cylinder import Tube
@@ -43,9 +40,9 @@ def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vecto
         share = select(jnp.where(hit.side > 0, hit.object, -1), seen, share)
         return light.radiance * (jnp.pi * share), jnp.zeros((), jnp.int32)
     if isinstance(light, Sun):
-        seen, exhausted = _disc(world, light, hit, active)
-        share = jnp.where(seen.share > 0, seen.share, 1)
-        return light.irradiance * seen.share * _cosine(world, quotient(seen.mean, share), hit), exhausted
+        share, mean, exhausted = _disc(world, light, hit, active)
+        towards = quotient(mean, jnp.where(share > 0, share, 1))
+        return light.irradiance * share * _cosine(world, towards, hit), exhausted
     wi, arriving, distance = materialise(_towards(light, hit.p))
     lit, exhausted = _visible(number, world, wi, distance, hit, active)
     return jnp.where(lit, arriving * _cosine(world, wi, hit), 0), exhausted
@@ -85,7 +82,7 @@ def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:
     flags = []
     for number, light in enumerate(world.lights):
         if isinstance(light, Sun):
-            flags.append(met & ~(_disc(world, light, hit, met)[0].share > 0))
+            flags.append(met & ~(_disc(world, light, hit, met)[0] > 0))
         elif not isinstance(light, Sky):
             wi, _, distance = _towards(light, hit.p)
             flags.append(met & ~_visible(number, world, wi, distance, hit, met)[0])
@@ -117,15 +114,9 @@ def _visible(number: int, world: World, wi: Vector, distance: Scalar | None, hit
     return lit, jnp.zeros((), jnp.int32)
 
 
-class _Seen(NamedTuple):
-    """Of the sun's disc: the share that is seen, and the integral of the directions towards it over the disc's area."""
-
-    share: Scalar
-    mean: Vector
-
-
-def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]:
-    """What is seen of the sun from the side of the surface that the ray came from, and how many walks ran out of steps.
+def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[Scalar, Vector, Index]:
+    """The share of the sun's disc that is seen from the side of the surface that the ray came from, the integral of the
+    directions towards it over the disc's area, and how many walks ran out of steps.
 
     The disc is cut into vertical chords, at the nodes of Gauss's and Chebyshev's quadrature of the second kind, whose weight is
     the chords' length. In the plane of a chord each surface hides what lies between two slopes: what is left of the chord, and
@@ -139,15 +130,15 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
     ground = _solid_ground(world)
     lit = active if ground is None else active & ((hit.side > 0) | (hit.object != ground[0]))
 
-    def chord(total: tuple[_Seen, Index], node: tuple[Scalar, Scalar]) -> tuple[tuple[_Seen, Index], None]:
-        seen, exhausted = total
+    def chord(seen: tuple[Scalar, Vector, Index], node: tuple[Scalar, Scalar]) -> tuple[tuple[Scalar, Vector, Index], None]:
+        share, mean, exhausted = seen
         half, foot = radius * node[1], wi[:2] + radius * node[0] * aside
         level = jnp.stack([*unit(foot), jnp.zeros((), dtype)])
         centre = jnp.stack([*foot, wi[2]])
         centre = centre / jnp.sqrt(dot(centre, centre))  # about 1
         middle = jnp.arctan2(wi[2], dot(foot, level[:2]))
-        lowest, mean, highest = (jnp.tan(within(middle + end, -_STEEPEST, _STEEPEST)) for end in (-half, 0, half))
-        own = _own_slopes(n, level, mean)
+        lowest, slope, highest = (jnp.tan(within(middle + end, -_STEEPEST, _STEEPEST)) for end in (-half, 0, half))
+        own = _own_slopes(n, level, slope)
 
         def angle(slope: Scalar) -> Scalar:
             above = jnp.where(slope < jnp.inf, within(jnp.arctan(slope) - middle, -half, half), half)
@@ -161,7 +152,7 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
             slope = greater(own[1], lowest)
             if world.settings.shadows:
                 number, grid = ground
-                slope, more = skyline_slope(grid, number, hit.p, level, hit, lit, (slope, highest), world.settings.max_steps)
+                slope, more = skyline_slope(grid, number, level, hit, lit, (slope, highest))
                 exhausted = exhausted + more.astype(jnp.int32)
             parts = [(angle(slope), half)]
         upwards = jnp.stack([*(-centre[2] * level[:2]), dot(centre, level)])
@@ -170,19 +161,19 @@ def _disc(world: World, sun: Sun, hit: Hit, active: Flag) -> tuple[_Seen, Index]
             weight = jnp.where(lit, weight, 0)
             higher = (begin + end) / 2
             direction = jnp.cos(higher) * centre + jnp.sin(higher) * upwards
-            seen = _Seen(seen.share + weight, seen.mean + weight * direction)
-        return (seen, exhausted), None
+            share, mean = share + weight, mean + weight * direction
+        return (share, mean, exhausted), None
 
     turns = np.arange(1, sun.chords + 1) * (np.pi / (sun.chords + 1))
     nodes = jnp.asarray(np.cos(turns), dtype), jnp.asarray(np.sin(turns), dtype)
-    none = _Seen(jnp.zeros((), dtype), jnp.zeros(3, dtype)), jnp.zeros((), jnp.int32)
-    (seen, exhausted), _ = lax.scan(chord, none, nodes)
+    none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros((), jnp.int32)
+    (share, mean, exhausted), _ = lax.scan(chord, none, nodes)
     for number, surface in enumerate(world.surfaces):
         if world.settings.shadows and isinstance(surface, Tube):
             fixed = lax.stop_gradient((surface, Ray(hit.p, wi), hit))
-            met, _ = blocked(*fixed, lit, None, number=number, max_steps=None)
-            seen = _Seen(*(jnp.where(met, 0, value) for value in seen))
-    return seen, exhausted
+            met, _ = blocked(*fixed, lit, None, number=number)
+            share, mean = jnp.where(met, 0, share), jnp.where(met, 0, mean)
+    return share, mean, exhausted
 
 
 def _solid_ground(world: World) -> tuple[int, Grid] | None:
@@ -204,10 +195,10 @@ def _hidden(
     hidden, exhausted = [], jnp.zeros((), jnp.int32)
     for number, surface in enumerate(world.surfaces if world.settings.shadows else ()):
         if isinstance(surface, Grid):
-            slopes, more = hidden_slopes(surface, number, hit.p, level, hit, active, between, world.settings.max_steps)
+            slopes, more = hidden_slopes(surface, number, level, hit, active, between)
             hidden, exhausted = [*hidden, slopes], exhausted + more
         elif isinstance(surface, Walls):
-            hidden = [*hidden, wall_slopes(surface, number, hit.p, level, hit)]
+            hidden = [*hidden, wall_slopes(surface, number, level, hit)]
     return hidden, exhausted
 
 

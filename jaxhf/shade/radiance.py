@@ -14,8 +14,7 @@ from ..preparation.world import World, first_hit, no_hit
 from ..scene.light import Sky
 from ..scene.material import Material, Matte, Mirror
 from ..scene.texture import ImageTexture
-from ..trace.hit import Hit
-from ..trace.status import Status
+from ..trace.hit import Hit, Status
 from ..xla.masked import only_where
 from .lighting import GRAZING, irradiance, sharp_lights, unshadowed_irradiance
 

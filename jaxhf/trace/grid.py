@@ -11,9 +11,9 @@ from jaxtyping import Float, Int, Shaped
 
 from ..core.affine import Affine
 from ..core.errors import UserError
-from ..core.powers import floor_to_power_of_two
-from ..core.settings import NormalScheme
+from ..core.settings import Settings
 from ..core.types import MOST_PLACES, Flag, Index, Scalar
+from ..core.vector import floor_to_power_of_two
 from ..scene.heightfield import Heightfield
 from .normals import vertex_normals
 from .pyramid import Pyramid, make_pyramid
@@ -36,7 +36,7 @@ class Grid(eqx.Module):
       pyramid: bounds over blocks of cells.
       normals: at the vertices, object frame; None where shading is flat.
       shape: (ny, nx).
-      early_exit: whether searches on it end early, see `first_triangle`.
+      max_steps, early_exit: of searches on it, as in `Settings`, see `first_triangle`.
       perturbation: what is added at the vertices of the triangle that a ray meets, for derivatives of one ray in those
         numbers alone; None: nothing.
       first: the place of the first vertex in `rows` and `normals`; None: 0, else they hold several grids, see `joined`.
@@ -50,7 +50,8 @@ class Grid(eqx.Module):
     grid_from_world: Affine
     object_from_world: Affine | None
     shape: tuple[int, int] = eqx.field(static=True)
-    early_exit: bool = eqx.field(static=True, default=True)
+    max_steps: int | None = eqx.field(static=True)
+    early_exit: bool = eqx.field(static=True)
     perturbation: Corners | None = None
     first: Index | None = None
 
@@ -66,21 +67,10 @@ class Grid(eqx.Module):
         return nx - 1, ny - 1
 
 
-def make_grid(
-    field: Heightfield,
-    world_from_object: Affine | None,
-    normals: NormalScheme | None,
-    levels: int | None = None,
-    early_exit: bool = True,
-) -> Grid:
+def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Settings) -> Grid:
     """Prepares `field` for tracing: dense array arithmetic, differentiable in the heights and in the transform.
 
-    Args:
-      field: its x0 and y0 must be 0, see `localise`.
-      world_from_object: None for the identity.
-      normals: the scheme at the vertices, see `vertex_normals`; None for none.
-      levels: of the pyramid, above its finest; None for all.
-      early_exit: see `Grid`.
+    Its x0 and y0 must be 0, see `localise`. The scheme of its normals and the levels of its bounds are those of the settings.
     """
     heights = jnp.asarray(field.heights)
     (ny, nx), dtype = heights.shape, heights.dtype
@@ -103,12 +93,14 @@ def make_grid(
         object_from_world = world_from_object.inverse()
         world_from_grid = Affine(world_from_object.linear * cell[None, :], world_from_object.point(ground))
         grid_from_world = Affine(object_from_world.linear / cell[:, None], (object_from_world.offset - ground) / cell)
-    at_vertices = None if normals is None else vertex_normals(heights, field.dx, field.dy, normals)
-    pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels)
-    normal_rows = None if at_vertices is None else at_vertices.reshape(-1, 3)
+    normals = None
+    if settings.shading == "smooth":
+        normals = vertex_normals(heights, field.dx, field.dy, settings.normals or "six").reshape(-1, 3)
+    pyramid = make_pyramid(lax.stop_gradient(z), z_top, 0 if settings.traversal == "dda" else None)
     return Grid(
-        z.reshape(-1), z_top, pyramid, normal_rows, world_from_grid, grid_from_world, object_from_world, (ny, nx), early_exit
-    )
+        z.reshape(-1), z_top, pyramid, normals, world_from_grid, grid_from_world, object_from_world, (ny, nx),
+        settings.max_steps, settings.early_exit,
+    )  # fmt: skip
 
 
 def joined(grids: Grid) -> tuple[Grid, Grid]:

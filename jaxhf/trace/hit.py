@@ -1,5 +1,6 @@
-"""Where a ray met a surface."""
+"""Where a ray met a surface, and how it ended."""
 
+import enum
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -9,12 +10,20 @@ from jaxtyping import Int
 
 from ..core.types import Index, Point2, Scalar, Vector
 from ..core.vector import dot, unit
-from .status import Status
 
 if TYPE_CHECKING:  # who has a hit of `cast` has its tangents
     _Tangent = Vector
 else:
     _Tangent = Vector | None
+
+
+class Status(enum.IntEnum):
+    """How a ray ended."""
+
+    MISS = 0
+    HIT = 1
+    EXHAUSTED = 2  # its budget of steps ran out
+    INVALID = 3  # its origin or direction was not finite, or its direction zero
 
 
 class Hit(eqx.Module):

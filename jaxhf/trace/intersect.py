@@ -13,18 +13,16 @@ import jax.numpy as jnp
 from jax import lax
 
 from ..core.autodiff import stored
-from ..core.powers import floor_to_power_of_two
 from ..core.ray import Ray
-from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, finite, largest_component, quotient, unit
+from ..core.types import Flag, Scalar, Vector
+from ..core.vector import dot, finite, floor_to_power_of_two, largest_component, quotient, unit
 from ..xla.masked import only_where
 from ..xla.materialise import materialise
-from .cylinder import Tube, hit_on_tube, tube_distance
+from .cylinder import Tube
 from .grid import Grid, triangle_plane
-from .hit import Hit, orthogonal_tangents
+from .hit import Hit, Status, orthogonal_tangents
 from .search import first_triangle
-from .skirt import Walls, before_terrain, hit_on_side, wall_distance
-from .status import Status
+from .skirt import Walls, before_terrain
 from .triangle import plane_through, triangle_corners
 from .walk import WalkResult
 from .walk_start import place_on_grid, point_on_grid
@@ -37,7 +35,6 @@ def intersect(
     number: int,
     ray: Ray,
     *,
-    max_steps: int | None,
     leaving: Hit | None = None,
     active: Flag | None = None,
     t_max: Scalar | None = None,
@@ -50,23 +47,26 @@ def intersect(
       surface: a prepared shape.
       number: of its object, for `Hit.object`.
       ray: one that is not finite, or whose `d` is zero, ends as INVALID.
-      max_steps: see `first_triangle`.
-      leaving: the hit from which the ray starts, on this surface or on another one, see `first_triangle`; None for rays that
-        start in free space.
-      active: False spares the ray the search: it ends as a miss.
-      t_max: where the search may give up: a hit beyond it may or may not be found.
-      count_steps: whether to count the steps of the search.
+      leaving, active, t_max, count_steps: see `first_triangle`; `leaving` may lie on another surface.
       tangents: whether the hit is to have its tangents, and the derivatives of `ns`.
     """
     valid = finite(ray.o) & finite(ray.d)
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
     if not isinstance(surface, Grid):
-        return materialise(_hit_of_closed_form(surface, number, ray, leaving, active, count_steps, tangents))
+        t, found, side = surface.distance(ray, leaving, number)
+        found = found if active is None else found & active
+        valid = largest_component(ray.d) > 0
+        met, t = found & valid, jnp.where(found, t, 0)
+        hit = surface.hit(number, ray(t), ray.d, side, found, tangents)
+        if isinstance(surface, Walls):
+            t = jnp.where(hit.side > 0, before_terrain(t), t)
+        status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID)).astype(jnp.int32)
+        hit = dataclasses.replace(hit, status=status, object=jnp.where(met, hit.object, -1), t=jnp.where(met, t, jnp.inf))
+        return materialise(dataclasses.replace(hit, steps=jnp.zeros((), jnp.int32)) if count_steps else hit)
     local, scale = ray_in_grid(surface, ray)
     found = first_triangle(
         surface,
         local,
-        max_steps=max_steps,
         active=active,
         leaving=leaving,
         number=number,
@@ -84,60 +84,21 @@ def hit_on_triangle(grid: Grid, number: int, ray: Ray, at: Hit) -> Hit:
     return surface_hit(grid, number, local, scale, WalkResult(met, ix, iy, at.triangle == 1, at.side, zero, zero, None))
 
 
-def blocked(
-    surface: Surface, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, *, number: int, max_steps: int | None
-) -> tuple[Flag, Flag]:
+def blocked(surface: Surface, ray: Ray, leaving: Hit, active: Flag, t_max: Scalar | None, *, number: int) -> tuple[Flag, Flag]:
     """Whether a world-frame ray meets the surface before `t_max`, and whether its budget ran out.
 
     Neither has a derivative: the arguments come under `stop_gradient`, see `unblocked`.
     """
     if not isinstance(surface, Grid):
-        t, found, _ = _distance(surface, number, ray, leaving)
+        t, found, _ = surface.distance(ray, leaving, number)
         return active & found & (t < (jnp.inf if t_max is None else t_max)), jnp.zeros((), bool)
     local, scale = ray_in_grid(surface, ray)
     t_max = None if t_max is None else t_max * scale
-    found = first_triangle(surface, local, max_steps=max_steps, active=active, leaving=leaving, number=number, t_max=t_max)
+    found = first_triangle(surface, local, active=active, leaving=leaving, number=number, t_max=t_max)
     met = found.status == int(Status.HIT)
     if t_max is not None:
         met = met & _is_through(triangle_plane(surface, found.ix, found.iy, found.upper), local, found, t_max)
     return stored((met, found.status == int(Status.EXHAUSTED)))
-
-
-def _distance(surface: Tube | Walls, number: int, ray: Ray, leaving: Hit | None) -> tuple[Scalar, Flag, Index]:
-    """The smallest t > 0 at which a ray meets a shape without cells, whether it does, and on which of its sides."""
-    if isinstance(surface, Walls):
-        return wall_distance(surface, ray, leaving, number)
-    t, found = tube_distance(surface, ray, None if leaving is None else leaving.object == number)
-    return t, found, jnp.zeros((), jnp.int32)
-
-
-def _hit_of_closed_form(
-    surface: Tube | Walls,
-    number: int,
-    ray: Ray,
-    leaving: Hit | None,
-    active: Flag | None,
-    count_steps: bool,
-    tangents: bool,
-) -> Hit:
-    """`intersect` for a shape without cells, and for a ray that is finite."""
-    t, found, side = _distance(surface, number, ray, leaving)
-    found = found if active is None else found & active
-    valid = largest_component(ray.d) > 0
-    met, t = found & valid, jnp.where(found, t, 0)
-    if isinstance(surface, Walls):
-        hit = hit_on_side(surface, number, ray(t), ray.d, side, tangents)
-        t = jnp.where(hit.side > 0, before_terrain(t), t)
-    else:
-        hit = hit_on_tube(surface, number, ray(t), ray.d, found, tangents)
-    status = jnp.where(valid, jnp.where(met, int(Status.HIT), int(Status.MISS)), int(Status.INVALID))
-    return dataclasses.replace(
-        hit,
-        status=status.astype(jnp.int32),
-        object=jnp.where(met, hit.object, -1),
-        t=jnp.where(met, t, jnp.inf),
-        steps=jnp.zeros((), jnp.int32) if count_steps else None,
-    )
 
 
 def leave(grid: Grid, number: int, hit: Hit, d: Vector) -> tuple[Ray, Hit]:
@@ -193,16 +154,11 @@ def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkRes
 
 
 def plane_distance(plane: tuple[Scalar, Scalar, Scalar], ray: Ray, found: WalkResult) -> Scalar:
-    """t at which `ray` (in the grid's frame) meets the plane of the triangle that was found, see `triangle_plane`.
+    """t at which `ray` (in the grid's frame) meets the plane of the triangle in which a walk ended, see `triangle_plane`.
 
     Plain arithmetic that is differentiable in the heights and in the ray. It starts at the cell, as the subtraction
     of far heights would cancel; t is clamped to the part of the ray over the triangle, without touching its derivative. A
     ray that lies in the plane meets it all along: then t is that of the cell, with the derivative zero.
-
-    Args:
-      plane: of the triangle.
-      ray: in the grid's frame.
-      found: where the walk ended.
     """
     a, b, c = plane
     o, d = ray(found.t_near), ray.d

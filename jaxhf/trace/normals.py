@@ -6,10 +6,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-from ..core.powers import floor_to_power_of_two
 from ..core.settings import NormalScheme
 from ..core.types import AnyArray
-from ..core.vector import quotient
+from ..core.vector import floor_to_power_of_two, quotient
 from ..xla.materialise import materialise
 
 # The triangles round a vertex, counter-clockwise: each is spanned by two neighbouring offsets (ix, iy).

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Float
 
-from ..core.powers import next_power_of_two
 from ..core.types import Flag, Index, Scalar
+from ..scene.heightfield import next_power_of_two
+from .triangle import value_at
 
 
 class Pyramid(eqx.Module):
@@ -42,7 +43,7 @@ class Pyramid(eqx.Module):
         of_one = self.width * (2 * self.height - (self.height >> self.levels))
         index = index + jnp.where(above, 0, of_one)
         index = index if self.first is None else index + self.first
-        return self.bounds.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        return value_at(self.bounds, index)
 
 
 def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None) -> Pyramid:

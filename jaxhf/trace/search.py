@@ -23,7 +23,6 @@ def first_triangle(
     grid: Grid,
     ray: Ray,
     *,
-    max_steps: int | None,
     active: Flag | None = None,
     leaving: Hit | None = None,
     number: int = 0,
@@ -34,14 +33,14 @@ def first_triangle(
 
     With one level of bounds this is the walk of Amanatides and Woo (A fast voxel traversal algorithm, Eurographics 1987), with
     the distance to each crossing recomputed from the integer cell, as a running sum drifts; with all levels, that of Tevs
-    et al. (I3D 2008) over their maximum mipmaps. The loop has a fixed budget of steps and ends early, when all rays of the
-    batch have ended; without the grid's `early_exit` it always takes all of them. The search is discrete and under
+    et al. (I3D 2008) over their maximum mipmaps. The loop has a fixed budget of steps, each of which skips up to two blocks and
+    visits one cell: the grid's `max_steps`, or `enough_steps`. It ends early, when all rays of the batch have ended; without
+    the grid's `early_exit` it always takes all of them. The search is discrete and under
     `stop_gradient`; derivatives begin at the hit, see `surface_hit` in `intersect.py`.
 
     Args:
       grid: the surface.
       ray: in the grid's frame; may start outside the footprint, or below the surface.
-      max_steps: the budget: a step skips up to two blocks and visits one cell; None: `enough_steps`.
       active: False spares a ray the walk: it ends as a miss.
       leaving: for a ray that starts from a hit. If that lies on this grid, the ray leaves its triangle on the hit's `side` and
         cannot meet it again; this replaces the usual offset by an epsilon.
@@ -51,12 +50,12 @@ def first_triangle(
     """
     grid, ray, leaving, t_max = lax.stop_gradient((grid, ray, leaving, t_max))
     walk, state, valid = walk_start(grid, ray, leaving, number, t_max, active)
-    state, steps = _search(walk, state, enough_steps(grid, max_steps), count_steps, grid.early_exit)
+    state, steps = _search(walk, state, enough_steps(grid), count_steps, grid.early_exit)
     return walk.finish(state, valid, steps)
 
 
-def enough_steps(grid: Grid, most: int | None = None) -> int:
-    """A number of steps that suffices for any ray, or `most` if that is less.
+def enough_steps(grid: Grid) -> int:
+    """A number of steps that suffices for any ray, or the grid's `max_steps` if that is less.
 
     A ray moves one way along each axis, so on each level it passes through at most (blocks along x) + (blocks along y) - 1
     blocks. It comes to each of them at most once: it grows to a block only on entering it, and goes down into one
@@ -65,7 +64,7 @@ def enough_steps(grid: Grid, most: int | None = None) -> int:
     cells_x, cells_y = grid.cells
     levels = range(grid.pyramid.levels + 1)
     enough = sum(math.ceil(cells_x / 2**level) + math.ceil(cells_y / 2**level) - 1 for level in levels)
-    return enough if most is None else min(most, enough)
+    return enough if grid.max_steps is None else min(grid.max_steps, enough)
 
 
 # Blocks of cells that are looked at between two visits to cells.

@@ -38,6 +38,55 @@ class Walls(eqx.Module):
     world_from_object: Affine
     object_from_world: Affine
 
+    def distance(self, ray: Ray, leaving: Hit | None, number: int) -> tuple[Scalar, Flag, Index]:
+        """The smallest t > 0 at which a world-frame ray meets a wall or the floor, whether it does, and which of the five.
+
+        For rays from outside each side is wider by rounding, for those from inside narrower: so nothing gets in between two
+        sides, or a side and the terrain, and who grazes an edge from outside does not see the inside. If the hit that a ray
+        leaves lies on these walls (the object `number`), its side cannot be met again.
+        """
+        local = self.object_from_world.ray(ray)
+        o, d = local.o, local.d
+        wide = _WIDE * jnp.finfo(o.dtype).eps
+        best, found, nearest = jnp.full_like(self.base, jnp.inf), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+        planes = [*_upright(self), (2, self.base, 0, self.size[0], 0, 0)]
+        for side, (axis, place, along, length, cells, first) in enumerate(planes):
+            t, ever = time_to(place - o[axis], d[axis])
+            at, rate = o + t * d, jnp.where(ever, d[axis], 1)
+            off = jnp.abs(o) + jnp.abs(at) + (jnp.abs(o[axis]) + jnp.abs(place)) / jnp.abs(rate) * jnp.abs(d)
+            outwards = -1 if side in (0, 2, _FLOOR) else 1
+            wider = jnp.where(outwards * d[axis] < 0, wide, -wide) * off
+            inside = (at[along] >= -wider[along]) & (at[along] <= length + wider[along])
+            if side == _FLOOR:
+                inside = inside & (at[1] >= -wider[1]) & (at[1] <= self.size[1] + wider[1])
+            else:
+                low, high, share = _tops(self, first, jnp.clip(at[along] / length, 0, 1) * cells, cells)
+                more = wider[2] + jnp.abs(high - low) * (cells / length) * wider[along]
+                inside = inside & (at[2] >= self.base - wider[2]) & (at[2] <= low + share * (high - low) + more)
+            met = ever & (t > 0) & (t < best) & inside
+            if leaving is not None:
+                met = met & ~((leaving.object == number) & (leaving.cell[0] == side))
+            best, found, nearest = jnp.where(met, t, best), found | met, jnp.where(met, side, nearest)
+        return jnp.where(found, best, 0), found, nearest
+
+    def hit(self, number: int, p: Vector, d: Vector, side: Index, found: Flag, tangents: bool) -> Hit:
+        """The hit at a point of a wall, or of the floor, of a ray that comes along `d`; with t = 0."""
+        local = self.object_from_world.point(p)
+        (size_x, size_y), dtype = self.size, p.dtype
+        outwards = jnp.array(OUTWARDS, dtype)[side]
+        along_x, floor = (side < 2) | (side == _FLOOR), side == _FLOOR
+        u = jnp.where(along_x, local[0] / size_x, local[1] / size_y)
+        v = jnp.where(floor, local[1] / size_y, time_to(local[2] - self.base, self.tallest)[0])
+        n = unit(self.object_from_world.covector(outwards))
+        zero = jnp.zeros((), dtype)
+        hit = hit_of_closed_form(number, p, n, jnp.stack([u, v]), d, side)
+        if not tangents:
+            return hit
+        per_u = jnp.where(along_x, jnp.stack([zero + size_x, zero, zero]), jnp.stack([zero, zero + size_y, zero]))
+        per_v = jnp.where(floor, jnp.stack([zero, zero + size_y, zero]), jnp.stack([zero, zero, self.tallest]))
+        dp_du, dp_dv = orthogonal_tangents(self.world_from_object.vector(per_u), self.world_from_object.vector(per_v), n)
+        return dataclasses.replace(hit, dp_du=dp_du, dp_dv=dp_dv, dn_du=jnp.zeros_like(n), dn_dv=jnp.zeros_like(n))
+
 
 def make_walls(skirt: Skirt, world_from_object: Affine | None) -> Walls:
     tops = jnp.concatenate([jnp.asarray(side) for side in (skirt.south, skirt.north, skirt.west, skirt.east)])
@@ -48,44 +97,6 @@ def make_walls(skirt: Skirt, world_from_object: Affine | None) -> Walls:
     base = jnp.asarray(skirt.base, dtype)
     tallest = jnp.max(jnp.where(jnp.isfinite(tops), tops, base)) - base
     return Walls(tops, base, tallest, size, cells, world, world.inverse())
-
-
-def wall_distance(walls: Walls, ray: Ray, leaving: Hit | None, number: int) -> tuple[Scalar, Flag, Index]:
-    """The smallest t > 0 at which a world-frame ray meets a wall or the floor, whether it does, and which of the five.
-
-    For rays from outside each side is wider by rounding, for those from inside narrower: so nothing gets in between two sides,
-    or a side and the terrain, and who grazes an edge from outside does not see the inside.
-
-    Args:
-      walls: the surface.
-      ray: world frame.
-      leaving: the hit from which it starts; if that lies on these walls, its side cannot be met again. None for
-        rays that start in free space.
-      number: of the object.
-    """
-    local = walls.object_from_world.ray(ray)
-    o, d = local.o, local.d
-    wide = _WIDE * jnp.finfo(o.dtype).eps
-    best, found, nearest = jnp.full_like(walls.base, jnp.inf), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
-    planes = [*_upright(walls), (2, walls.base, 0, walls.size[0], 0, 0)]
-    for side, (axis, place, along, length, cells, first) in enumerate(planes):
-        t, ever = time_to(place - o[axis], d[axis])
-        at, rate = o + t * d, jnp.where(ever, d[axis], 1)
-        off = jnp.abs(o) + jnp.abs(at) + (jnp.abs(o[axis]) + jnp.abs(place)) / jnp.abs(rate) * jnp.abs(d)
-        outwards = -1 if side in (0, 2, _FLOOR) else 1
-        wider = jnp.where(outwards * d[axis] < 0, wide, -wide) * off
-        inside = (at[along] >= -wider[along]) & (at[along] <= length + wider[along])
-        if side == _FLOOR:
-            inside = inside & (at[1] >= -wider[1]) & (at[1] <= walls.size[1] + wider[1])
-        else:
-            low, high, share = _tops(walls, first, jnp.clip(at[along] / length, 0, 1) * cells, cells)
-            more = wider[2] + jnp.abs(high - low) * (cells / length) * wider[along]
-            inside = inside & (at[2] >= walls.base - wider[2]) & (at[2] <= low + share * (high - low) + more)
-        met = ever & (t > 0) & (t < best) & inside
-        if leaving is not None:
-            met = met & ~((leaving.object == number) & (leaving.cell[0] == side))
-        best, found, nearest = jnp.where(met, t, best), found | met, jnp.where(met, side, nearest)
-    return jnp.where(found, best, 0), found, nearest
 
 
 def _upright(walls: Walls) -> list[tuple[int, float, int, float, int, int]]:
@@ -101,18 +112,15 @@ def _tops(walls: Walls, first: int, position: Scalar, cells: int) -> tuple[Scala
     return walls.tops[first + cell], walls.tops[first + cell + 1], position - cell.astype(position.dtype)
 
 
-def wall_slopes(walls: Walls, number: int, p: Vector, level: Vector, leaving: Hit) -> tuple[Scalar, Scalar]:
+def wall_slopes(walls: Walls, number: int, level: Vector, leaving: Hit) -> tuple[Scalar, Scalar]:
     """The lowest and the highest slope that a skirt hides from a point; differentiable. (inf, -inf) where it hides none.
 
     In a vertical plane the floor and the walls at its ends are one line, as a sheet is, see `hidden_slopes`.
 
-    Args:
-      walls: an upright skirt.
-      number: of its object.
-      p: the point of the hit `leaving`, world frame.
-      level: a horizontal direction of length 1, world frame.
-      leaving: the hit; if that lies on the outside of these walls, they hide nothing beside what its own side does.
+    The arguments are those of `skyline_slope`; the skirt is upright. If the hit lies on the outside of these walls, they hide
+    nothing beside what its own side does.
     """
+    p = leaving.p
     o, d = walls.object_from_world.point(p), walls.object_from_world.vector(level)
     wide, own = _WIDE * float(jnp.finfo(o.dtype).eps) * (largest_component(o[:2]) + max(walls.size)), leaving.object == number
     low, high = jnp.full_like(walls.base, jnp.inf), jnp.full_like(walls.base, -jnp.inf)
@@ -138,22 +146,3 @@ def wall_slopes(walls: Walls, number: int, p: Vector, level: Vector, leaving: Hi
 def before_terrain(t: Scalar) -> Scalar:
     """The t of a wall that is met from outside: at the rim the terrain, whose lower side would be seen there, comes behind."""
     return t * (1 - _WIDE * jnp.finfo(t.dtype).eps)
-
-
-def hit_on_side(walls: Walls, number: int, p: Vector, d: Vector, side: Index, tangents: bool) -> Hit:
-    """The hit at a point of a wall, or of the floor, of a ray that comes along `d`; with t = 0."""
-    local = walls.object_from_world.point(p)
-    (size_x, size_y), dtype = walls.size, p.dtype
-    outwards = jnp.array(OUTWARDS, dtype)[side]
-    along_x, floor = (side < 2) | (side == _FLOOR), side == _FLOOR
-    u = jnp.where(along_x, local[0] / size_x, local[1] / size_y)
-    v = jnp.where(floor, local[1] / size_y, time_to(local[2] - walls.base, walls.tallest)[0])
-    n = unit(walls.object_from_world.covector(outwards))
-    zero = jnp.zeros((), dtype)
-    hit = hit_of_closed_form(number, p, n, jnp.stack([u, v]), d, side)
-    if not tangents:
-        return hit
-    per_u = jnp.where(along_x, jnp.stack([zero + size_x, zero, zero]), jnp.stack([zero, zero + size_y, zero]))
-    per_v = jnp.where(floor, jnp.stack([zero, zero + size_y, zero]), jnp.stack([zero, zero, walls.tallest]))
-    dp_du, dp_dv = orthogonal_tangents(walls.world_from_object.vector(per_u), walls.world_from_object.vector(per_v), n)
-    return dataclasses.replace(hit, dp_du=dp_du, dp_dv=dp_dv, dn_du=jnp.zeros_like(n), dn_dv=jnp.zeros_like(n))

@@ -27,14 +27,7 @@ from .walk_start import point_on_grid, walk_start
 
 
 def hidden_slopes(
-    grid: Grid,
-    number: int,
-    p: Vector,
-    level: Vector,
-    leaving: Hit,
-    active: Flag,
-    between: tuple[Scalar, Scalar],
-    max_steps: int | None,
+    grid: Grid, number: int, level: Vector, leaving: Hit, active: Flag, between: tuple[Scalar, Scalar]
 ) -> tuple[tuple[Scalar, Scalar], Index]:
     """The lowest and the highest slope that a sheet with two sides hides from a point, and how many walks ran out of steps.
 
@@ -46,13 +39,12 @@ def hidden_slopes(
     hidden.
     """
     own, lowest = leaving.object == number, between[0]
-    covers, gap = _over_footprint(grid, grid.grid_from_world.point(p))
+    covers, gap = _over_footprint(grid, grid.grid_from_world.point(leaving.p))
     underfoot = jnp.where(own, leaving.side > 0, covers & (gap > 0))
     overhead = jnp.where(own, leaving.side < 0, covers & (gap <= 0))
-    args = grid, number, p, level, leaving
-    high, ran_out = skyline_slope(*args, active & ~overhead, between, max_steps)
+    high, ran_out = skyline_slope(grid, number, level, leaving, active & ~overhead, between)
     stands = active & ~underfoot & (overhead | (high > lowest))
-    low, more = skyline_slope(*args, stands, between, max_steps, above=False)
+    low, more = skyline_slope(grid, number, level, leaving, stands, between, above=False)
     hidden = jnp.where(underfoot, -jnp.inf, jnp.where(stands, low, lowest)), jnp.where(overhead, jnp.inf, high)
     return hidden, ran_out.astype(jnp.int32) + more.astype(jnp.int32)
 
@@ -77,12 +69,10 @@ def _rounding(grid: Grid, o: Vector) -> float:
 def skyline_slope(
     grid: Grid,
     number: int,
-    p: Vector,
     level: Vector,
     leaving: Hit,
     active: Flag,
     between: tuple[Scalar, Scalar],
-    max_steps: int | None,
     above: bool = True,
 ) -> tuple[Scalar, Flag]:
     """The largest slope at which the surface is seen from a point, and whether the walk ran out of steps.
@@ -93,22 +83,18 @@ def skyline_slope(
     Args:
       grid: an upright surface.
       number: of its object.
-      p: the point of the hit `leaving`, world frame.
       level: a horizontal direction of length 1, world frame.
-      leaving: the hit; if that lies on this grid, its own triangle does not count.
+      leaving: the hit at that point; if it lies on this grid, its own triangle does not count.
       active: False spares the walk.
       between: the slopes that matter: what is below the first counts as the first, and the walk gives up beyond the second.
-      max_steps: see `first_triangle`.
       above: False for the smallest slope: then what is above the second counts as the second, and the walk gives up beyond the
         first.
     """
-    o = jnp.where(leaving.object == number, point_on_grid(grid, leaving), grid.grid_from_world.point(p))
-    local, rise = jnp.stack([*grid.grid_from_world.vector(level)[:2], jnp.zeros_like(o[2])]), grid.grid_from_world.linear[2, 2]
-    lowest, highest = between
-    fixed = lax.stop_gradient((grid, Ray(o, local), level, leaving, lowest, highest, rise))
-    edge, exhausted = stored(materialise(_outermost_edge(*fixed, number, active, max_steps, above)))
+    o = jnp.where(leaving.object == number, point_on_grid(grid, leaving), grid.grid_from_world.point(leaving.p))
+    fixed = lax.stop_gradient((grid, o, level, leaving, between))
+    edge, exhausted = stored(materialise(_outermost_edge(*fixed, number, active, above)))
     slope = _slope_to(grid, o, level, edge, above)
-    return (greater(slope, lowest) if above else lesser(slope, highest)), exhausted
+    return (greater(slope, between[0]) if above else lesser(slope, between[1])), exhausted
 
 
 def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index, above: bool) -> Scalar:
@@ -138,30 +124,22 @@ def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index, above: bool) ->
 
 def _outermost_edge(
     grid: Grid,
-    ray: Ray,
+    o: Vector,
     level: Vector,
     leaving: Hit,
-    lowest: Scalar,
-    highest: Scalar,
-    rise: Scalar,
+    between: tuple[Scalar, Scalar],
     number: int,
     active: Flag,
-    max_steps: int | None,
     above: bool,
 ) -> tuple[Index, Flag]:
     """The edge that makes the horizon, -1 where that is the slope to begin with; and whether the walk ran out of steps.
 
-    The walk begins as that of a level ray between the lowest and the highest of the heights.
-
-    Args:
-      ray: level, in the grid's frame, t in world units.
-      level: its direction, world frame.
-      lowest, highest: world frame.
-      rise: of a world unit, in the grid's frame.
-      grid, leaving, number, active, max_steps, above: as for `skyline_slope`.
+    The walk begins as that of a level ray between the lowest and the highest of the heights, with t in world units. It comes
+    from `o`, in the grid's frame; the other arguments are those of `skyline_slope`.
     """
-    o = ray.o
-    inside = Ray(jnp.stack([o[0], o[1], jnp.clip(o[2], 0, grid.z_top)]), ray.d)
+    (lowest, highest), rise = between, grid.grid_from_world.linear[2, 2]
+    along = jnp.stack([*grid.grid_from_world.vector(level)[:2], jnp.zeros_like(o[2])])
+    inside = Ray(jnp.stack([o[0], o[1], jnp.clip(o[2], 0, grid.z_top)]), along)
     walk, state, _ = walk_start(grid, inside, leaving, number, None, active & (lowest < highest))
     state = state | 4 if above else state & ~jnp.uint32(4)
     own = leaving.object == number
@@ -200,7 +178,7 @@ def _outermost_edge(
     first = lowest if above else highest
     edge = jnp.where(~own & (walk.t_start > touching), _border(tilted(first), state, above), -1)
     init = state, raised(first, edge), edge
-    state, _, edge = until_ended(advance, init, enough_steps(grid, max_steps), grid.early_exit)
+    state, _, edge = until_ended(advance, init, enough_steps(grid), grid.early_exit)
     return edge, walking(state)
 
 

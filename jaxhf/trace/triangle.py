@@ -26,7 +26,7 @@ def corners(
     """
     first = iy * nx + ix
     first = first if grid is None else first + grid
-    return tuple(_at(rows, first + further) for further in (0, 1, nx, nx + 1))
+    return tuple(value_at(rows, first + further) for further in (0, 1, nx, nx + 1))
 
 
 def triangle_corners(
@@ -38,7 +38,7 @@ def triangle_corners(
     """
     places = triangle_vertices(nx, ix, iy, upper)
     first, between, last = (place if grid is None else place + grid for place in places)
-    return _at(rows, first), _at(rows, between), _at(rows, last)
+    return value_at(rows, first), value_at(rows, between), value_at(rows, last)
 
 
 def triangle_vertices(nx: int, ix: Index, iy: Index, upper: Flag) -> tuple[Index, Index, Index]:
@@ -47,7 +47,8 @@ def triangle_vertices(nx: int, ix: Index, iy: Index, upper: Flag) -> tuple[Index
     return first, first + jnp.where(upper, nx, 1), first + nx + 1
 
 
-def _at(rows: Float[jax.Array, "vertices *rest"], index: Index) -> jax.Array:
+def value_at(rows: jax.Array, index: Index) -> jax.Array:
+    """The value in a place that is in range."""
     return rows.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 

@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float, UInt32
 
 from ..core.types import Flag, Index, Scalar
 from ..core.vector import FAR, greater, lesser
+from .hit import Status
 from .pyramid import Pyramid
-from .status import Status
 from .triangle import corners
 
 # The state of a walk is one unsigned integer, as every further carried array would repeat the step's arithmetic in a

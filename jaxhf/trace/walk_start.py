@@ -1,5 +1,7 @@
 """Where a ray's walk over a grid starts: at the border of the surface's box, or at the hit that the ray leaves."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,28 +16,12 @@ from .hit import Hit
 from .walk import LEAVING, MISS, WALKING, Walk, reciprocal
 
 
-class _SurfaceStart(eqx.Module):
-    """Where on this grid a ray starts from a hit.
-
-    Attributes:
-      active: False for a ray that starts anywhere else; the rest then means nothing.
-      ix, iy, upper: the triangle.
-      x, y: the point in grid coordinates.
-      side: 1 where the ray leaves on the +z side, else -1.
-    """
-
-    active: Flag
-    ix: Index
-    iy: Index
-    upper: Flag
-    x: Scalar
-    y: Scalar
-    side: Index
-
-
-def _surface_start(grid: Grid, leaving: Hit, number: int) -> _SurfaceStart:
-    ix, iy, x, y = place_on_grid(grid, leaving)
-    start = _SurfaceStart(leaving.object == number, ix, iy, leaving.triangle == 1, x, y, leaving.side)
+def _surface_start(grid: Grid, leaving: Hit | None, number: int) -> tuple[Any, ...]:
+    """Whether a ray starts on this grid; then its cell, its place as in `place_on_grid`, whether in the upper triangle, and its
+    side. All None for rays that start in free space."""
+    if leaving is None:
+        return (None,) * 7
+    start = leaving.object == number, *place_on_grid(grid, leaving), leaving.triangle == 1, leaving.side
     return lax.stop_gradient(materialise(start))
 
 
@@ -57,13 +43,7 @@ def walk_start(
 ) -> tuple[Walk, jax.Array, Flag]:
     """The constants of a ray's walk, the state in which it starts, and whether the ray is finite and has a direction.
 
-    Args:
-      grid: the surface.
-      ray: in the grid's frame.
-      leaving: the hit from which the ray starts, see `first_triangle`; None for rays that start in free space.
-      number: of the grid's object, as in `Hit.object`.
-      t_max: where to give up.
-      active: False: the walk ends before its first step.
+    The arguments are those of `first_triangle`.
     """
     width, height = grid.pyramid.width, grid.pyramid.height
     assert 3 + width.bit_length() + (height - 1).bit_length() <= 32, "Heightfield checks that a walk's state fits"
@@ -77,12 +57,11 @@ def walk_start(
     x = jnp.clip(ray.o[0] + t_start * dx, 0, cells_x * inside)
     y = jnp.clip(ray.o[1] + t_start * dy, 0, cells_y * inside)
     z_ray = jnp.clip(ray.o[2] + t_start * dz, 0, grid.z_top)
-    start = None if leaving is None else _surface_start(grid, leaving, number)
-    if start is not None:
-        away, at = start.active, start
-        on_triangle = height_over(grid, at.ix, at.iy, at.upper, at.x, at.y)
+    away, own_ix, own_iy, own_x, own_y, own_upper, side = _surface_start(grid, leaving, number)
+    if leaving is not None:
+        on_triangle = height_over(grid, own_ix, own_iy, own_upper, own_x, own_y)
         enters, t_start = enters | away, jnp.where(away, 0, t_start)
-        x, y, z_ray = jnp.where(away, at.x, x), jnp.where(away, at.y, y), jnp.where(away, on_triangle, z_ray)
+        x, y, z_ray = jnp.where(away, own_x, x), jnp.where(away, own_y, y), jnp.where(away, on_triangle, z_ray)
 
     # From the grid's frame to the walk's.
     back_x, back_y = inv_x < 0, inv_y < 0
@@ -111,9 +90,9 @@ def walk_start(
         t_start=t_start,
         t_end=jnp.where(inv_z > 0, grid.z_top - z_ray, -z_ray) * inv_z,
         t_stop=jnp.full_like(x, jnp.inf),
-        ahead=None if start is None else (start.upper == begins_upper) & (rate != 0),
+        ahead=None if leaving is None else (own_upper == begins_upper) & (rate != 0),
         first=grid.first,
-        noise=None if start is None else jnp.where(start.active, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
+        noise=None if leaving is None else jnp.where(away, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
     )
     t_stop = lesser(lesser(walk.distance_x(end_x), walk.distance_y(end_y)), walk.t_end)
     walk = eqx.tree_at(lambda walk: walk.t_stop, walk, t_stop if t_max is None else lesser(t_stop, t_max - t_start))
@@ -131,10 +110,9 @@ def walk_start(
     above = jnp.where(through_end, dz < 0, gap >= 0)
     going = enters if active is None else enters & active
     status = jnp.where(going, WALKING, MISS)
-    if start is not None:
-        away, at = start.active, start
-        ix, iy = jnp.where(away, at.ix ^ flip_x, ix), jnp.where(away, at.iy ^ flip_y, iy)
-        above = jnp.where(away, at.side > 0, above)
+    if leaving is not None:
+        ix, iy = jnp.where(away, own_ix ^ flip_x, ix), jnp.where(away, own_iy ^ flip_y, iy)
+        above = jnp.where(away, side > 0, above)
         status = jnp.where(going & away, LEAVING, status)
     return walk, walk.pack(status, above, 2 * ix + 1, iy), valid
 

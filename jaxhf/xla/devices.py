@@ -4,7 +4,7 @@ import contextlib
 import functools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,6 +18,9 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 from ..core.errors import ArgumentError, UserError, require_kind
 from .compilation import is_traced
 from .machine import peak_mb
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 # A device more of a CPU costs 7 ms a run, and so many rays take 10 (one terrain) to 300 ms (mirrors) to trace.
 _RAYS_A_DEVICE = 2**16
@@ -170,6 +173,21 @@ def where_called(owner: str, tree: Any) -> Any:
     """
     mesh = chosen_mesh(owner, None, tree)
     return tree if jax.sharding.get_abstract_mesh().empty else on_every_device(tree, mesh)
+
+
+def takes_numbers(fun: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """`fun`, within which NumPy's arrays may go to devices whatever `jax.transfer_guard` says of the caller's own program.
+
+    Cameras, lights and transforms are NumPy's until they are rendered. Compiled programs take them as they are, in less time
+    than `jax.device_put` takes for each leaf; to the guard that is a transfer by mistake.
+    """
+
+    @functools.wraps(fun)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        with jax.transfer_guard_host_to_device("allow"):
+            return fun(*args, **kwargs)
+
+    return call
 
 
 def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any) -> Any:

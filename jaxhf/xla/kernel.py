@@ -39,10 +39,7 @@ PART = 128
 def in_parts(fun: _Function, own: Any, shared: Any) -> Any:
     """`fun(own, shared)` as one kernel; on CPUs for `PART` items after `PART` items, if that divides their number.
 
-    Args:
-      fun: with no other traced values than its arguments; its results have an axis for the items, too.
-      own: a pytree of arrays whose leading axis counts the items.
-      shared: a pytree of arrays.
+    `own` and what `fun` returns have a leading axis that counts the items; for the rest see `one_kernel`.
     """
     count = jax.tree.leaves(own)[0].shape[0]
 
@@ -58,8 +55,7 @@ def in_turn(fun: _Function, *args: Any, derivative_of: _Function | None = None) 
     """`fun(*args)`; under `vmap` for one after the other, so that none waits for the slowest (not so in plain mode).
 
     Args:
-      fun: with no other traced values than its arguments.
-      args: pytrees of arrays.
+      fun, args: as for `one_kernel`.
       derivative_of: a function of the same values, up to rounding, which stands for `fun` wherever that is differentiated.
     """
     module = insides()

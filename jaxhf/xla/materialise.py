@@ -1,6 +1,5 @@
 """Keeping XLA on the CPU from computing a value anew for each of its users, and from computing constants as it compiles."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,15 +21,6 @@ def materialise(tree: Any) -> Any:
     """
     module = insides()
     return tree if module is None else jax.tree.map(module.in_memory.bind, tree)
-
-
-def apart(fun: Callable[..., Any], *args: Any) -> Any:
-    """`fun(*args)` between two such borders: `args` are in memory before, and the result afterwards.
-
-    For gathers. XLA on the CPU fuses one into its only user; one with several users becomes a loop over its elements, some
-    twenty times as slow.
-    """
-    return materialise(fun(*materialise(args)))
 
 
 def unfolded(tree: Any) -> Any:

@@ -350,10 +350,10 @@ def flows_at(scene: jaxhf.Scene, s: float) -> tuple[jax.Array, jax.Array]:
         sample = BoundarySample(
             valid, edge, none, light, start, end, at, jnp.ones_like(at), none, jnp.zeros(2, jnp.int32), valid, at
         )
-        sample, passage = pass_edge(world, camera, sample)
-        segment = boundary_segment(world, camera, sample, passage.fold)
-        near, beyond = (radiance_jump(world, sample, passage, segment.valid, jnp.asarray(k, jnp.int32)) for k in (0, 1))
-        return (near + beyond)[0] * segment.across
+        sample, fold, beyond = pass_edge(world, camera, sample)
+        segment = boundary_segment(world, camera, sample, fold)
+        parts = [radiance_jump(world, sample, fold, beyond, segment.valid, jnp.asarray(k, jnp.int32)) for k in (0, 1)]
+        return (parts[0] + parts[1])[0] * segment.across
 
     starts = jnp.tile(vertices, (6, 1))
     ends = starts + jnp.tile(jnp.repeat(jnp.array(STEPS, jnp.int32), len(vertices), axis=0), (2, 1))

@@ -150,7 +150,7 @@ FLAT = np.zeros((2, 2))
         (lambda: jaxhf.horizon(FLAT, lowest=90.0, dx=1.0), "horizon: lowest must be from -90 to below 90 degrees, it is 90.0"),
         (lambda: jaxhf.horizon(FLAT[0], dx=1.0), "Heightfield: heights must have shape (ny, nx) of at least 2x2"),
         (lambda: jaxhf.sky_view(FLAT, -2, dx=1.0), "sky_view: azimuths must be a whole number from 1 on, it is -2"),
-        (lambda: jaxhf.sky_view(FLAT, weighting="x", dx=1.0), "sky_view: weighting must be among solid-angle, horiz"),
+        (lambda: jaxhf.sky_view(FLAT, weighting="x", dx=1.0), "sky_view: weighting must be one of solid-angle, horiz"),
         (lambda: jaxhf.sky_view(jaxhf.Heightfield(FLAT), dx=1.0), "sky_view: dx must stand without a Heightfield, w"),
     ],
 )

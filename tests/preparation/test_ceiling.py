@@ -27,7 +27,7 @@ AZIMUTHS = (0.0, 37.0, 90.0, 135.0, 161.0, 200.0, 225.0, 270.0, 315.0)
 @functools.partial(jax.jit, static_argnames=("dx", "dy"))
 def judged(heights, world, x, y, up, suns, dx: float, dy: float):
     """For each sun and each hit from above (`up`) or below, in cells, whether walks are wanted, are spared, meet something."""
-    grid = make_grid(jaxhf.Heightfield(heights, dx, dy), affine(world), None)
+    grid = make_grid(jaxhf.Heightfield(heights, dx, dy), affine(world), jaxhf.Settings(shading="flat"))
 
     def under(sun):
         ceiling, wi = make_ceiling(grid, unit(sun)), unit(sun)
@@ -35,9 +35,9 @@ def judged(heights, world, x, y, up, suns, dx: float, dy: float):
         def one(x, y, up):
             far = jnp.where(up, 2, -1) * jnp.maximum(grid.z_top, 1)
             start = grid.world_from_grid.ray(Ray(jnp.stack([x, y, far]), jnp.stack([0 * x, 0 * x, -far])))
-            hit = intersect(grid, 0, start, max_steps=None)
+            hit = intersect(grid, 0, start)
             wanted = (hit.object == 0) & (dot(wi, hit.n) * hit.side.astype(wi.dtype) > 0)
-            met, _ = blocked(grid, Ray(hit.p, wi), hit, wanted, None, number=0, max_steps=None)
+            met, _ = blocked(grid, Ray(hit.p, wi), hit, wanted, None, number=0)
             return wanted, wanted & clears(ceiling, grid, 0, hit), met
 
         return jax.vmap(one)(x, y, up)

@@ -102,12 +102,12 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
     "cylinder": (
         "plain",
         case(jaxhf.Object(jaxhf.Cylinder())),
-        [everywhere(cylinder.make_tube), everywhere(cylinder.tube_distance), everywhere(cylinder.hit_on_tube)],
+        [everywhere(cylinder.make_tube), within(cylinder.Tube, "distance"), within(cylinder.Tube, "hit")],
     ),
     "skirt": (
         "plain",
         case(jaxhf.Object(jaxhf.Skirt.of(FIELD, -1))),
-        [*map(everywhere, (skirt.make_walls, skirt.hit_on_side))],
+        [everywhere(skirt.make_walls), within(skirt.Walls, "hit")],
     ),
     "second heightfield": (
         "smooth normals",
@@ -149,7 +149,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
     "step budget": (
         "plain",
         case(max_steps=6),
-        [everywhere(search.first_triangle, lambda max_steps=None, **_: max_steps is not None)],
+        [lambda patch, say: patch.setattr(search, "min", saying(min, say, lambda **_: True), raising=False)],
     ),
     "fixed number of steps": (
         "plain",

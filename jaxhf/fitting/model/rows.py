@@ -15,10 +15,8 @@ import scipy.sparse
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ...boundary.term import resampled_side
 from ...preparation.world import make_world
 from ...rendering.samples import PictureSamples
-from ...rendering.tiles import Tiling
 from ...scene.heightfield import Heightfield
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
@@ -215,7 +213,7 @@ def _vertices_by_heights(
 
 def _slots(samples: PictureSamples) -> Int[np.ndarray, "pixels each"]:
     """Which samples each pixel has: `PictureSamples.in_pixels` of their numbers."""
-    tiling, each = Tiling(samples.camera, samples.settings), samples.settings.samples or 1
+    tiling, each = samples.tiling, samples.tiling.samples
     size = tiling.side * tiling.side
     slots = np.moveaxis(np.arange(tiling.count * each * size).reshape(tiling.count, each, size), 1, 2)
     return tiling.assemble(slots).reshape(tiling.width * tiling.height, each)
@@ -244,8 +242,7 @@ def _picture_by_vertices(
         return rows(slots, share, shape)
     resampled, pixel, edges = known.edges.resampled, known.edges.pixel, known.edges
     share[resampled] = 0
-    tiling = Tiling(samples.camera, samples.settings)
-    once_more = tiling.count * slots.shape[1] * size + np.arange(resampled.size * resampled_side(samples.settings) ** 2)
+    once_more = samples.tiling.count * slots.shape[1] * size + np.arange(resampled.size * samples.resampled_side**2)
     once_more = once_more.reshape(resampled.size, -1)
     moving = np.moveaxis(edges.slopes[:, channel], 1, 2).reshape(-1, 5)
     heights = np.moveaxis(edges.vertices, 1, 2).reshape(-1, 5) * at_vertex
