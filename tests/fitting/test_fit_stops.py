@@ -134,7 +134,7 @@ def test_steps_by_factors_end_where_they_are_no_shorter(steps, predicted, stop):
 
 def test_rejections_in_a_row_damp_ever_faster():
     """Twice as much as the one before; and the step that is accepted after them leaves λ as it is."""
-    searches = [LevenbergMarquardt(rejections, 0.1, 9, None).search for rejections in range(4)]
+    searches = [LevenbergMarquardt(rejections, None).search for rejections in range(4)]
     np.testing.assert_allclose([search.low_constant for search in searches], 0.25 / 2.0 ** np.arange(4))
     np.testing.assert_allclose([search.high_constant for search in searches], [4, 1, 1, 1])
 

@@ -61,6 +61,10 @@ class Expansion(eqx.Module):
         """The same pictures in a problem that differs in noise, priors or basis alone."""
         return dataclasses.replace(self, problem=problem)
 
+    def with_noise(self, noise: Float[np.ndarray, " pictures"]) -> "Expansion":
+        """The same with another standard deviation of each picture's values at weight 1, beside the error of their samples."""
+        return self.of(self.problem.with_noise(noise, self.sampling))
+
     def pictures(self) -> Rows:
         """As they would be measured."""
         return _pictures(*on_every_device((self.unknowns, self.problem, self.linearised), self.problem.mesh))
@@ -102,12 +106,6 @@ def expand(unknowns: Unknowns, problem: Problem) -> Expansion:
     heights = _heights(unknowns, problem.basis)
     still = unknowns.without_modes()
     return Expansion(problem, unknowns, _linearised(heights, still, problem))
-
-
-def place_of(unknowns: Unknowns, problem: Problem) -> list[np.ndarray]:
-    """All on which pictures depend: the heights, whatever modes they are made of, and the other unknowns."""
-    others = unknowns.without_modes()
-    return [np.asarray(_heights(unknowns, problem.basis)), *map(np.asarray, jax.tree.leaves(others))]
 
 
 def residuals(unknowns: Unknowns, about: tuple[Problem, tuple[Linearised | None, ...]]) -> tuple[Any, None]:

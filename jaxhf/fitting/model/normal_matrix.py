@@ -4,7 +4,6 @@ import copy
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -144,10 +143,7 @@ class NormalMatrix:
         """The change of the unknowns."""
         surface, others = self.split(x)
         modes = fft.dctn(self.free * surface, norm="ortho") / np.asarray(self.expansion.problem.basis.scale, np.float64)
-        unknowns = self.unflat(jnp.asarray(others, self.dtype))
-        return eqx.tree_at(
-            lambda u: u.coefficients, unknowns, jnp.asarray(modes, self.dtype), is_leaf=lambda leaf: leaf is None
-        )
+        return self.unflat(jnp.asarray(others, self.dtype)).with_modes(jnp.asarray(modes, self.dtype))
 
     def split(self, x: Flat) -> tuple[Float[np.ndarray, "my mx"], Float[np.ndarray, " k"]]:
         count = int(np.prod(self.shape))

@@ -41,11 +41,14 @@ class Unknowns(eqx.Module):
 
     def at_base(self) -> "Unknowns":
         """The same but for the modes, which are 0: those of a surface that has become the base."""
-        return eqx.tree_at(lambda u: u.coefficients, self, jnp.zeros_like(self.coefficients))
+        return self.with_modes(jnp.zeros_like(self.coefficients))
+
+    def with_modes(self, coefficients: Any) -> Any:
+        return eqx.tree_at(lambda u: u.coefficients, self, coefficients, is_leaf=lambda leaf: leaf is None)
 
     def without_modes(self) -> Any:
         """All but the coefficients, which are None."""
-        return eqx.tree_at(lambda u: u.coefficients, self, None)
+        return self.with_modes(None)
 
     @property
     def count(self) -> int:

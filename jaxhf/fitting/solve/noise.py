@@ -101,7 +101,7 @@ class Restricted:
         widths = np.ones(OCTAVES)
         noise, far, change, draws = problem.noise.copy(), np.zeros(labels.size, bool), None, [None] * _draws(labels)
         for _ in range(_ROUNDS):
-            here = problem.with_noise(noise, self._expansion.sampling)
+            here = self._expansion.with_noise(noise).problem
             factors = self._factors(here)
             matrix = self._matrix.weighted(factors * np.where(far, _NO_WEIGHT, 1.0), by_mode(widths, self._matrix.shape))
             change = matrix.solved(-matrix.gradient(matrix.roots * self._rows), _TOLERANCE, change)
@@ -114,7 +114,7 @@ class Restricted:
                 for k, which in _each_picture(labels):
                     simulated = np.concatenate([draw.left[which] for draw in draws])
                     if np.mean(simulated**2) > _LEAST_FREE:
-                        noise[k] = _rms(deviations[which]) * _bounded(left[which]) / _bounded(simulated)
+                        noise[k] = rms(deviations[which]) * _bounded(left[which]) / _bounded(simulated)
                 noise = np.maximum(noise, problem.least_noise)
             far = self._far_off(left)
             if problem.known:
@@ -130,7 +130,7 @@ class Restricted:
     def freedom(self, estimate: Estimate) -> Freedom:
         """How much of its pictures' noise a fit leaves, by simulated fits of heights that vary as was estimated."""
         problem, labels = self._expansion.problem, self._labels
-        factors = self._factors(problem.with_noise(estimate.noise, self._expansion.sampling))
+        factors = self._factors(self._expansion.with_noise(estimate.noise).problem)
         roots = factors * np.where(self._far_off(factors * self._rows), _NO_WEIGHT, 1.0)
         matrix = self._matrix.weighted(roots, np.ones(self._matrix.shape))
         wider = by_mode(estimate.widths, matrix.shape)
@@ -272,10 +272,10 @@ def _draws(labels: Labels) -> int:
 def _bounded(values: Float[np.ndarray, " n"]) -> float:
     """The root mean square of what is not far off."""
     sizes = np.abs(values)
-    return _rms(sizes[sizes <= _FAR * np.median(sizes)])
+    return rms(sizes[sizes <= _FAR * np.median(sizes)])
 
 
-def _rms(values: Float[np.ndarray, " n"]) -> float:
+def rms(values: Float[np.ndarray, " n"]) -> float:
     return float(np.sqrt(np.mean(values * values)))
 
 

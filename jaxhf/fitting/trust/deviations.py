@@ -117,5 +117,5 @@ def with_unexplained(
     factor = float(np.sqrt(np.mean(psi**2) * np.mean(weight) / np.mean(slope) ** 2 / share))
     if not factor > 1:
         return expansion, 1.0
-    wider = problem.with_noise(factor * problem.noise, expansion.sampling)
-    return expansion.of(dataclasses.replace(wider, loss_scale=problem.loss_scale / factor)), factor
+    wider = dataclasses.replace(problem, loss_scale=problem.loss_scale / factor)
+    return expansion.of(wider).with_noise(factor * problem.noise), factor

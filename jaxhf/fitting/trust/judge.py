@@ -11,7 +11,7 @@ from ..history import Stop
 from ..model.expansion import Expansion
 from ..model.problem import Problem
 from ..solve.noise import Freedom, Restricted, explains_noise
-from ..solve.run import Ended, with_all_modes
+from ..solve.run import Ended
 from ..solve.stages import varies_all
 from .deviations import standard_deviations, with_unexplained
 from .facts import (
@@ -55,7 +55,7 @@ class Judgement(NamedTuple):
 def judged(ended: Ended, problems: Sequence[Problem], given: Given, report: Callable[..., None] | None) -> Judgement:
     """The judgement; `problems` are those of `run`. `report` is called after each draw."""
     fitted = varies_all(ended.state, problems) and bool(np.isfinite(ended.state.loss))
-    expansion, free = _restricted(with_all_modes(ended, problems, given), fitted, given)
+    expansion, free = _restricted(ended.expansion, fitted, given)
     problem = expansion.problem
     left, residuals = _left(expansion)
     in_noise = [picture.residual for picture in left]
@@ -105,7 +105,7 @@ def _restricted(expansion: Expansion, fitted: bool, given: Given) -> tuple[Expan
     restricted = Restricted(expansion)
     estimate = restricted.noise(given.noise is None)
     if given.noise is None:
-        expansion = expansion.of(expansion.problem.with_noise(estimate.noise, expansion.sampling))
+        expansion = expansion.with_noise(estimate.noise)
     return expansion, restricted.freedom(estimate)
 
 
