@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..fitting.fit import Fit
 from ..fitting.model.view import differences, sun
+from ..fitting.trust.judge import Fit
 from ..scene.heightfield import Heightfield
 
 if TYPE_CHECKING:

@@ -14,7 +14,6 @@ from ..scene.camera import Camera, Perspective
 from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
 from .given import Given, Prior
-from .model.pictures import weights_of
 from .model.surface import resample
 
 _FACTOR = 4  # between levels: a sixteenth of the work
@@ -46,10 +45,9 @@ def coarser(
         array = np.asarray(numbers(values), np.float64)
         return array if array.ndim == 0 else _reduced(resample(array, old.heights.shape), shape)
 
-    pictures = [
-        _coarser_picture(scene.camera, target, weight, factor)
-        for scene, target, weight in zip(scenes, targets, weights_of(scenes, targets, given.weights), strict=True)
-    ]
+    assert given.weights is not None
+    triples = zip(scenes, targets, given.weights, strict=True)
+    pictures = [_coarser_picture(scene.camera, target, weight, factor) for scene, target, weight in triples]
     prior = given.prior
     if prior is not None:
         cell = factor * max(old.dx, old.dy)
@@ -89,7 +87,7 @@ def _coarser_picture(
     def summed(values: np.ndarray) -> np.ndarray:
         return np.einsum("ih,jw,hwc->ijc", rows, columns, values, optimize=True)
 
-    shaped = target.reshape(*target.shape[:2], -1)
+    shaped, weight = (values.reshape(*target.shape[:2], -1) for values in (target, weight))
     told = summed(weight**2)
     mean = summed(weight**2 * np.where(weight > 0, shaped, 0)) / np.where(told > 0, told, 1)
     return camera, mean.reshape(height, width, *target.shape[2:]), np.sqrt(told).reshape(height, width, *target.shape[2:])

@@ -16,8 +16,8 @@ from ..command import Command
 from ..overwriting import require_no_input
 
 if TYPE_CHECKING:
-    from ...fitting.fit import Fit
     from ...fitting.history import Draws, Step
+    from ...fitting.trust.judge import Fit
     from ...io.scenes.toml.fit import Case
 
 _USUAL_STEPS = 30  # of a fit, until it says what is to come

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ...rendering.render import render_each
 from ...scene.material import Matte
@@ -22,7 +22,7 @@ from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device
-from .linearise import Linearised, can_be_linearised, linearise_each, picture_each
+from .linearise import Linearised, can_be_linearised, changing_pixels, linearise_each, picture_each
 from .pictures import Group
 from .problem import Problem
 from .robust import soften
@@ -73,6 +73,12 @@ class Expansion(eqx.Module):
         """(picture - target) / noise."""
         pairs = zip(self.problem.groups, self.pictures(), strict=True)
         return [group.weights * (image - group.targets) for group, image in pairs]
+
+    def informing(self) -> list[Bool[np.ndarray, "n h w c"]]:
+        """Which values depend on the heights; all of those with a weight where that is not known."""
+        found = [np.asarray(group.given) > 0 for group in self.problem.groups]
+        pairs = zip(found, self.linearised, strict=True)
+        return [counts if known is None else counts & changing_pixels(known)[..., None] for counts, known in pairs]
 
     def push(self, change: Surface) -> Rows:
         """J times a change of the surface and of the other unknowns: by what the pictures change, in units of the noise."""
@@ -204,15 +210,11 @@ def _simulate(
             if group.targets.shape[-1] == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
         if unknowns.exposures is not None:
-            image = image * _each(unknowns.exposures, group)
+            image = image * group.each(unknowns.exposures)
         if unknowns.offsets is not None:
-            image = image + problem.bright * _each(unknowns.offsets, group)
+            image = image + problem.bright * group.each(unknowns.offsets)
         images.append(image)
     return images
-
-
-def _each(values: Float[Array, " pictures"], group: Group) -> Float[Array, "n 1 1 1"]:
-    return jnp.stack([values[k] for k in group.indices]).reshape(-1, 1, 1, 1)
 
 
 def _moves(unknowns: Unknowns, problem: Problem, group: Group) -> View:

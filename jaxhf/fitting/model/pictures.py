@@ -37,12 +37,17 @@ class Group(eqx.Module):
     weights: Float[Array, "n h w c"]
     indices: tuple[int, ...] = eqx.field(static=True)
 
+    def each(self, values: Any) -> Any:
+        """A number for each of the caller's pictures, for each of these: shape (n, 1, 1, 1)."""
+        stack = np.stack if isinstance(values, np.ndarray) else jnp.stack
+        return stack([values[k] for k in self.indices]).reshape(-1, 1, 1, 1)
+
     def complete(self, scene: Scene, heights: Float[Array, "ny nx"]) -> Scene:
         """One picture's leaves of `scenes`, with those that are shared and these heights."""
         return _with_heights(eqx.combine(scene, self.shared), heights)
 
 
-def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None = None) -> None:
+def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> None:
     """Checks that there is a scene for each picture, and that all have the same first heightfield but for its heights."""
     if len(scenes) == 0:
         raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
@@ -56,21 +61,15 @@ def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Seq
         _require_alike(k, scene, scenes[0])
 
 
-def masked_targets(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> tuple[np.ndarray, ...]:
-    """Checks scenes, targets and weights; returns the targets with nan where they have no weight: no statistic counts these."""
-    require_scenes(scenes, targets, weights)
-    found = []
-    for k, (scene, target) in enumerate(zip(scenes, targets, strict=True)):
-        values, weight = _checked_picture(k, scene, target, weights)
-        found.append(np.where(weight > 0, values, np.nan).reshape(np.shape(target)))
-    return tuple(found)
-
-
-def weights_of(
+def checked_pictures(
     scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None
-) -> list[Float[np.ndarray, "h w c"]]:
-    """Of each value of each picture, 0 where it does not count."""
-    return [_checked_picture(k, *pair, weights)[1] for k, pair in enumerate(zip(scenes, targets, strict=True))]
+) -> tuple[tuple[np.ndarray, ...], list[Float[np.ndarray, "h w c"]]]:
+    """Checks scenes, targets and weights; returns the targets with nan where they have no weight, as no statistic counts these,
+    and the weight of each of their values."""
+    require_scenes(scenes, targets, weights)
+    pairs = [_checked_picture(k, *pair, weights) for k, pair in enumerate(zip(scenes, targets, strict=True))]
+    kept = [np.where(weight > 0, values, np.nan) for values, weight in pairs]
+    return tuple(map(np.reshape, kept, map(np.shape, targets))), [weight for _, weight in pairs]
 
 
 def make_groups(

@@ -22,7 +22,7 @@ from ...scene.texture import ImageTexture
 from ...xla.devices import chosen_mesh
 from ..given import Given, Unknown
 from .defaults import choose_edge_samples, choose_samples
-from .pictures import Group, make_groups, require_scenes
+from .pictures import Group, make_groups
 from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units
 from .terms import Terms, make_terms
 from .view import View, sun
@@ -82,6 +82,12 @@ class Problem(eqx.Module):
         """How many values of pictures count."""
         return sum(int(np.count_nonzero(np.asarray(group.given))) for group in self.groups)
 
+    def by_picture(self, rows: Sequence[Any]) -> list[Any]:
+        """What each picture has in an array for each group, in the order of the caller's pictures."""
+        pairs = zip(self.groups, rows, strict=True)
+        found = {k: part for group, row in pairs for k, part in zip(group.indices, row, strict=True)}
+        return [found[k] for k in range(self.count)]
+
     def edge_samples_for(self, heights: Float[Array, "ny nx"], settings: Settings) -> int:
         """As many points on edges as pictures of these heights call for, if the user's settings leave that open.
 
@@ -113,7 +119,7 @@ class Problem(eqx.Module):
         for number, group in enumerate(self.groups):
             # By NumPy: each operation of JAX's would be a program to compile.
             given = np.asarray(group.given)
-            variance = noise[list(group.indices)].astype(given.dtype).reshape(-1, 1, 1, 1) ** 2
+            variance = group.each(noise).astype(given.dtype) ** 2
             variance = variance / np.where(given > 0, given, 1) ** 2
             if sampling is not None and sampling[number] is not None:
                 variance = variance + np.asarray(sampling[number])[..., None] ** 2
@@ -128,7 +134,6 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
     Raises:
       ValueError: scenes, targets and arguments do not belong together.
     """
-    require_scenes(scenes, targets)
     first = scenes[0]
     field, dtype = first.heightfields[0], first.heights.dtype
     length = None if given.prior is None else given.prior.length

@@ -34,16 +34,15 @@ def balanced(expansion: Expansion) -> Units:
     slopes, _ = slope_units(problem.basis.base.shape, problem.field.dx, problem.field.dy)
     gradients, of_others = expansion.random_gradients()
     modes, curvature = _balanced_units(slopes, mode_curvature(problem, gradients))
-    known = {id(values): np.asarray(term.weight, np.float64) ** 2 for term, values in problem.terms.others(unknowns)}
-
-    def relative(values: Any, *draws: Any) -> Any:
+    others = []
+    for (term, values), *draws in zip(problem.terms.others(unknowns), *map(jax.tree.leaves, of_others), strict=True):
         # Of one kind and one place in each picture, as its light's first angle, or of all texels: few draws tell little more.
         squares = np.mean(np.square(draws, dtype=np.float64), axis=0)
         along = tuple(range(squares.ndim)) if squares.ndim != 2 else 0
-        total = np.broadcast_to(squares.mean(axis=along, keepdims=True), squares.shape) + known[id(values)]
-        return np.asarray(np.maximum(total / curvature, _LEAST_CURVATURE), values.dtype)
-
-    return Units(modes, curvature, jax.tree.map(relative, unknowns.without_modes(), *of_others))
+        total = np.broadcast_to(squares.mean(axis=along, keepdims=True), squares.shape)
+        total = total + np.asarray(term.weight, np.float64) ** 2
+        others.append(np.asarray(np.maximum(total / curvature, _LEAST_CURVATURE), values.dtype))
+    return Units(modes, curvature, jax.tree.unflatten(jax.tree.structure(unknowns.without_modes()), others))
 
 
 def _balanced_units(

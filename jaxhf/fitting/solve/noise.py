@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..model.expansion import Expansion
-from ..model.linearise import changing_pixels
 from ..model.near_inverse import near_inverse, normal_matrix
-from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, PartMatrix, in_row
+from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, Place, in_row
 from ..model.problem import Problem
-from ..model.rows import Place, can_have_rows, first_vertices, part_by_heights
+from ..model.rows import can_have_rows, first_vertices, part_by_heights
 
 _FAR = 6.0  # times the median: four standard deviations of normal errors; what is farther off is not explained
 _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
@@ -165,7 +164,7 @@ def _told(expansion: Expansion, labels: Labels) -> tuple[Int[np.ndarray, " value
     if place is None:
         return np.arange(labels.size), normal_matrix(expansion, np.ones(labels.size))
     rows, values = part_by_heights(expansion, place)
-    matrix = PartMatrix(expansion, np.ones(values.size), rows, place)
+    matrix = NormalMatrix(expansion, np.ones(values.size), rows, place)
     matrix.inverse = near_inverse(matrix)
     return values, matrix
 
@@ -245,18 +244,15 @@ def _values_that_tell(expansion: Expansion) -> Labels:
     than half of the noise, and more than those of half of the pixels.
     """
     problem, found = expansion.problem, []
-    for group, known in zip(problem.groups, expansion.linearised, strict=True):
+    for group, known, informing in zip(problem.groups, expansion.linearised, expansion.informing(), strict=True):
         labels = np.full(group.targets.shape, -1)
-        changing = None if known is None else changing_pixels(known)
-        for position, k in enumerate(group.indices):
-            counted = np.asarray(group.given)[position] > 0
-            if known is not None and changing is not None:
-                shown = counted & changing[position][..., None]
-                if shown.any():
-                    error = np.broadcast_to(np.asarray(known.sampling)[position][..., None], shown.shape)
-                    most = max(np.median(error[shown]), _FINE * problem.noise[k])
-                    counted = shown & (error <= most)
-            labels[position][counted] = k
+        for position, (k, told) in enumerate(zip(group.indices, informing, strict=True)):
+            if not told.any():
+                told = np.asarray(group.given)[position] > 0
+            elif known is not None:
+                error = np.broadcast_to(np.asarray(known.sampling)[position][..., None], told.shape)
+                told = told & (error <= max(np.median(error[told]), _FINE * problem.noise[k]))
+            labels[position][told] = k
         found.append(labels)
     return in_row(found).astype(int)
 
@@ -291,6 +287,5 @@ def _weights(problem: Problem) -> Float[np.ndarray, " rows"]:
 
 def _pictures(problem: Problem) -> Labels:
     """The number of its picture, for each value."""
-    groups = problem.groups
-    numbers = [np.broadcast_to(np.reshape(group.indices, (-1, 1, 1, 1)), group.targets.shape) for group in groups]
-    return in_row(numbers).astype(int)
+    numbers = np.arange(problem.count)
+    return in_row([np.broadcast_to(group.each(numbers), group.targets.shape) for group in problem.groups]).astype(int)
