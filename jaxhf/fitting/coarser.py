@@ -14,7 +14,7 @@ from ..scene.camera import Camera, Perspective
 from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
 from .given import Given, Prior
-from .model.surface import resample
+from .model.surface import interpolation, resample
 
 _FACTOR = 4  # between levels: a sixteenth of the work
 _MOST_SAMPLES = 2**21  # of all pictures, with which steps take about as long as it takes to compile another level
@@ -102,10 +102,7 @@ def _overlap(n: int, count: int, factor: int) -> Float[np.ndarray, "count n"]:
 
 def _reduced(heights: Float[np.ndarray, "ny nx"], shape: tuple[int, ...]) -> Float[np.ndarray, "my mx"]:
     """Means of heights by the weights that a bilinear surface through fewer vertices would give these."""
-    for axis, count in enumerate(shape):
-        n = heights.shape[axis]
-        at = np.arange(n) * ((count - 1) / (n - 1))
-        weights = np.maximum(1 - np.abs(at[None, :] - np.arange(count)[:, None]), 0)
-        weights /= weights.sum(axis=1, keepdims=True)
-        heights = np.moveaxis(np.tensordot(weights, heights, (1, axis)), 0, axis)
+    for count in shape:
+        weights = interpolation(np.linspace(0, count - 1, len(heights)), count).T
+        heights = (weights @ heights / weights.sum(axis=1)[:, None]).T
     return heights

@@ -19,7 +19,6 @@ import jaxhf
 from jaxhf.fitting import coarser as _coarser, fit as _fit
 from jaxhf.fitting.model.expansion import Expansion, found_scenes
 from jaxhf.fitting.model.problem import make_problem
-from jaxhf.fitting.model.units import Units
 from jaxhf.fitting.solve import run as _run, steps as _steps
 from jaxhf.fitting.solve.state import fingerprint as state_fingerprint
 from jaxhf.fitting.solve.steps import Outcome
@@ -217,9 +216,9 @@ def without_pictures(setattr: Callable[..., None]) -> None:
     setattr(_fit, "judged", judged_as_it_is)
 
 
-def units_of_one(expansion: Expansion) -> Units:
+def units_of_one(expansion: Expansion) -> tuple[np.ndarray, float, Any]:
     others = jax.tree.map(np.ones_like, expansion.unknowns.without_modes())
-    return Units(np.ones(expansion.problem.basis.base.shape), 1.0, others)
+    return np.ones(expansion.problem.basis.base.shape), 1.0, others
 
 
 def judged_as_it_is(ended, problems, scenes, targets, given, report) -> jaxhf.Fit:

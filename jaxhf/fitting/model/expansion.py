@@ -13,21 +13,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ...rendering.render import render_each
-from ...scene.material import Matte
 from ...scene.scene import Scene
-from ...scene.texture import ImageTexture
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device
-from .linearise import Linearised, can_be_linearised, changing_pixels, linearise_each, picture_each
-from .pictures import Group
+from .linearise import Linearised, can_be_linearised, changing_pixels, linearise_each, moved_each, picture_each
+from .pictures import Group, with_albedo
 from .problem import Problem
 from .robust import soften
 from .surface import Basis, Unknowns
-from .view import View, moved
+from .view import View
 
 Rows = list[Float[Array, "_ _ _ _"]]
 """A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""
@@ -40,7 +37,6 @@ class Expansion(eqx.Module):
     """A problem about some unknowns.
 
     Attributes:
-      problem, unknowns: these.
       linearised: the pictures of each group with their derivatives; None: there are none such, see `can_be_linearised`.
     """
 
@@ -150,15 +146,8 @@ def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Pro
     def of(group: Group) -> Linearised | None:
         if not can_be_linearised(group.scenes, problem.settings):
             return None
-        return linearise_each(
-            group.scenes,
-            completion(unknowns, group, heights),
-            problem.settings,
-            problem.mesh,
-            group.targets.shape[-1],
-            _moves(unknowns, problem, group),
-            unknowns.albedo,
-        )
+        moves = _moves(unknowns, problem, group)
+        return linearise_each(group, heights, problem.settings, problem.mesh, moves, unknowns.albedo)
 
     return on_every_device(tuple(map(of, problem.groups)), problem.mesh)
 
@@ -201,12 +190,12 @@ def _simulate(
     """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
     images = []
     for group, known in zip(problem.groups, linearised, strict=True):
-        change = completion(unknowns, group, heights)
         if known is not None:
             moves = _moves(unknowns, problem, group)
-            image = picture_each(known, group.scenes, change, problem.settings, problem.mesh, moves, unknowns.albedo)
+            image = picture_each(known, group, heights, problem.settings, problem.mesh, moves, unknowns.albedo)
         else:
-            image = render_each(_views(unknowns, problem, group), change, problem.settings, problem.mesh)
+            complete = functools.partial(group.complete, heights=heights, factors=unknowns.albedo)
+            image = render_each(_views(unknowns, problem, group), complete, problem.settings, problem.mesh)
             if group.targets.shape[-1] == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
         if unknowns.exposures is not None:
@@ -225,34 +214,7 @@ def _moves(unknowns: Unknowns, problem: Problem, group: Group) -> View:
 
 def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
     """`group.scenes` under the lights and from the cameras that are sought."""
-    moves = _moves(unknowns, problem, group)
-    if not jax.tree.leaves(moves):
-        return group.scenes
-    found = lax.map(lambda seen: moved(*seen), (group.scenes.lights, group.scenes.camera, moves))
-    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, found)
-
-
-def completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
-    """Makes the scene of one picture from its own leaves, those that the group shares, these heights and the unknowns."""
-
-    def complete(scene: Scene) -> Scene:
-        scene = group.complete(scene, heights)
-        return scene if unknowns.albedo is None else _with_albedo(scene, unknowns.albedo)
-
-    return complete
-
-
-def _with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
-    """The scene with the albedo of its first heightfield multiplied."""
-    k = scene.first_heightfield
-    material = scene.objects[k].material
-    assert isinstance(material, Matte)
-    old = material.albedo
-    texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.asarray(old).reshape(1, 1, 3))
-    shape = (*(max(pair) for pair in zip(texture.texels.shape[:2], factor.shape[:2], strict=True)), 3)
-    new = jnp.broadcast_to(texture.texels, shape) * jnp.broadcast_to(factor, shape)
-    albedo = new.reshape(3) if shape[:2] == (1, 1) and texture is not old else dataclasses.replace(texture, texels=new)
-    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
+    return moved_each(group.scenes, _moves(unknowns, problem, group))
 
 
 def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:
@@ -264,7 +226,7 @@ def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) 
         for n, k in enumerate(group.indices):
             scene = scenes[k].with_heights(heights)
             if unknowns.albedo is not None:
-                scene = _with_albedo(scene, unknowns.albedo)
+                scene = with_albedo(scene, unknowns.albedo)
             if jax.tree.leaves(unknowns.view):
                 given = scene.lights, scene.camera
                 lights, camera = jax.tree.map(lambda leaf, more, n=n: np.asarray(leaf) + more[n], given, change)

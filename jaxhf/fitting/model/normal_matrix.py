@@ -71,8 +71,8 @@ class NormalMatrix:
             self.spectrum = scipy.ndimage.map_coordinates(self.spectrum, at, order=1, mode="nearest")
             self.inside, sought, besides = np.arange(self.off.size), (), []
         others, self.unflat = jax.flatten_util.ravel_pytree(sought)
-        self.others_weight = _joined([np.broadcast_to(np.asarray(term.weight), values.shape) for term, values in besides])
-        self.others_off = _joined([np.asarray(term.residual(values)) for term, values in besides])
+        self.others_weight = in_row([np.broadcast_to(np.asarray(term.weight), values.shape) for term, values in besides])
+        self.others_off = in_row([np.asarray(term.residual(values)) for term, values in besides])
         self.size, self.columns = self.off.size + others.size, None
         if rows is not None and others.size <= MOST_OTHERS:
             each = [self._by_jax(np.zeros(self.shape), one) for one in np.eye(others.size)]
@@ -173,13 +173,9 @@ class NormalMatrix:
         return np.concatenate([fft.idctn(squares * fft.dctn(surface, norm="ortho"), norm="ortho").ravel(), others])
 
 
-def _joined(parts: list[Any]) -> Float[np.ndarray, " k"]:
-    return np.concatenate([np.zeros(0), *(np.asarray(part, np.float64).ravel() for part in parts)])
-
-
 def in_row(rows: Sequence[Any]) -> Float[np.ndarray, " rows"]:
     """All values of all pictures, one after the other."""
-    return np.concatenate([np.asarray(part, np.float64).ravel() for part in rows])
+    return np.concatenate([np.zeros(0), *(np.asarray(part, np.float64).ravel() for part in rows)])
 
 
 def in_groups(row: np.ndarray, expansion: Expansion) -> list[Any]:

@@ -1,5 +1,6 @@
 """The pictures of a fit, checked and gathered into those that one program renders."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +16,9 @@ from ...core.precision import numbers
 from ...core.settings import Settings
 from ...preparation.localise import localise
 from ...preparation.world import resolve_settings
+from ...scene.material import Matte
 from ...scene.scene import Scene
+from ...scene.texture import ImageTexture
 
 
 class Group(eqx.Module):
@@ -42,9 +45,10 @@ class Group(eqx.Module):
         stack = np.stack if isinstance(values, np.ndarray) else jnp.stack
         return stack([values[k] for k in self.indices]).reshape(-1, 1, 1, 1)
 
-    def complete(self, scene: Scene, heights: Float[Array, "ny nx"]) -> Scene:
-        """One picture's leaves of `scenes`, with those that are shared and these heights."""
-        return _with_heights(eqx.combine(scene, self.shared), heights)
+    def complete(self, scene: Scene, heights: Float[Array, "ny nx"], factors: Float[Array, "ty tx c"] | None = None) -> Scene:
+        """One picture's leaves of `scenes`, with those that are shared, these heights, and an albedo times these factors."""
+        scene = _with_heights(eqx.combine(scene, self.shared), heights)
+        return scene if factors is None else with_albedo(scene, factors)
 
 
 def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> None:
@@ -110,6 +114,19 @@ def make_groups(
 def _with_heights(scene: Scene, heights: Array | None) -> Scene:
     """`scene` over other heights of its first heightfield; None where they are to be filled in later."""
     return eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights, is_leaf=lambda leaf: leaf is None)
+
+
+def with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
+    """The scene with the albedo of its first heightfield multiplied."""
+    k = scene.first_heightfield
+    material = scene.objects[k].material
+    assert isinstance(material, Matte)
+    old = material.albedo
+    texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.asarray(old).reshape(1, 1, 3))
+    shape = (*(max(pair) for pair in zip(texture.texels.shape[:2], factor.shape[:2], strict=True)), 3)
+    new = jnp.broadcast_to(texture.texels, shape) * jnp.broadcast_to(factor, shape)
+    albedo = new.reshape(3) if shape[:2] == (1, 1) and texture is not old else dataclasses.replace(texture, texels=new)
+    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
 
 
 def _stacked(scenes: Sequence[Scene]) -> tuple[Scene, Scene]:

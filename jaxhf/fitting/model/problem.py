@@ -150,6 +150,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
     brightness, view_unit = _brightness(targets), _view_unit(scenes, given.unknown)
     terms = make_terms(field, given.prior, given.unknown, base, free, view_unit)
     groups = make_groups(scenes, targets, given.weights, settings)
+    unknowns = _first_unknowns(scenes, basis, max(group.targets.shape[-1] for group in groups), given.unknown, view_unit)
     problem = Problem(
         groups=groups,
         basis=basis,
@@ -160,14 +161,11 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
         bright=jnp.asarray(np.median(brightness), dtype),
         view_unit=view_unit,
         field=Heightfield(field.heights, field.dx, field.dy),  # wherever it stands: other windows then share programs
-        albedo_shape=None,
+        albedo_shape=None if unknowns.albedo is None else unknowns.albedo.shape,
         settings=settings,
         mesh=chosen_mesh("fit", given.mesh),
         known=given.prior is not None,
     ).with_noise(_noise(given.noise, brightness))
-    unknowns = _first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), given.unknown)
-    if unknowns.albedo is not None:
-        problem = dataclasses.replace(problem, albedo_shape=unknowns.albedo.shape)
     return problem.with_edge_samples(problem.edge_samples_for(jnp.asarray(heights, dtype), given.settings)), unknowns
 
 
@@ -238,8 +236,9 @@ def _brightness(targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
     return np.where(np.asarray(bright) > 0, bright, 1.0)
 
 
-def _first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, unknown: Unknown) -> Unknowns:
+def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknown: Unknown, view_unit: View) -> Unknowns:
     """Those from which a fit starts: coefficients 0, the albedo, lights and cameras of the scenes, exposure 1 and offset 0."""
+    scene, count = scenes[0], len(scenes)
     shape, dtype, albedo = scene.heights.shape, scene.heights.dtype, None
     if unknown.albedo is not None:
         material = scene.objects[scene.first_heightfield].material
@@ -253,8 +252,5 @@ def _first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, unkno
         albedo,
         jnp.ones(count, dtype) if unknown.exposures else None,
         jnp.zeros(count, dtype) if unknown.offsets else None,
-        View(
-            None if unknown.light_std is None else jnp.zeros((count, 2), dtype),
-            None if unknown.camera_std is None else jnp.zeros((count, 6), dtype),
-        ),
+        jax.tree.map(lambda unit: jnp.zeros((count, unit.size), dtype), view_unit),
     )

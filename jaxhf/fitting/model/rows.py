@@ -23,7 +23,7 @@ from ...scene.heightfield import Heightfield
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, on_host
-from .expansion import Expansion, completion
+from .expansion import Expansion
 from .linearise import vertex_values
 from .normal_matrix import Place
 from .pictures import Group
@@ -149,7 +149,7 @@ def _slopes(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem
         first = jax.tree.map(lambda leaf: leaf[0], group.scenes)
 
         def values(heights: Array, group: Group = group, scene: Scene = first) -> Array:
-            return vertex_values(make_world(completion(unknowns, group, heights)(scene), problem.settings))
+            return vertex_values(make_world(group.complete(scene, heights, unknowns.albedo), problem.settings))
 
         _, change = jax.linearize(values, heights)
         slopes.append(lax.map(lambda k, change=change: change((phase == k).astype(heights.dtype)), jnp.arange(_REACH**2)))

@@ -76,16 +76,14 @@ def explains_noise(problem: Problem) -> bool:
 
 
 class Restricted:
-    """Restricted maximum likelihood about an expansion: the noise of pictures, and how much of it heights explain.
+    """Restricted maximum likelihood about an expansion, all of whose modes are varied: the noise of pictures, and how much of
+    it heights explain.
 
     Residuals r of a picture with n values have |r|² = σ² (n - tr A), A the hat matrix (Patterson and Thompson, Biometrika 58,
     545, 1971; Harville, JASA 72, 320, 1977). The trace is that of simulated fits: what they leave of noise. The prior decides
     how much of the noise heights explain, and is seldom quite the terrain's (Wahba, Annals of Statistics 13, 1378, 1985), so
     the deviations of its modes are estimated too, octave by octave: τ² = |u|² / g, u the modes in units of the prior, g how
     many of them the pictures tell. All that is in the linear model about the expansion.
-
-    Args:
-      expansion: where the fit stands, all modes varied.
     """
 
     def __init__(self, expansion: Expansion):

@@ -230,6 +230,6 @@ def _with_all_modes(state: State, here: Expansion, problems: Sequence[Problem], 
     if stages(problems)[state.stage].level < len(problems) - 1:
         state = on_finer(state, problems, len(problems) - 1, given)
         here = expand(state.unknowns, state.posed(finest, 1.0)).with_noise(state.noise)
-    units = balanced(here).modes if units is None else units
+    units = balanced(here)[0] if units is None else units
     basis = make_basis(finest.field, np.asarray(surface_of(state.unknowns, here.problem.basis)), units, 1.0, finest.basis.free)
     return dataclasses.replace(here.of(dataclasses.replace(here.problem, basis=basis)), unknowns=state.unknowns.at_base())

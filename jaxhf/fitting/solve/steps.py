@@ -159,7 +159,6 @@ def advance(
     Args:
       unknowns, position: of the step before. What the state holds of J makes room for that of the new one: it is gone.
       expansion: at `position.y_eval`.
-      others: see `ConjugateGradients`.
       rejections: how many steps before were rejected in a row.
     """
     solver = LevenbergMarquardt(rejections, others)

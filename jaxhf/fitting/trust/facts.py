@@ -252,7 +252,6 @@ def why_noise_is_unsure(problem: Problem, unknowns: int, freedom: Freedom | None
     """Why an estimate of the noise may be too small, in words; None: it is sure.
 
     Args:
-      problem: of the fit.
       unknowns: how many numbers were sought.
       freedom: None: it is not known.
     """
@@ -278,7 +277,6 @@ def chi_squared(
     and Weisberg, Residuals and influence in regression, 1982, section 2.2).
 
     Args:
-      problem: of the fit.
       residuals: in units of the noise, picture after picture.
       counts: how many of them each picture has.
       freedom: None: heights are few, and explain nothing of the noise.

@@ -99,28 +99,20 @@ def widened(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 
 
 class Findings(NamedTuple):
-    """What `warnings` are made from.
+    """What `warnings` are made from; texts and numbers are None where there is nothing to be said, or none were asked for.
 
     Attributes:
-      result: why the fit stopped.
-      chi2: see `Fit.stats`.
       noise_given: whether the noise is the user's, not estimated.
-      where: see `where_residuals_are`.
-      regions: see `worst_regions`.
-      unlike_noise: what is left although it is no noise, in words; None: nothing.
-      channels: which channels are hardly more than one measurement, in words; None: none.
+      channels: which channels are hardly more than one measurement.
       help: what to try where the pictures are not explained.
-      strayed: root mean square of (heights - prior) / std over the heights that are seen; None: no prior.
       seen: which heights the pictures show.
-      mean_shown: whether pictures change as all heights move up together.
       noise_share: the least noise of a picture over its brightness.
       lights: how many directions light comes from, over all pictures.
-      scaled: by what the noise was multiplied for the standard deviations; None: there are none.
-      displaced: by how much boundaries may be, height units, and what that multiplies the deviations by; None: as `scaled`.
-      draws: asked for, made; (0, 0): none were asked for.
-      parts: the deviations of the mean height and of the heights about it; None: as `scaled`.
-      unsure_noise: why the noise that was estimated may be too small, in words; None: it was given, or is sure.
-      length: how the prior's correlation length does not fit, in words; None: it does.
+      scaled: by what the noise was multiplied for the standard deviations.
+      displaced: by how much boundaries may be, height units, and what that multiplies the deviations by.
+      draws: asked for, made.
+      parts: the deviations of the mean height and of the heights about it.
+      unsure_noise, length: why the estimated noise may be too small; how the prior's correlation length does not fit.
     """
 
     result: Stop
