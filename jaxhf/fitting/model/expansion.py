@@ -48,18 +48,14 @@ class Expansion(eqx.Module):
     def heights(self) -> Float[Array, "ny nx"]:
         return self.problem.basis.heights(self.unknowns.coefficients)
 
-    @property
-    def sampling(self) -> list[Float[np.ndarray, "n h w"] | None]:
-        """The error of each pixel's samples, radiance."""
-        return [None if known is None else np.asarray(known.sampling) for known in self.linearised]
-
     def of(self, problem: Problem) -> "Expansion":
         """The same pictures in a problem that differs in noise, priors or basis alone."""
         return dataclasses.replace(self, problem=problem)
 
     def with_noise(self, noise: Float[np.ndarray, " pictures"]) -> "Expansion":
         """The same with another standard deviation of each picture's values at weight 1, beside the error of their samples."""
-        return self.of(self.problem.with_noise(noise, self.sampling))
+        sampling = [None if known is None else np.asarray(known.sampling) for known in self.linearised]
+        return self.of(self.problem.with_noise(noise, sampling))
 
     def pictures(self) -> Rows:
         """As they would be measured."""
@@ -105,9 +101,7 @@ def expand(unknowns: Unknowns, problem: Problem) -> Expansion:
     """The problem about these unknowns: its pictures are rendered here, by one program."""
     # What enters a compiled program must lie in the same places each time, or it is compiled again for the other ones.
     unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
-    heights = _heights(unknowns, problem.basis)
-    still = unknowns.without_modes()
-    return Expansion(problem, unknowns, _linearised(heights, still, problem))
+    return Expansion(problem, unknowns, _linearised(unknowns, problem))
 
 
 def residuals(unknowns: Unknowns, about: tuple[Problem, tuple[Linearised | None, ...]]) -> tuple[Any, None]:
@@ -132,17 +126,14 @@ def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
 
 @eqx.filter_jit
 def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
-    """The heights with their padding, from one program, so that they can be compared bit for bit."""
+    """The heights with their padding, by one program."""
     return basis.surface(unknowns.coefficients)
 
 
-@eqx.filter_jit
-def _heights(unknowns: Unknowns, basis: Basis) -> Float[Array, "ny nx"]:
-    return basis.heights(unknowns.coefficients)
-
-
 @functools.partial(compiled, jit=eqx.filter_jit)
-def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
+def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
+    heights = problem.basis.heights(unknowns.coefficients)
+
     def of(group: Group) -> Linearised | None:
         if not can_be_linearised(group.scenes, problem.settings):
             return None
@@ -219,7 +210,7 @@ def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
 
 def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:
     """The scenes as they were given, with all that was found; positions keep double precision."""
-    heights, found = _heights(unknowns, problem.basis), list(scenes)
+    heights, found = problem.basis.crop(surface_of(unknowns, problem.basis)), list(scenes)
     for group in problem.groups:
         new, old = ((part.lights, part.camera) for part in (_views(unknowns, problem, group), group.scenes))
         change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)

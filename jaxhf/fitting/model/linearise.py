@@ -202,7 +202,8 @@ def picture_each(
     view: View,
     factors: Float[jax.Array, "ty tx k"] | None,
 ) -> Float[jax.Array, "n h w c"]:
-    """The pictures that are known, with their derivatives in all arguments of `linearise_each`, which had the same values."""
+    """The pictures that are known, with their derivatives in the heights, in what moves lights and cameras, and in the albedo's
+    factors, whose values must be those at which `linearise_each` was called."""
 
     def values(scene: Scene) -> Float[jax.Array, "vertices n"]:
         return vertex_values(make_world(on_every_device(group.complete(scene, heights, factors), mesh), settings))

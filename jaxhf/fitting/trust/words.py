@@ -1,9 +1,10 @@
 """What a fit says about its result: where the pictures are left unexplained, and what its heights cannot be trusted for."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.ndimage
 from jaxtyping import Bool, Float
 
 from ..history import Stop
@@ -15,6 +16,9 @@ _NOISY = 0.1  # of the brightness
 _REGIONS = 3
 _BLOCKS = 16  # along a picture's longer side
 _LEAST_BLOCK = 4  # pixels
+_AROUND = np.ones((3, 3))  # a pixel and its eight neighbours
+
+ndimage: Any = scipy.ndimage  # whose stubs miss much
 
 
 class Region(NamedTuple):
@@ -75,11 +79,11 @@ def where_residuals_are(residuals: Sequence[Float[np.ndarray, "h w c"]], places:
     total = at_silhouettes = at_shadows = 0.0
     for residual, place in zip(residuals, places, strict=True):
         squares = np.sum(np.square(residual, dtype=np.float64), axis=-1)
-        near = widened(place.silhouettes)
+        near = ndimage.binary_dilation(place.silhouettes, _AROUND)
         total += float(squares.sum())
         at_silhouettes += float(squares[near].sum())
         if place.shadows is not None:
-            at_shadows += float(squares[widened(place.shadows) & ~near].sum())
+            at_shadows += float(squares[ndimage.binary_dilation(place.shadows, _AROUND) & ~near].sum())
     if total == 0:
         return "they are all 0"
     rest = f"{(total - at_silhouettes - at_shadows) / total:.0%} elsewhere"
@@ -89,13 +93,6 @@ def where_residuals_are(residuals: Sequence[Float[np.ndarray, "h w c"]], places:
         f"{at_silhouettes / total:.0%} of their squares lie at the terrain's border and silhouettes, "
         f"{at_shadows / total:.0%} at the edges of shadows, {rest}"
     )
-
-
-def widened(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The pixels of a mask with their eight neighbours."""
-    padded = np.pad(mask, 1)
-    h, w = mask.shape
-    return np.any([padded[y : y + h, x : x + w] for y in range(3) for x in range(3)], axis=0)
 
 
 class Findings(NamedTuple):
