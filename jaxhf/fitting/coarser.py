@@ -14,8 +14,7 @@ from ..scene.camera import Camera, Perspective
 from ..scene.heightfield import Heightfield
 from ..scene.scene import Scene
 from .given import Given, Prior
-from .model.pictures import weights_of
-from .model.surface import resample
+from .model.surface import interpolation, resample
 
 _FACTOR = 4  # between levels: a sixteenth of the work
 _MOST_SAMPLES = 2**21  # of all pictures, with which steps take about as long as it takes to compile another level
@@ -46,10 +45,9 @@ def coarser(
         array = np.asarray(numbers(values), np.float64)
         return array if array.ndim == 0 else _reduced(resample(array, old.heights.shape), shape)
 
-    pictures = [
-        _coarser_picture(scene.camera, target, weight, factor)
-        for scene, target, weight in zip(scenes, targets, weights_of(scenes, targets, given.weights), strict=True)
-    ]
+    assert given.weights is not None
+    triples = zip(scenes, targets, given.weights, strict=True)
+    pictures = [_coarser_picture(scene.camera, target, weight, factor) for scene, target, weight in triples]
     prior = given.prior
     if prior is not None:
         cell = factor * max(old.dx, old.dy)
@@ -89,7 +87,7 @@ def _coarser_picture(
     def summed(values: np.ndarray) -> np.ndarray:
         return np.einsum("ih,jw,hwc->ijc", rows, columns, values, optimize=True)
 
-    shaped = target.reshape(*target.shape[:2], -1)
+    shaped, weight = (values.reshape(*target.shape[:2], -1) for values in (target, weight))
     told = summed(weight**2)
     mean = summed(weight**2 * np.where(weight > 0, shaped, 0)) / np.where(told > 0, told, 1)
     return camera, mean.reshape(height, width, *target.shape[2:]), np.sqrt(told).reshape(height, width, *target.shape[2:])
@@ -104,10 +102,7 @@ def _overlap(n: int, count: int, factor: int) -> Float[np.ndarray, "count n"]:
 
 def _reduced(heights: Float[np.ndarray, "ny nx"], shape: tuple[int, ...]) -> Float[np.ndarray, "my mx"]:
     """Means of heights by the weights that a bilinear surface through fewer vertices would give these."""
-    for axis, count in enumerate(shape):
-        n = heights.shape[axis]
-        at = np.arange(n) * ((count - 1) / (n - 1))
-        weights = np.maximum(1 - np.abs(at[None, :] - np.arange(count)[:, None]), 0)
-        weights /= weights.sum(axis=1, keepdims=True)
-        heights = np.moveaxis(np.tensordot(weights, heights, (1, axis)), 0, axis)
+    for count in shape:
+        weights = interpolation(np.linspace(0, count - 1, len(heights)), count).T
+        heights = (weights @ heights / weights.sum(axis=1)[:, None]).T
     return heights

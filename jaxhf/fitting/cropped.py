@@ -74,12 +74,8 @@ def cropped(
 ) -> list[Seen]:
     """What the pictures show of a window of a terrain.
 
-    Args:
-      scenes: of the whole terrain.
-      targets, weights: of each, as `fit` takes them, a weight for each value.
-      terrain: its heights as far as they are known.
-      deviation: the largest standard deviation of these.
-      window: which heights are sought.
+    Scenes, targets and weights are those of the whole terrain, a weight for each value; `terrain`: its heights as far as they
+    are known; `deviation`: the largest standard deviation of these.
     """
     fields = _fields(scenes[0].heightfields[0], terrain, window)
     parts = [_with_surroundings(scene, *fields, window) for scene in scenes]

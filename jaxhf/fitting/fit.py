@@ -6,75 +6,23 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Bool, Float
 
 from ..core.errors import ArgumentError, kind_of
 from ..core.settings import Settings
-from ..core.types import AnyArray
 from ..scene.scene import Scene
 from ..xla.devices import automatic_axes, on_every_device, takes_numbers
 from .coarser import coarser, factors
 from .given import Checkpoint, Given, Prior, Unknown
-from .history import Draws, Step, Stop, printed_progress
-from .model.expansion import found_scenes
-from .model.pictures import masked_targets
+from .history import Draws, Step, printed_progress
+from .model.pictures import checked_pictures
 from .model.problem import Problem, make_problem
 from .model.surface import Unknowns
 from .solve.run import Ended, run
 from .solve.stages import steps_to_come
 from .solve.state import State, fingerprint, first_state, load_state, save_state
-from .trust.judge import judged
-from .trust.words import Region
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Fit:
-    """What `fit` found.
-
-    Attributes:
-      heights: shape (ny, nx), in the dtype of the scenes' heights.
-      result: why it stopped.
-      std: standard deviation of each height, shape (ny, nx); infinite where nothing says anything about it. None where no
-        draws were asked for.
-      samples: terrains that pictures and prior allow, one for each draw, shape (draws, ny, nx): what is derived from each, a
-        slope or a volume, varies as it is unsure. None as `std`.
-      seen: whether a change of the height would change any picture, shape (ny, nx).
-      albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c); None where it was known.
-      exposures, offsets: of each picture; None where they were known.
-      noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated.
-      scenes: as they were given, with all that was found: heights, albedo, lights and cameras.
-      settings: those that were given, with all that was chosen: `render` with them makes `images` of `scenes`, but for the
-        pixels that a boundary crosses, which have more samples in a fit.
-      images: the pictures as they would be measured, (h, w) or (h, w, c) each, as their targets.
-      residuals: `images` - targets; 0 where a target has no weight.
-      regions: the three blocks of the pictures with the largest residuals.
-      warnings: what speaks against trusting the heights, a sentence each; empty where nothing does.
-      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals, by degree of freedom, in units of
-        `noise` and the error of their samples, without a background that is explained: about 1 where `noise` is right and all
-        is explained.
-      history: a `Step` for each step.
-    """
-
-    heights: Float[AnyArray, "ny nx"]
-    result: Stop
-    std: Float[np.ndarray, "ny nx"] | None
-    samples: Float[np.ndarray, "draws ny nx"] | None
-    seen: Bool[np.ndarray, "ny nx"]
-    albedo: Float[AnyArray, "ty tx c"] | None
-    exposures: Float[AnyArray, " pictures"] | None
-    offsets: Float[AnyArray, " pictures"] | None
-    noise: Float[np.ndarray, " pictures"]
-    scenes: tuple[Scene, ...]
-    settings: Settings
-    images: tuple[np.ndarray, ...]
-    residuals: tuple[np.ndarray, ...]
-    regions: tuple[Region, ...]
-    warnings: tuple[str, ...]
-    stats: dict[str, int | float]
-    history: tuple[Step, ...]
+from .trust.judge import Fit, judged
 
 
 @takes_numbers
@@ -154,7 +102,8 @@ def fit(
 
 
 def _found(scenes: tuple[Scene, ...], targets: tuple[Any, ...], given: Given) -> Fit:
-    targets = masked_targets(scenes, targets, given.weights)
+    targets, weights = checked_pictures(scenes, targets, given.weights)
+    given = dataclasses.replace(given, weights=weights)
     problem, unknowns = make_problem(scenes, targets, given)
     levels = factors(scenes, problem.settings.samples or 1)
     coarse = [make_problem(*coarser(scenes, targets, given, factor)) for factor in levels[:-1]]
@@ -164,34 +113,7 @@ def _found(scenes: tuple[Scene, ...], targets: tuple[Any, ...], given: Given) ->
         raise ArgumentError("fit", "scenes", "must have float64 heights where JAX's x64 mode is on, theirs are float32")
     report = printed_progress() if given.progress is True else given.progress or None
     ended = _run(problems, unknowns, given, report)
-    judgement = judged(ended, problems, given, report)
-    expansion, state = judgement.expansion, ended.state
-    found = expansion.unknowns
-    return Fit(
-        heights=jnp.asarray(problem.basis.crop(np.asarray(expansion.problem.basis.base))),
-        result=ended.stop,
-        std=judgement.std,
-        samples=judgement.samples,
-        seen=judgement.seen,
-        albedo=found.albedo,
-        exposures=found.exposures,
-        offsets=None if found.offsets is None else found.offsets * problem.bright,
-        noise=expansion.problem.noise,
-        scenes=found_scenes(scenes, found, expansion.problem),
-        settings=expansion.problem.settings,
-        images=tuple(map(_in_shape, judgement.images, map(np.shape, targets))),
-        residuals=tuple(map(_in_shape, judgement.residuals, map(np.shape, targets))),
-        regions=judgement.regions,
-        warnings=judgement.warnings,
-        stats={
-            "steps": len(state.history),
-            "accepted": sum(step.accepted for step in state.history),
-            "seconds": state.seconds,
-            "loss": state.loss,
-            "chi2": judgement.chi2,
-        },
-        history=state.history,
-    )
+    return judged(ended, problems, scenes, targets, given, report)
 
 
 def _run(problems: Sequence[Problem], unknowns: Unknowns, given: Given, report: Callable[[Step | Draws], None] | None) -> Ended:
@@ -221,8 +143,3 @@ def _run(problems: Sequence[Problem], unknowns: Unknowns, given: Given, report: 
     finally:
         keep()  # what comes now, standard deviations, may take long
     return ended
-
-
-def _in_shape(image: Float[np.ndarray, "h w c"], shape: tuple[int, ...]) -> np.ndarray:
-    """An image in the shape of its target; a grey one that was given with three channels is compared as one."""
-    return np.broadcast_to(image, (*image.shape[:2], *shape[2:])).copy() if len(shape) == 3 else image[..., 0]

@@ -125,11 +125,7 @@ class Checkpoint:
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class Given:
-    """The keyword arguments of `fit`, which documents them; checked without scenes and targets.
-
-    Raises:
-      ValueError: a value is none of its choices, or out of range.
-    """
+    """The keyword arguments of `fit`, which documents them; checked without scenes and targets."""
 
     prior: Prior | None
     unknown: Unknown

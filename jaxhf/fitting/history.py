@@ -1,5 +1,6 @@
 """What a fit says of its steps, and why it stopped."""
 
+import collections
 import enum
 import sys
 from collections.abc import Callable
@@ -55,18 +56,17 @@ class Draws(NamedTuple):
 
 
 class Pace:
-    """How long steps take, by when the last few of them ended."""
+    """How long steps take, by when the last few of them ended.
+
+    `begin`: when the first step began; None: how long that took, compilation above all, says nothing.
+    """
 
     def __init__(self, begin: float | None = None):
-        """
-        Args:
-          begin: when the first step began; None: how long that took, compilation above all, says nothing.
-        """
-        self._ends = [] if begin is None else [begin]
+        self._ends = collections.deque([] if begin is None else [begin], maxlen=6)
 
     def remaining(self, end: float, to_come: int | None) -> float | None:
         """The seconds that so many steps will take after one that ended now; None: not known."""
-        self._ends = [*self._ends, end][-6:]
+        self._ends.append(end)
         steps = len(self._ends) - 1
         return None if steps < 1 or to_come is None else (self._ends[-1] - self._ends[0]) / steps * to_come
 

@@ -18,15 +18,17 @@ from ..io.checkpoint import load_arrays, load_facts_of, save_checkpoint
 from ..preparation.localise import localise
 from ..scene.scene import Scene
 from .cropped import Seen, Window, cropped
-from .fit import Fit, fit
+from .fit import fit
 from .given import Checkpoint, Prior
 from .history import Draws, Step
 from .model.defaults import EDGE_SAMPLES, choose_edge_samples, choose_samples
-from .model.pictures import masked_targets, weights_of
+from .model.pictures import checked_pictures
 from .model.surface import make_heights
 from .solve.state import digest
+from .trust.judge import Fit
 
 _LEAST_WINDOW, _LEAST_OVERLAP = 32, 8  # heights: the outermost four or so of a window are hardly told by its pictures
+_ARRAYS = ("heights", "std", "seen")  # of a terrain while it is found: float64, and a mask
 
 
 class Fitted(NamedTuple):
@@ -72,16 +74,6 @@ class Mosaic:
     windows: tuple[Fitted, ...]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Terrain:
-    """The terrain while it is found: float64, but for two masks; `done`: where a window was fitted."""
-
-    heights: Float[np.ndarray, "ny nx"]
-    std: Float[np.ndarray, "ny nx"]
-    seen: Bool[np.ndarray, "ny nx"]
-    done: Bool[np.ndarray, "ny nx"]
-
-
 def fit_windows(
     scenes: Sequence[Scene],
     targets: Sequence[Any],
@@ -123,7 +115,7 @@ def fit_windows(
       ValueError: as by `fit`, and a checkpoint of another terrain.
     """
     scenes, targets = tuple(scenes), tuple(targets)
-    targets, weights = masked_targets(scenes, targets, weights), weights_of(scenes, targets, weights)
+    targets, weights = checked_pictures(scenes, targets, weights)
     field = scenes[0].heightfields[0]
     shape = field.heights.shape
     if not isinstance(prior, Prior):
@@ -136,25 +128,23 @@ def fit_windows(
     mean, std = (make_heights("Prior", name, getattr(prior, name), field) for name in ("heights", "std"))
     known = Prior(mean, std, prior.length)
     begin = make_heights("fit", "start", field.heights if start is None else start, field)
-    state = _Terrain(np.where(std > 0, begin, mean), std.copy(), np.zeros(shape, bool), std == 0)
-    order, fitted = divided(shape, window, overlap), ()
+    terrain = Mosaic(np.where(std > 0, begin, mean), std.copy(), np.zeros(shape, bool), ())
+    order = divided(shape, window, overlap)
     options = {**options, "settings": _settings(scenes, options.get("settings") or Settings(), len(order))}
     path = None if checkpoint is None else Path(checkpoint.path)
     values = scenes, targets, weights, mean, std, begin, noise
     choices = prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)
     name = digest(choices, values)
     if path is not None and path.exists():
-        state, fitted = _load(path, state, name)
-    for number in range(len(fitted), len(order)):
+        terrain = _load(path, terrain, name)
+    for number in range(len(terrain.windows), len(order)):
         place = order[number]
-        seen = cropped(scenes, targets, weights, state.heights, float(std[place.place].max()), place)
-        found = None
-        if seen:
-            tell = None if progress is None else lambda done, number=number: progress(number, len(order), done)
-            found = _fit(seen, state, known, place, noise, tell or False, options)
+        seen = cropped(scenes, targets, weights, terrain.heights, float(std[place.place].max()), place)
+        tell = None if progress is None else lambda done, number=number: progress(number, len(order), done)
+        found = _fit(seen, terrain, known, place, noise, tell or False, options) if seen else None
         done = Fitted(*place, len(seen))
         if found is not None:
-            state, seam = _joined(state, found, place, overlap)
+            terrain, seam = _joined(terrain, known, found, place, overlap)
             done = done._replace(
                 result=found.result.value,
                 steps=int(found.stats["steps"]),
@@ -163,11 +153,12 @@ def fit_windows(
                 seam=seam,
                 warnings=found.warnings,
             )
-        fitted = (*fitted, done)
+        terrain = dataclasses.replace(terrain, windows=(*terrain.windows, done))
         if path is not None:
-            _save(path, state, fitted, name)
-    deviations = state.std if options.get("draws") else None
-    return Mosaic(state.heights.astype(field.heights.dtype), deviations, state.seen, fitted)
+            facts = {"fingerprint": name, "windows": [list(done) for done in terrain.windows]}
+            save_checkpoint(path, facts, [getattr(terrain, part) for part in _ARRAYS])
+    deviations = terrain.std if options.get("draws") else None
+    return dataclasses.replace(terrain, heights=terrain.heights.astype(field.heights.dtype), std=deviations)
 
 
 def _settings(scenes: Sequence[Scene], settings: Settings, count: int) -> Settings:
@@ -191,7 +182,7 @@ def divided(shape: tuple[int, ...], side: int, overlap: int) -> list[Window]:
 
 
 def _fit(
-    seen: Sequence[Seen], state: _Terrain, prior: Prior, window: Window, noise: Any, progress: Any, options: dict[str, Any]
+    seen: Sequence[Seen], terrain: Mosaic, prior: Prior, window: Window, noise: Any, progress: Any, options: dict[str, Any]
 ) -> Fit | None:
     """The fit of a window; None where all of its heights are held."""
     here = window.place
@@ -200,7 +191,7 @@ def _fit(
     held[:, 0] |= window.x > 0
     if held.all():
         return None
-    known = Prior(np.where(held, state.heights[here], prior.heights[here]), np.where(held, 0, prior.std[here]), prior.length)
+    known = Prior(np.where(held, terrain.heights[here], prior.heights[here]), np.where(held, 0, prior.std[here]), prior.length)
     if noise is not None and np.ndim(noise) == 1:
         noise = numbers(noise)[[part.number for part in seen]]
     return fit(
@@ -209,24 +200,26 @@ def _fit(
     )  # fmt: skip
 
 
-def _joined(state: _Terrain, found: Fit, window: Window, overlap: int) -> tuple[_Terrain, float]:
+def _joined(terrain: Mosaic, prior: Prior, found: Fit, window: Window, overlap: int) -> tuple[Mosaic, float]:
     """The terrain with a window's heights, and the difference in its overlap with those before."""
-    here = window.place
-    done = state.done[here]
+    here, done = window.place, prior.std == 0
+    for before in terrain.windows:
+        if before.result:
+            done[before.y : before.y + before.ny, before.x : before.x + before.nx] = True
+    done = done[here]
     # From 0 at sides in windows before to 1, where these end; what is at the right was fitted in the row before.
     rows = _ramp(window.y > 0, False, window.ny, overlap)
-    columns = _ramp(window.x > 0, window.x + window.nx < state.done.shape[1], window.nx, overlap)
+    columns = _ramp(window.x > 0, window.x + window.nx < terrain.heights.shape[1], window.nx, overlap)
     share = np.where(done, rows[:, None] * columns, 1)
-    heights, std, seen, all_done = (part.copy() for part in (state.heights, state.std, state.seen, state.done))
+    heights, std, seen = (np.array(getattr(terrain, part)) for part in _ARRAYS)
     new = np.asarray(found.heights, np.float64)
-    both = done & found.seen & state.seen[here] & (np.abs(share - 0.5) < 0.25)
+    both = done & found.seen & terrain.seen[here] & (np.abs(share - 0.5) < 0.25)
     seam = float(np.sqrt(np.mean((new - heights[here])[both] ** 2))) if both.any() else math.nan
     heights[here] = (1 - share) * heights[here] + share * new
     if found.std is not None:
         std[here] = (1 - share) * std[here] + share * found.std
     seen[here] |= found.seen
-    all_done[here] = True
-    return _Terrain(heights, std, seen, all_done), seam
+    return Mosaic(heights, std, seen, terrain.windows), seam
 
 
 def _ramp(begins: bool, ends: bool, count: int, overlap: int) -> Float[np.ndarray, " n"]:
@@ -235,11 +228,7 @@ def _ramp(begins: bool, ends: bool, count: int, overlap: int) -> Float[np.ndarra
     return np.minimum(np.minimum(low, high[::-1]) / overlap, 1)
 
 
-def _save(path: Path, state: _Terrain, fitted: Sequence[Fitted], name: str) -> None:
-    save_checkpoint(path, {"fingerprint": name, "windows": [list(done) for done in fitted]}, list(vars(state).values()))
-
-
-def _load(path: Path, like: _Terrain, name: str) -> tuple[_Terrain, tuple[Fitted, ...]]:
-    facts = load_facts_of(path, name)
-    windows = tuple(Fitted._make([*line[:-1], tuple(line[-1])]) for line in facts["windows"])
-    return _Terrain(*load_arrays(path, list(vars(like).values()))), windows
+def _load(path: Path, like: Mosaic, name: str) -> Mosaic:
+    windows = tuple(Fitted._make([*line[:-1], tuple(line[-1])]) for line in load_facts_of(path, name)["windows"])
+    heights, std, seen = load_arrays(path, [getattr(like, part) for part in _ARRAYS])
+    return Mosaic(heights, std, seen, windows)

@@ -11,7 +11,7 @@ import pytest
 import jaxhf
 import jaxhf.mujoco
 from jaxhf.core.types import array_leaf
-from jaxhf.fitting.model.pictures import masked_targets
+from jaxhf.fitting.model.pictures import checked_pictures
 from jaxhf.fitting.model.surface import make_heights
 
 RNG = np.random.default_rng(0)
@@ -61,7 +61,7 @@ MADE = {
     "horizon": (lambda z: jaxhf.horizon(z, 2, dx=1.0), HEIGHTS),
     "hillshade": (lambda z: jaxhf.hillshade(z, 1.0), HEIGHTS),
     "start of a fit": (lambda z: make_heights("fit", "start", z, FIELD), HEIGHTS.astype(np.float64)),
-    "targets and weights of a fit": (lambda image, weight: masked_targets([SCENE], [image], [weight]),
+    "targets and weights of a fit": (lambda image, weight: checked_pictures([SCENE], [image], [weight]),
                                      HEIGHTS.astype(np.float64), HEIGHTS.astype(np.float64)),
 }  # fmt: skip
 

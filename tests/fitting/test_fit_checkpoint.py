@@ -17,9 +17,8 @@ from small_fits import given
 
 import jaxhf
 from jaxhf.fitting import coarser as _coarser, fit as _fit
-from jaxhf.fitting.model.expansion import Expansion
+from jaxhf.fitting.model.expansion import Expansion, found_scenes
 from jaxhf.fitting.model.problem import make_problem
-from jaxhf.fitting.model.units import Units
 from jaxhf.fitting.solve import run as _run, steps as _steps
 from jaxhf.fitting.solve.state import fingerprint as state_fingerprint
 from jaxhf.fitting.solve.steps import Outcome
@@ -217,16 +216,20 @@ def without_pictures(setattr: Callable[..., None]) -> None:
     setattr(_fit, "judged", judged_as_it_is)
 
 
-def units_of_one(expansion: Expansion) -> Units:
+def units_of_one(expansion: Expansion) -> tuple[np.ndarray, float, Any]:
     others = jax.tree.map(np.ones_like, expansion.unknowns.without_modes())
-    return Units(np.ones(expansion.problem.basis.base.shape), 1.0, others)
+    return np.ones(expansion.problem.basis.base.shape), 1.0, others
 
 
-def judged_as_it_is(ended, problems, given, report) -> _judge.Judgement:
+def judged_as_it_is(ended, problems, scenes, targets, given, report) -> jaxhf.Fit:
     """Without a look at its pictures."""
-    none = np.zeros((12, 12, 1))
-    expansion = _run.with_all_modes(ended, problems, given)
-    return _judge.Judgement(expansion, [none], [none], (), np.ones(expansion.heights.shape, bool), None, None, 1.0, ())
+    problem, unknowns, none = ended.expansion.problem, ended.expansion.unknowns, np.zeros((12, 12, 1))
+    return jaxhf.Fit(
+        heights=problem.basis.crop(problem.basis.base), result=ended.stop, std=None, samples=None,
+        seen=np.ones(ended.expansion.heights.shape, bool), albedo=unknowns.albedo, exposures=None, offsets=None,
+        noise=problem.noise, scenes=found_scenes(scenes, unknowns, problem), settings=problem.settings, images=(none,),
+        residuals=(none,), regions=(), warnings=(), stats={}, history=ended.state.history,
+    )  # fmt: skip
 
 
 def test_it_goes_on_with_coarse_and_with_fine_heights(tmp_path, monkeypatch):

@@ -16,7 +16,8 @@ import jaxhf
 from jaxhf.core.errors import ArgumentError
 from jaxhf.fitting import fit as _fit
 from jaxhf.fitting.coarser import coarser, factors
-from jaxhf.fitting.model.expansion import _with_albedo, prior_residuals
+from jaxhf.fitting.model.expansion import prior_residuals
+from jaxhf.fitting.model.pictures import with_albedo
 from jaxhf.fitting.model.problem import Problem, make_problem
 from jaxhf.fitting.model.robust import influence_function, soften
 from jaxhf.fitting.model.surface import make_basis, resample, slope_units
@@ -85,7 +86,7 @@ def test_errors_of_a_prior_are_correlated_as_whittle_said():
 def test_a_sought_albedo_lies_as_its_texture(lies):
     texels = np.random.default_rng(0).uniform(0.2, 0.9, (4, 5, 3)).astype(np.float32)
     given, expected = (scenes(albedo=jaxhf.ImageTexture(np.float32(factor) * texels, **lies))[0] for factor in (1, 2))
-    found = _with_albedo(given, jnp.full((4, 5, 1), 2.0))
+    found = with_albedo(given, jnp.full((4, 5, 1), 2.0))
     assert eqx.tree_equal(localise(found), localise(expected), typematch=False)
 
 

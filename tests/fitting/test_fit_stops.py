@@ -124,7 +124,7 @@ def test_a_fit_ends_where_no_step_counts_any_more(stage, factors, steps, predict
 
 def test_rejections_in_a_row_damp_ever_faster():
     """Twice as much as the one before; and the step that is accepted after them leaves λ as it is."""
-    searches = [LevenbergMarquardt(rejections, 0.1, 9, None).search for rejections in range(4)]
+    searches = [LevenbergMarquardt(rejections, None).search for rejections in range(4)]
     np.testing.assert_allclose([search.low_constant for search in searches], 0.25 / 2.0 ** np.arange(4))
     np.testing.assert_allclose([search.high_constant for search in searches], [4, 1, 1, 1])
 

@@ -14,6 +14,7 @@ from jaxhf.fitting.model.expansion import residuals
 from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.solve import run as _run
 from jaxhf.fitting.solve.newton import WholeStep, relaxed, whole_step
+from jaxhf.fitting.solve.stages import Stage
 from jaxhf.fitting.solve.state import first_state
 
 HELD = np.where(np.indices(TRUTH.shape).sum(0) % 5 == 0, 0.0, 0.05)
@@ -53,12 +54,12 @@ def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, monkeypatch)
     ones = jax.tree.map(jnp.ones_like, here.unknowns)
     steps = [WholeStep(ones, length, 10 * length, 7.0 + number) for number, length in enumerate(lengths)]
     state = dataclasses.replace(first_state(here.problem, here.unknowns), stage=4)
-    place: Any = _run._Place(here.problem, 1.0, here, None, None, steps[0])
+    place: Any = _run._Place(here, None, steps[0])
     monkeypatch.setattr(_run, "expand", lambda unknowns, problem: dataclasses.replace(here, unknowns=unknowns))
     for number, taken in enumerate(accepted, 1):
         monkeypatch.setattr(_run, "whole_step", lambda _, number=number: steps[number])
         before, there = state.unknowns, place.expansion
-        state, place = _run._step_by_factors(state, place, 0.0)
+        state, place = _run._stepped(state, place, Stage(0, 1.0, by_factors=True), 0.0)
         kept = steps[number if taken else number - 1]
         assert (state.history[-1].accepted, state.history[-1].step) == (taken, number)
         assert (state.loss, state.predicted, place.whole_step) == (kept.loss, kept.predicted, kept)

@@ -16,7 +16,7 @@ from jaxhf.fitting.model import near_inverse as _near_inverse
 from jaxhf.fitting.model.expansion import Expansion, prior_residuals
 from jaxhf.fitting.model.linearise import LinearisedEdges
 from jaxhf.fitting.model.near_inverse import near_inverse
-from jaxhf.fitting.model.normal_matrix import NormalMatrix, PartMatrix, in_row
+from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
 from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
 from jaxhf.fitting.trust.boundaries import Boundaries
 from jaxhf.fitting.trust.deviations import standard_deviations
@@ -73,21 +73,21 @@ PLACE = (slice(0, 8), slice(4, 12))
 def test_a_part_of_the_pictures_depends_on_a_part_of_the_heights(prior):
     """On no others, and as all pictures do; so do its products, but for the prior of heights beyond."""
     here = expanded(scenes(TRUTH), pictures(), prior=PRIORS[prior], **OPTIONS)
-    whole, part = pictures_by_heights(here), part_by_heights(here, PLACE)
+    whole, (part, values) = pictures_by_heights(here), part_by_heights(here, PLACE)
     assert whole is not None
     inside = np.zeros(TRUTH.shape, bool)
     inside[PLACE] = True
-    rows = whole.toarray()[part.values]
+    rows = whole.toarray()[values]
     assert not rows[:, ~inside.ravel()].any()
-    np.testing.assert_array_equal(part.matrix.toarray(), rows[:, inside.ravel()])
+    np.testing.assert_array_equal(part.toarray(), rows[:, inside.ravel()])
     # All that is seen of these cells but the outermost: a picture shows 12 x 12 vertices in 24 x 24 pixels.
-    assert part.values.size > 0.6 * VALUES * (7 * 7) / (11 * 11)
+    assert values.size > 0.6 * VALUES * (7 * 7) / (11 * 11)
     roots = np.random.default_rng(1).uniform(0.5, 1.0, VALUES)
-    matrix = PartMatrix(here, roots[part.values], part.matrix, PLACE)
+    matrix = NormalMatrix(here, roots[values], part, PLACE)
     x = np.zeros(here.problem.basis.base.shape)
     change = np.random.default_rng(0).standard_normal(matrix.shape)
     here.problem.basis.crop(x)[PLACE] = change
-    np.testing.assert_allclose(matrix.seen(change.ravel()), NormalMatrix(here, roots, whole).seen(x.ravel())[part.values])
+    np.testing.assert_allclose(matrix.seen(change.ravel()), NormalMatrix(here, roots, whole).seen(x.ravel())[values])
     matrix.inverse = near_inverse(matrix)
     right = matrix.gathered(matrix.drawn(0))
     np.testing.assert_allclose(matrix.product(matrix.solved(right, 1e-6)), right, rtol=0, atol=1e-5 * rms(right) * right.size)

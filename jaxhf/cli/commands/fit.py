@@ -12,9 +12,10 @@ import numpy as np
 
 from ...core.errors import ArgumentError, UserError, counted
 from ...core.extras import import_extra
-from ...fitting.fit import Fit, fit
+from ...fitting.fit import fit
 from ...fitting.given import Checkpoint, Prior, Unknown
 from ...fitting.history import Draws, Pace, Step
+from ...fitting.trust.judge import Fit
 from ...fitting.windows import Mosaic, fit_windows
 from ...io.errors import FileError
 from ...io.files import require_writable, save_text

@@ -35,10 +35,7 @@ def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: boo
 
     A power of two, so that pictures that differ little share a program.
 
-    Args:
-      views: `localise`d scenes, one a picture.
-      settings: the knobs.
-      shadows: whether the measured pictures show shadows, whatever these scenes do.
+    `views` are `localise`d; `shadows`: whether the measured pictures show shadows, whatever these scenes do.
     """
     has_skirt = any(isinstance(obj.shape, Skirt) for view in views for obj in view.objects)  # with points it is refused
     if has_skirt or not all(can_be_linearised(view, settings) for view in views):

@@ -13,20 +13,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ...rendering.render import render_each
-from ...scene.material import Matte
 from ...scene.scene import Scene
-from ...scene.texture import ImageTexture
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device
-from .linearise import Linearised, can_be_linearised, linearise_each, picture_each
-from .pictures import Group
+from .linearise import Linearised, can_be_linearised, changing_pixels, linearise_each, moved_each, picture_each
+from .pictures import Group, with_albedo
 from .problem import Problem
 from .robust import soften
 from .surface import Basis, Unknowns
-from .view import View, moved
+from .view import View
 
 Rows = list[Float[Array, "_ _ _ _"]]
 """A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""
@@ -39,7 +37,6 @@ class Expansion(eqx.Module):
     """A problem about some unknowns.
 
     Attributes:
-      problem, unknowns: these.
       linearised: the pictures of each group with their derivatives; None: there are none such, see `can_be_linearised`.
     """
 
@@ -51,14 +48,14 @@ class Expansion(eqx.Module):
     def heights(self) -> Float[Array, "ny nx"]:
         return self.problem.basis.heights(self.unknowns.coefficients)
 
-    @property
-    def sampling(self) -> list[Float[np.ndarray, "n h w"] | None]:
-        """The error of each pixel's samples, radiance."""
-        return [None if known is None else np.asarray(known.sampling) for known in self.linearised]
-
     def of(self, problem: Problem) -> "Expansion":
         """The same pictures in a problem that differs in noise, priors or basis alone."""
         return dataclasses.replace(self, problem=problem)
+
+    def with_noise(self, noise: Float[np.ndarray, " pictures"]) -> "Expansion":
+        """The same with another standard deviation of each picture's values at weight 1, beside the error of their samples."""
+        sampling = [None if known is None else np.asarray(known.sampling) for known in self.linearised]
+        return self.of(self.problem.with_noise(noise, sampling))
 
     def pictures(self) -> Rows:
         """As they would be measured."""
@@ -68,6 +65,12 @@ class Expansion(eqx.Module):
         """(picture - target) / noise."""
         pairs = zip(self.problem.groups, self.pictures(), strict=True)
         return [group.weights * (image - group.targets) for group, image in pairs]
+
+    def informing(self) -> list[Bool[np.ndarray, "n h w c"]]:
+        """Which values depend on the heights; all of those with a weight where that is not known."""
+        found = [np.asarray(group.given) > 0 for group in self.problem.groups]
+        pairs = zip(found, self.linearised, strict=True)
+        return [counts if known is None else counts & changing_pixels(known)[..., None] for counts, known in pairs]
 
     def push(self, change: Surface) -> Rows:
         """J times a change of the surface and of the other unknowns: by what the pictures change, in units of the noise."""
@@ -98,15 +101,7 @@ def expand(unknowns: Unknowns, problem: Problem) -> Expansion:
     """The problem about these unknowns: its pictures are rendered here, by one program."""
     # What enters a compiled program must lie in the same places each time, or it is compiled again for the other ones.
     unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
-    heights = _heights(unknowns, problem.basis)
-    still = unknowns.without_modes()
-    return Expansion(problem, unknowns, _linearised(heights, still, problem))
-
-
-def place_of(unknowns: Unknowns, problem: Problem) -> list[np.ndarray]:
-    """All on which pictures depend: the heights, whatever modes they are made of, and the other unknowns."""
-    others = unknowns.without_modes()
-    return [np.asarray(_heights(unknowns, problem.basis)), *map(np.asarray, jax.tree.leaves(others))]
+    return Expansion(problem, unknowns, _linearised(unknowns, problem))
 
 
 def residuals(unknowns: Unknowns, about: tuple[Problem, tuple[Linearised | None, ...]]) -> tuple[Any, None]:
@@ -131,29 +126,19 @@ def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
 
 @eqx.filter_jit
 def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
-    """The heights with their padding, from one program, so that they can be compared bit for bit."""
+    """The heights with their padding, by one program."""
     return basis.surface(unknowns.coefficients)
 
 
-@eqx.filter_jit
-def _heights(unknowns: Unknowns, basis: Basis) -> Float[Array, "ny nx"]:
-    return basis.heights(unknowns.coefficients)
-
-
 @functools.partial(compiled, jit=eqx.filter_jit)
-def _linearised(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
+def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
+    heights = problem.basis.heights(unknowns.coefficients)
+
     def of(group: Group) -> Linearised | None:
         if not can_be_linearised(group.scenes, problem.settings):
             return None
-        return linearise_each(
-            group.scenes,
-            completion(unknowns, group, heights),
-            problem.settings,
-            problem.mesh,
-            group.targets.shape[-1],
-            _moves(unknowns, problem, group),
-            unknowns.albedo,
-        )
+        moves = _moves(unknowns, problem, group)
+        return linearise_each(group, heights, problem.settings, problem.mesh, moves, unknowns.albedo)
 
     return on_every_device(tuple(map(of, problem.groups)), problem.mesh)
 
@@ -196,24 +181,20 @@ def _simulate(
     """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
     images = []
     for group, known in zip(problem.groups, linearised, strict=True):
-        change = completion(unknowns, group, heights)
         if known is not None:
             moves = _moves(unknowns, problem, group)
-            image = picture_each(known, group.scenes, change, problem.settings, problem.mesh, moves, unknowns.albedo)
+            image = picture_each(known, group, heights, problem.settings, problem.mesh, moves, unknowns.albedo)
         else:
-            image = render_each(_views(unknowns, problem, group), change, problem.settings, problem.mesh)
+            complete = functools.partial(group.complete, heights=heights, factors=unknowns.albedo)
+            image = render_each(_views(unknowns, problem, group), complete, problem.settings, problem.mesh)
             if group.targets.shape[-1] == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
         if unknowns.exposures is not None:
-            image = image * _each(unknowns.exposures, group)
+            image = image * group.each(unknowns.exposures)
         if unknowns.offsets is not None:
-            image = image + problem.bright * _each(unknowns.offsets, group)
+            image = image + problem.bright * group.each(unknowns.offsets)
         images.append(image)
     return images
-
-
-def _each(values: Float[Array, " pictures"], group: Group) -> Float[Array, "n 1 1 1"]:
-    return jnp.stack([values[k] for k in group.indices]).reshape(-1, 1, 1, 1)
 
 
 def _moves(unknowns: Unknowns, problem: Problem, group: Group) -> View:
@@ -224,48 +205,19 @@ def _moves(unknowns: Unknowns, problem: Problem, group: Group) -> View:
 
 def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
     """`group.scenes` under the lights and from the cameras that are sought."""
-    moves = _moves(unknowns, problem, group)
-    if not jax.tree.leaves(moves):
-        return group.scenes
-    seen = group.scenes.lights, group.scenes.camera, moves
-    found = [moved(*jax.tree.map(lambda leaf, n=n: leaf[n], seen)) for n in range(len(group.indices))]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
-    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), group.scenes, stacked)
-
-
-def completion(unknowns: Unknowns, group: Group, heights: Float[Array, "ny nx"]) -> Callable[[Scene], Scene]:
-    """Makes the scene of one picture from its own leaves, those that the group shares, these heights and the unknowns."""
-
-    def complete(scene: Scene) -> Scene:
-        scene = group.complete(scene, heights)
-        return scene if unknowns.albedo is None else _with_albedo(scene, unknowns.albedo)
-
-    return complete
-
-
-def _with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
-    """The scene with the albedo of its first heightfield multiplied."""
-    k = scene.first_heightfield
-    material = scene.objects[k].material
-    assert isinstance(material, Matte)
-    old = material.albedo
-    texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.asarray(old).reshape(1, 1, 3))
-    shape = (*(max(pair) for pair in zip(texture.texels.shape[:2], factor.shape[:2], strict=True)), 3)
-    new = jnp.broadcast_to(texture.texels, shape) * jnp.broadcast_to(factor, shape)
-    albedo = new.reshape(3) if shape[:2] == (1, 1) and texture is not old else dataclasses.replace(texture, texels=new)
-    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
+    return moved_each(group.scenes, _moves(unknowns, problem, group))
 
 
 def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:
     """The scenes as they were given, with all that was found; positions keep double precision."""
-    heights, found = _heights(unknowns, problem.basis), list(scenes)
+    heights, found = problem.basis.crop(surface_of(unknowns, problem.basis)), list(scenes)
     for group in problem.groups:
         new, old = ((part.lights, part.camera) for part in (_views(unknowns, problem, group), group.scenes))
         change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)
         for n, k in enumerate(group.indices):
             scene = scenes[k].with_heights(heights)
             if unknowns.albedo is not None:
-                scene = _with_albedo(scene, unknowns.albedo)
+                scene = with_albedo(scene, unknowns.albedo)
             if jax.tree.leaves(unknowns.view):
                 given = scene.lights, scene.camera
                 lights, camera = jax.tree.map(lambda leaf, more, n=n: np.asarray(leaf) + more[n], given, change)

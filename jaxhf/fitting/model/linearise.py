@@ -9,7 +9,6 @@ shading again. A sample of a moving boundary depends on five heights at most, an
 import dataclasses
 import functools
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -39,6 +38,7 @@ from ...trace.triangle import Corners, triangle_vertices
 from ...xla.devices import Spread, map_and_spread, map_over, on_every_device, over_spread
 from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
+from .pictures import Group
 from .view import KNOWN, View, moved
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
@@ -139,35 +139,34 @@ def can_be_linearised(scene: Scene, settings: Settings) -> bool:
 
 
 def linearise_each(
-    scenes: Scene,
-    change: Callable[[Scene], Scene],
+    group: Group,
+    heights: Float[jax.Array, "ny nx"],
     settings: Settings,
     mesh: Mesh,
-    channels: int,
-    view: View = KNOWN,
-    factors: Float[jax.Array, "ty tx k"] | None = None,
+    view: View,
+    factors: Float[jax.Array, "ty tx k"] | None,
 ) -> Linearised:
-    """Pictures of scenes that differ in numbers only, one after the other, and their derivatives in the heights, and in what
-    moves lights and cameras.
+    """The pictures of a group whose scenes `can_be_linearised`, one after the other, and their derivatives in the heights, and
+    in what moves lights and cameras; leaves have a leading axis of n pictures.
 
     Args:
-      scenes: one `localise`d scene that `can_be_linearised`; its leaves have a leading axis of n scenes.
-      change: what is done to each before it is rendered.
-      settings: the knobs.
-      mesh: the devices that share the work.
-      channels: 3, or 1 for their mean.
       view: by what the light and the camera of each are `moved`, (n, 2) and (n, 6), if that is sought.
-      factors: by which `change` multiplies the albedo of the first heightfield, if they are sought.
-
-    Returns:
-      Leaves with a leading axis of n pictures.
+      factors: by which the albedo of the first heightfield is multiplied, if they are sought.
     """
 
     def one(seen: tuple[Scene, View]) -> Linearised:
-        scene, view = on_every_device((change(seen[0]), seen[1]), mesh)
-        return _linearise(_Seen.of(scene, view, settings), mesh, channels, factors)
+        scene, view = on_every_device((group.complete(seen[0], heights, factors), seen[1]), mesh)
+        return _linearise(_Seen.of(scene, view, settings), mesh, group.targets.shape[-1], factors)
 
-    return lax.map(one, (scenes, view))
+    return lax.map(one, (group.scenes, view))
+
+
+def moved_each(scenes: Scene, view: View) -> Scene:
+    """Stacked scenes with their lights and cameras `moved`."""
+    if not jax.tree.leaves(view):
+        return scenes
+    found = lax.map(lambda seen: moved(*seen), (scenes.lights, scenes.camera, view))
+    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), scenes, found)
 
 
 class _Seen(NamedTuple):
@@ -196,24 +195,26 @@ class _Seen(NamedTuple):
 
 def picture_each(
     known: Linearised,
-    scenes: Scene,
-    change: Callable[[Scene], Scene],
+    group: Group,
+    heights: Float[jax.Array, "ny nx"],
     settings: Settings,
     mesh: Mesh,
-    view: View = KNOWN,
-    factors: Float[jax.Array, "ty tx k"] | None = None,
+    view: View,
+    factors: Float[jax.Array, "ty tx k"] | None,
 ) -> Float[jax.Array, "n h w c"]:
-    """The pictures that are known, with their derivatives in the heights that `change` gives to the scenes, in what moves
-    their lights and cameras, and in the albedo's factors.
+    """The pictures that are known, with their derivatives in the heights, in what moves lights and cameras, and in the albedo's
+    factors, whose values must be those at which `linearise_each` was called."""
 
-    Values of all these must be the ones at which `linearise_each` was called.
-    """
+    def values(scene: Scene) -> Float[jax.Array, "vertices n"]:
+        return vertex_values(make_world(on_every_device(group.complete(scene, heights, factors), mesh), settings))
+
+    scenes = group.scenes
     if jax.tree.leaves(scenes.objects):  # each picture has vertices of its own
-        each = lax.map(lambda scene: _values(change(scene), settings, mesh), scenes)
+        each = lax.map(values, scenes)
         first = jnp.arange(each.shape[0])[:, None, None, None] * each.shape[1]
         at_vertices = each.reshape(-1, each.shape[-1])
     else:
-        at_vertices, first = _values(change(jax.tree.map(lambda leaf: leaf[0], scenes)), settings, mesh), jnp.int32(0)
+        at_vertices, first = values(jax.tree.map(lambda leaf: leaf[0], scenes)), jnp.int32(0)
     relative = None if factors is None else factors / _apart_from_zero(lax.stop_gradient(factors))
     # All pictures at once: a loop over them would copy what it reads of each.
     of_samples = over_spread(mesh, _of_samples, (at_vertices, first, view, relative), known.samples)
@@ -236,10 +237,6 @@ def picture_each(
 
     camera, settings = scenes.camera, resolve_settings(settings, scenes)
     return jax.vmap(one)(known.image, known.edges, of_samples, light, view)
-
-
-def _values(scene: Scene, settings: Settings, mesh: Mesh) -> Float[jax.Array, "vertices n"]:
-    return vertex_values(make_world(on_every_device(scene, mesh), settings))
 
 
 def _linearise(seen: _Seen, mesh: Mesh, channels: int, factors: Float[jax.Array, "ty tx k"] | None) -> Linearised:
@@ -403,9 +400,7 @@ def _of_samples(
     """What samples of n pictures change by: their rows times what stands at the vertices, moves light and camera, and is the
     relative change of the albedo's factors.
 
-    Args:
-      shared: these; the second is the number of the first vertex of each picture.
-      rows: of these samples.
+    `shared`: these; the second is the number of the first vertex of each picture.
     """
     at_vertices, first, view, relative = shared
     n, chunks, channels, k, size = rows.slopes.shape

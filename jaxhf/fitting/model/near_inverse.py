@@ -17,7 +17,7 @@ from .expansion import Expansion
 from .normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row
 from .robust import robust_weight
 from .rows import THREADS, Sparse, pictures_by_heights, scaled
-from .surface import slope_units
+from .surface import interpolation, slope_units
 
 sp: Any = scipy.sparse  # whose stubs miss much
 _PROBES = 8  # of their curvature, where they are more
@@ -99,7 +99,8 @@ def _inverse(near: Sparse, shape: tuple[int, ...]) -> Callable[[Flat], Flat]:
     sides = ((slice(max(0, begin - _BEYOND), begin + _BLOCK + _BEYOND) for begin in corner) for corner in begins)
     blocks = [numbers[rows, columns].ravel() for rows, columns in sides]
     share = 1 / np.sqrt(np.bincount(np.concatenate(blocks)))  # of a height in each of its blocks, on both sides of the inverse
-    between = sp.kron(*(_interpolation(n) for n in shape), format="csr")
+    places = [np.arange(n) / _COARSER for n in shape]
+    between = sp.kron(*(interpolation(at, int(np.ceil(at[-1])) + 1) for at in places), format="csr")
     coarse = _factors(between.T @ near @ between)
     factors = [_factors(near[block][:, block]) for block in blocks]  # SciPy never frees those of another thread
 
@@ -127,15 +128,6 @@ def _factors(matrix: Sparse) -> Any:
     """Those of a symmetric matrix that is positive definite, by SuperLU."""
     options = {"SymmetricMode": True}
     return sp.linalg.splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-
-
-def _interpolation(n: int) -> Sparse:
-    """Values at n vertices from those of a grid whose cells are `_COARSER` times as wide, linearly."""
-    at = np.arange(n) / _COARSER
-    count = int(np.ceil(at[-1])) + 1
-    low = np.minimum(at.astype(int), count - 2)
-    entries = np.concatenate([1 - (at - low), at - low])
-    return sp.csr_array((entries, (np.tile(np.arange(n), 2), np.concatenate([low, low + 1]))), shape=(n, count))
 
 
 def _polynomial(precision: Float[np.ndarray, "my mx"], field: Heightfield) -> Sparse:

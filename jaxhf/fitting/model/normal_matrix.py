@@ -4,7 +4,6 @@ import copy
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
@@ -20,6 +19,8 @@ from .surface import Unknowns
 linalg: Any = scipy.sparse.linalg  # whose stubs miss much
 fft: Any = scipy.fft
 Flat = Float[np.ndarray, " n"]
+Place = tuple[slice, slice]
+"""Rows and columns of heights, without padding."""
 MOST_OTHERS = 64
 """Unknowns besides heights whose columns of J are kept, and that are eliminated."""
 _MOST_ITERATIONS = 300
@@ -45,24 +46,34 @@ class NormalMatrix:
       expansion: all of whose modes are varied.
       roots: of the weights of the pictures' residuals, flat as `in_row`.
       rows: `pictures_by_heights` there, with which products take a tenth of the time; None: by JAX.
+      place: of heights without padding, whose `part_by_heights` rows and roots are: all else counts as known.
     """
 
-    def __init__(self, expansion: Expansion, roots: Float[np.ndarray, " rows"], rows: Any = None):
+    def __init__(self, expansion: Expansion, roots: Float[np.ndarray, " rows"], rows: Any = None, place: Place | None = None):
         self.expansion, self.roots, self.rows = expansion, roots, rows
         self.inverse: Callable[[Flat], Flat] = self._by_modes
-        problem, unknowns = expansion.problem, expansion.unknowns
-        self.shape, self.dtype = problem.basis.base.shape, unknowns.coefficients.dtype
-        term = problem.terms.surface
-        self.weight, self.spectrum = (np.asarray(values, np.float64) for values in (term.weight, term.spectrum))
-        self.free = 1.0 if problem.basis.free is None else np.asarray(problem.basis.free, np.float64)
-        self.off = np.asarray(surface_of(unknowns, problem.basis), np.float64) - np.asarray(term.mean, np.float64)
-        others, self.unflat = jax.flatten_util.ravel_pytree(unknowns.without_modes())
-        terms = problem.terms.others(unknowns)
-        self.others_weight = _joined([np.broadcast_to(np.asarray(term.weight), values.shape) for term, values in terms])
-        self.others_off = _joined([np.asarray(term.residual(values)) for term, values in terms])
-        self.size = int(np.prod(self.shape)) + others.size
-        self.inside = np.asarray(problem.basis.crop(np.arange(self.off.size).reshape(self.shape))).ravel()
-        self.columns = None
+        unknowns, basis, terms = expansion.unknowns, expansion.problem.basis, expansion.problem.terms
+
+        def here(values: Any) -> Float[np.ndarray, "..."]:
+            values = np.asarray(values, np.float64)
+            return values if place is None or values.ndim == 0 else basis.crop(values)[place]
+
+        self.weight, self.free = here(terms.surface.weight), here(1.0 if basis.free is None else basis.free)
+        self.off = here(surface_of(unknowns, basis)) - here(terms.surface.mean)
+        self.spectrum = np.asarray(terms.surface.spectrum, np.float64)
+        self.shape, self.dtype = self.off.shape, unknowns.coefficients.dtype
+        self.inside = np.asarray(basis.crop(np.arange(self.off.size).reshape(self.shape))).ravel()
+        sought, besides = unknowns.without_modes(), terms.others(unknowns)
+        if place is not None:
+            # That of a part of a terrain has the density of the whole one's modes.
+            at = [np.arange(n) * (m / n) for n, m in zip(self.shape, self.spectrum.shape, strict=True)]
+            at = np.meshgrid(*at, indexing="ij")
+            self.spectrum = scipy.ndimage.map_coordinates(self.spectrum, at, order=1, mode="nearest")
+            self.inside, sought, besides = np.arange(self.off.size), (), []
+        others, self.unflat = jax.flatten_util.ravel_pytree(sought)
+        self.others_weight = in_row([np.broadcast_to(np.asarray(term.weight), values.shape) for term, values in besides])
+        self.others_off = in_row([np.asarray(term.residual(values)) for term, values in besides])
+        self.size, self.columns = self.off.size + others.size, None
         if rows is not None and others.size <= MOST_OTHERS:
             each = [self._by_jax(np.zeros(self.shape), one) for one in np.eye(others.size)]
             self.columns = np.reshape(each, (others.size, roots.size)).T
@@ -144,10 +155,7 @@ class NormalMatrix:
         """The change of the unknowns."""
         surface, others = self.split(x)
         modes = fft.dctn(self.free * surface, norm="ortho") / np.asarray(self.expansion.problem.basis.scale, np.float64)
-        unknowns = self.unflat(jnp.asarray(others, self.dtype))
-        return eqx.tree_at(
-            lambda u: u.coefficients, unknowns, jnp.asarray(modes, self.dtype), is_leaf=lambda leaf: leaf is None
-        )
+        return self.unflat(jnp.asarray(others, self.dtype)).with_modes(jnp.asarray(modes, self.dtype))
 
     def split(self, x: Flat) -> tuple[Float[np.ndarray, "my mx"], Float[np.ndarray, " k"]]:
         count = int(np.prod(self.shape))
@@ -165,39 +173,9 @@ class NormalMatrix:
         return np.concatenate([fft.idctn(squares * fft.dctn(surface, norm="ortho"), norm="ortho").ravel(), others])
 
 
-class PartMatrix(NormalMatrix):
-    """That of a part of the pictures and of the heights on which alone it depends; other unknowns are known.
-
-    Heights beyond do not matter, and their prior is that of a part of a terrain: it has the density of the whole one's modes.
-
-    Args:
-      expansion: of the whole.
-      roots: see `NormalMatrix`, of the part.
-      rows: J, a sparse matrix.
-      place: these heights, without padding.
-    """
-
-    def __init__(self, expansion: Expansion, roots: Float[np.ndarray, " rows"], rows: Any, place: tuple[slice, slice]):
-        super().__init__(expansion, roots)
-        whole, crop = self.shape, expansion.problem.basis.crop
-        self.rows, self.columns = rows, np.zeros((roots.size, 0))
-        self.off = crop(self.off)[place]
-        self.weight, self.free = (crop(part)[place] if np.ndim(part) == 2 else part for part in (self.weight, self.free))
-        self.shape = self.off.shape
-        if self.spectrum.ndim == 2:
-            at = np.meshgrid(*(np.arange(n) * (m / n) for n, m in zip(self.shape, whole, strict=True)), indexing="ij")
-            self.spectrum = scipy.ndimage.map_coordinates(self.spectrum, at, order=1, mode="nearest")
-        self.others_weight = self.others_off = np.zeros(0)
-        self.size, self.inside = self.off.size, np.arange(self.off.size)
-
-
-def _joined(parts: list[Any]) -> Float[np.ndarray, " k"]:
-    return np.concatenate([np.zeros(0), *(np.asarray(part, np.float64).ravel() for part in parts)])
-
-
 def in_row(rows: Sequence[Any]) -> Float[np.ndarray, " rows"]:
     """All values of all pictures, one after the other."""
-    return np.concatenate([np.asarray(part, np.float64).ravel() for part in rows])
+    return np.concatenate([np.zeros(0), *(np.asarray(part, np.float64).ravel() for part in rows)])
 
 
 def in_groups(row: np.ndarray, expansion: Expansion) -> list[Any]:

@@ -1,5 +1,6 @@
 """The pictures of a fit, checked and gathered into those that one program renders."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +16,9 @@ from ...core.precision import numbers
 from ...core.settings import Settings
 from ...preparation.localise import localise
 from ...preparation.world import resolve_settings
+from ...scene.material import Matte
 from ...scene.scene import Scene
+from ...scene.texture import ImageTexture
 
 
 class Group(eqx.Module):
@@ -37,12 +40,18 @@ class Group(eqx.Module):
     weights: Float[Array, "n h w c"]
     indices: tuple[int, ...] = eqx.field(static=True)
 
-    def complete(self, scene: Scene, heights: Float[Array, "ny nx"]) -> Scene:
-        """One picture's leaves of `scenes`, with those that are shared and these heights."""
-        return _with_heights(eqx.combine(scene, self.shared), heights)
+    def each(self, values: Any) -> Any:
+        """A number for each of the caller's pictures, for each of these: shape (n, 1, 1, 1)."""
+        stack = np.stack if isinstance(values, np.ndarray) else jnp.stack
+        return stack([values[k] for k in self.indices]).reshape(-1, 1, 1, 1)
+
+    def complete(self, scene: Scene, heights: Float[Array, "ny nx"], factors: Float[Array, "ty tx c"] | None = None) -> Scene:
+        """One picture's leaves of `scenes`, with those that are shared, these heights, and an albedo times these factors."""
+        scene = _with_heights(eqx.combine(scene, self.shared), heights)
+        return scene if factors is None else with_albedo(scene, factors)
 
 
-def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None = None) -> None:
+def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> None:
     """Checks that there is a scene for each picture, and that all have the same first heightfield but for its heights."""
     if len(scenes) == 0:
         raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
@@ -56,21 +65,15 @@ def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Seq
         _require_alike(k, scene, scenes[0])
 
 
-def masked_targets(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> tuple[np.ndarray, ...]:
-    """Checks scenes, targets and weights; returns the targets with nan where they have no weight: no statistic counts these."""
-    require_scenes(scenes, targets, weights)
-    found = []
-    for k, (scene, target) in enumerate(zip(scenes, targets, strict=True)):
-        values, weight = _checked_picture(k, scene, target, weights)
-        found.append(np.where(weight > 0, values, np.nan).reshape(np.shape(target)))
-    return tuple(found)
-
-
-def weights_of(
+def checked_pictures(
     scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None
-) -> list[Float[np.ndarray, "h w c"]]:
-    """Of each value of each picture, 0 where it does not count."""
-    return [_checked_picture(k, *pair, weights)[1] for k, pair in enumerate(zip(scenes, targets, strict=True))]
+) -> tuple[tuple[np.ndarray, ...], list[Float[np.ndarray, "h w c"]]]:
+    """Checks scenes, targets and weights; returns the targets with nan where they have no weight, as no statistic counts these,
+    and the weight of each of their values."""
+    require_scenes(scenes, targets, weights)
+    pairs = [_checked_picture(k, *pair, weights) for k, pair in enumerate(zip(scenes, targets, strict=True))]
+    kept = [np.where(weight > 0, values, np.nan) for values, weight in pairs]
+    return tuple(map(np.reshape, kept, map(np.shape, targets))), [weight for _, weight in pairs]
 
 
 def make_groups(
@@ -111,6 +114,19 @@ def make_groups(
 def _with_heights(scene: Scene, heights: Array | None) -> Scene:
     """`scene` over other heights of its first heightfield; None where they are to be filled in later."""
     return eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights, is_leaf=lambda leaf: leaf is None)
+
+
+def with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
+    """The scene with the albedo of its first heightfield multiplied."""
+    k = scene.first_heightfield
+    material = scene.objects[k].material
+    assert isinstance(material, Matte)
+    old = material.albedo
+    texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.asarray(old).reshape(1, 1, 3))
+    shape = (*(max(pair) for pair in zip(texture.texels.shape[:2], factor.shape[:2], strict=True)), 3)
+    new = jnp.broadcast_to(texture.texels, shape) * jnp.broadcast_to(factor, shape)
+    albedo = new.reshape(3) if shape[:2] == (1, 1) and texture is not old else dataclasses.replace(texture, texels=new)
+    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
 
 
 def _stacked(scenes: Sequence[Scene]) -> tuple[Scene, Scene]:

@@ -22,7 +22,7 @@ from ...scene.texture import ImageTexture
 from ...xla.devices import chosen_mesh
 from ..given import Given, Unknown
 from .defaults import choose_edge_samples, choose_samples
-from .pictures import Group, make_groups, require_scenes
+from .pictures import Group, make_groups
 from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units
 from .terms import Terms, make_terms
 from .view import View, sun
@@ -82,6 +82,12 @@ class Problem(eqx.Module):
         """How many values of pictures count."""
         return sum(int(np.count_nonzero(np.asarray(group.given))) for group in self.groups)
 
+    def by_picture(self, rows: Sequence[Any]) -> list[Any]:
+        """What each picture has in an array for each group, in the order of the caller's pictures."""
+        pairs = zip(self.groups, rows, strict=True)
+        found = {k: part for group, row in pairs for k, part in zip(group.indices, row, strict=True)}
+        return [found[k] for k in range(self.count)]
+
     def edge_samples_for(self, heights: Float[Array, "ny nx"], settings: Settings) -> int:
         """As many points on edges as pictures of these heights call for, if the user's settings leave that open.
 
@@ -113,7 +119,7 @@ class Problem(eqx.Module):
         for number, group in enumerate(self.groups):
             # By NumPy: each operation of JAX's would be a program to compile.
             given = np.asarray(group.given)
-            variance = noise[list(group.indices)].astype(given.dtype).reshape(-1, 1, 1, 1) ** 2
+            variance = group.each(noise).astype(given.dtype) ** 2
             variance = variance / np.where(given > 0, given, 1) ** 2
             if sampling is not None and sampling[number] is not None:
                 variance = variance + np.asarray(sampling[number])[..., None] ** 2
@@ -128,7 +134,6 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
     Raises:
       ValueError: scenes, targets and arguments do not belong together.
     """
-    require_scenes(scenes, targets)
     first = scenes[0]
     field, dtype = first.heightfields[0], first.heights.dtype
     length = None if given.prior is None else given.prior.length
@@ -145,6 +150,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
     brightness, view_unit = _brightness(targets), _view_unit(scenes, given.unknown)
     terms = make_terms(field, given.prior, given.unknown, base, free, view_unit)
     groups = make_groups(scenes, targets, given.weights, settings)
+    unknowns = _first_unknowns(scenes, basis, max(group.targets.shape[-1] for group in groups), given.unknown, view_unit)
     problem = Problem(
         groups=groups,
         basis=basis,
@@ -155,14 +161,11 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
         bright=jnp.asarray(np.median(brightness), dtype),
         view_unit=view_unit,
         field=Heightfield(field.heights, field.dx, field.dy),  # wherever it stands: other windows then share programs
-        albedo_shape=None,
+        albedo_shape=None if unknowns.albedo is None else unknowns.albedo.shape,
         settings=settings,
         mesh=chosen_mesh("fit", given.mesh),
         known=given.prior is not None,
     ).with_noise(_noise(given.noise, brightness))
-    unknowns = _first_unknowns(first, basis, max(group.targets.shape[-1] for group in groups), len(scenes), given.unknown)
-    if unknowns.albedo is not None:
-        problem = dataclasses.replace(problem, albedo_shape=unknowns.albedo.shape)
     return problem.with_edge_samples(problem.edge_samples_for(jnp.asarray(heights, dtype), given.settings)), unknowns
 
 
@@ -233,8 +236,9 @@ def _brightness(targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
     return np.where(np.asarray(bright) > 0, bright, 1.0)
 
 
-def _first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, unknown: Unknown) -> Unknowns:
+def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknown: Unknown, view_unit: View) -> Unknowns:
     """Those from which a fit starts: coefficients 0, the albedo, lights and cameras of the scenes, exposure 1 and offset 0."""
+    scene, count = scenes[0], len(scenes)
     shape, dtype, albedo = scene.heights.shape, scene.heights.dtype, None
     if unknown.albedo is not None:
         material = scene.objects[scene.first_heightfield].material
@@ -248,8 +252,5 @@ def _first_unknowns(scene: Scene, basis: Basis, channels: int, count: int, unkno
         albedo,
         jnp.ones(count, dtype) if unknown.exposures else None,
         jnp.zeros(count, dtype) if unknown.offsets else None,
-        View(
-            None if unknown.light_std is None else jnp.zeros((count, 2), dtype),
-            None if unknown.camera_std is None else jnp.zeros((count, 6), dtype),
-        ),
+        jax.tree.map(lambda unit: jnp.zeros((count, unit.size), dtype), view_unit),
     )

@@ -5,7 +5,7 @@ import functools
 import itertools
 import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,8 +21,9 @@ from ...scene.heightfield import Heightfield
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, on_host
-from .expansion import Expansion, completion
+from .expansion import Expansion
 from .linearise import vertex_values
+from .normal_matrix import Place
 from .pictures import Group
 from .problem import Problem
 from .surface import Unknowns
@@ -40,26 +41,10 @@ THREADS = min(4, os.cpu_count() or 1)
 _REACH = 3  # A vertex's normal depends on heights one row and one column off: of each 3 x 3 heights on one.
 
 
-Place = tuple[slice, slice]
-"""Rows and columns of heights, without padding."""
-
-
-class Part(NamedTuple):
-    """A part of the pictures that depends on a part of the heights alone.
-
-    Attributes:
-      matrix: the derivative, in units of the noise: a row for each value, a column for each of these heights.
-      values: the values' places in the order of `in_row`, rising.
-    """
-
-    matrix: Sparse
-    values: Int[np.ndarray, " rows"]
-
-
 def pictures_by_heights(expansion: Expansion) -> Sparse | None:
     """The derivative of the pictures in the heights, in units of the noise: a row for each value, in the order of `in_row`, a
     column for each height without padding. None: it is not known, or too large to be factorised."""
-    return _rows_of(expansion, None).matrix if has_rows(expansion) else None
+    return part_by_heights(expansion, None)[0] if has_rows(expansion) else None
 
 
 def has_rows(expansion: Expansion) -> bool:
@@ -69,13 +54,6 @@ def has_rows(expansion: Expansion) -> bool:
 
 def can_have_rows(expansion: Expansion) -> bool:
     return all(known is not None for known in expansion.linearised)
-
-
-def part_by_heights(expansion: Expansion, place: Place) -> Part:
-    """The values that depend on such heights alone, without those of pixels that a boundary crosses."""
-    part = _rows_of(expansion, place)
-    inside = _inside(expansion.problem.field.heights.shape, place, 0)
-    return part._replace(matrix=part.matrix[:, np.flatnonzero(inside)])
 
 
 def first_vertices(expansion: Expansion) -> Int[np.ndarray, " rows"]:
@@ -101,7 +79,9 @@ def _inside(shape: tuple[int, ...], place: Place, rim: int) -> Bool[np.ndarray, 
     return found
 
 
-def _rows_of(expansion: Expansion, place: Place | None) -> Part:
+def part_by_heights(expansion: Expansion, place: Place | None) -> tuple[Sparse, Int[np.ndarray, " rows"]]:
+    """The derivative in such heights, as that of `pictures_by_heights`, of the values that depend on no others, but for those
+    of pixels that a boundary crosses; and these values' places in the order of `in_row`, rising. None: of all."""
     problem, heights = expansion.problem, expansion.heights
     slopes = _slopes(*on_every_device((heights, expansion.unknowns, problem), problem.mesh))
     near, core = (None if place is None else _inside(heights.shape, place, rim) for rim in (0, 1))
@@ -117,16 +97,12 @@ def _rows_of(expansion: Expansion, place: Place | None) -> Part:
         )
         values += [first + (k * h * w + pixels[k]) * c + channel for k in range(n) for channel in range(c)]
         first += n * h * w * c
-    exposures = expansion.unknowns.exposures
-    factors = [
-        np.asarray(group.weights) * (1 if exposures is None else np.asarray(exposures)[list(group.indices), None, None, None])
-        for group in problem.groups
-    ]
+    exposures = np.ones(problem.count) if expansion.unknowns.exposures is None else np.asarray(expansion.unknowns.exposures)
+    factors = np.concatenate([np.ravel(np.asarray(group.weights) * group.each(exposures)) for group in problem.groups])
     places = np.concatenate(values)
     order = np.argsort(places)
-    places = places[order]
-    matrix = sp.vstack(blocks, format="csr")[order]
-    return Part(scaled(matrix, np.concatenate([factor.ravel() for factor in factors])[places]), places)
+    matrix = scaled(sp.vstack(blocks, format="csr")[order], factors[places[order]])
+    return matrix if near is None else matrix[:, np.flatnonzero(near)], places[order]
 
 
 def _pixels_at(
@@ -171,7 +147,7 @@ def _slopes(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem
         first = jax.tree.map(lambda leaf: leaf[0], group.scenes)
 
         def values(heights: Array, group: Group = group, scene: Scene = first) -> Array:
-            return vertex_values(make_world(completion(unknowns, group, heights)(scene), problem.settings))
+            return vertex_values(make_world(group.complete(scene, heights, unknowns.albedo), problem.settings))
 
         _, change = jax.linearize(values, heights)
         slopes.append(lax.map(lambda k, change=change: change((phase == k).astype(heights.dtype)), jnp.arange(_REACH**2)))

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.sparse
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -41,11 +42,14 @@ class Unknowns(eqx.Module):
 
     def at_base(self) -> "Unknowns":
         """The same but for the modes, which are 0: those of a surface that has become the base."""
-        return eqx.tree_at(lambda u: u.coefficients, self, jnp.zeros_like(self.coefficients))
+        return self.with_modes(jnp.zeros_like(self.coefficients))
+
+    def with_modes(self, coefficients: Any) -> Any:
+        return eqx.tree_at(lambda u: u.coefficients, self, coefficients, is_leaf=lambda leaf: leaf is None)
 
     def without_modes(self) -> Any:
         """All but the coefficients, which are None."""
-        return eqx.tree_at(lambda u: u.coefficients, self, None)
+        return self.with_modes(None)
 
     @property
     def count(self) -> int:
@@ -190,10 +194,14 @@ def make_heights(owner: str, name: str, value: Any, field: Heightfield) -> Float
 
 def resample(heights: Float[np.ndarray, "my mx"], shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:
     """The bilinear surface through a grid over the same footprint, at the vertices of another grid."""
-    for axis, count in enumerate(shape):
-        old = heights.shape[axis]
-        at = np.linspace(0, old - 1, count)
-        low = np.minimum(at.astype(int), old - 2)
-        share = np.expand_dims(at - low, 1 - axis)
-        heights = (1 - share) * np.take(heights, low, axis) + share * np.take(heights, low + 1, axis)
+    for count in shape:  # rows and then columns, which each turn makes rows
+        heights = (interpolation(np.linspace(0, len(heights) - 1, count), len(heights)) @ heights).T
     return heights
+
+
+def interpolation(at: Float[np.ndarray, " m"], count: int) -> Any:
+    """The sparse matrix that takes so many values in a row to those at places between them, linearly."""
+    low = np.minimum(at.astype(int), count - 2)
+    entries = np.concatenate([1 - (at - low), at - low])
+    places = np.tile(np.arange(at.size), 2), np.concatenate([low, low + 1])
+    return scipy.sparse.csr_array((entries, places), shape=(at.size, count))

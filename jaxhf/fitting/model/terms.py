@@ -3,6 +3,7 @@
 import math
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -43,26 +44,14 @@ class Term(eqx.Module):
 
 
 class Terms(eqx.Module):
-    """A `Term` for each of the `Unknowns`; None for what is known."""
+    """The `Term` of the surface, and those of what else is sought, as its numbers follow one another in `Unknowns`."""
 
     surface: Term
-    albedo: Term | None
-    exposures: Term | None
-    offsets: Term | None
-    light: Term | None
-    camera: Term | None
+    besides: tuple[Term, ...]
 
     def others(self, unknowns: Unknowns) -> list[tuple[Term, Float[Array, "..."]]]:
         """Those of what is sought besides the surface, each with its numbers."""
-        view = unknowns.view
-        pairs = (
-            (self.albedo, unknowns.albedo),
-            (self.exposures, unknowns.exposures),
-            (self.offsets, unknowns.offsets),
-            (self.light, view.light),
-            (self.camera, view.camera),
-        )
-        return [(term, values) for term, values in pairs if term is not None and values is not None]
+        return list(zip(self.besides, jax.tree.leaves(unknowns.without_modes()), strict=True))
 
 
 def make_terms(
@@ -86,20 +75,20 @@ def make_terms(
     surface = _shape_term(field, start) if prior is None else _prior_term(field, prior)
     if free is not None:
         surface = eqx.tree_at(lambda term: term.weight, surface, surface.weight * jnp.asarray(free, dtype))
-    light = camera = None
+    others = []
+    if unknown.albedo is not None:
+        others.append(term(one, one / unknown.albedo_std))
+    if unknown.exposures:
+        others.append(term(one, one))
+    if unknown.offsets:
+        others.append(term(none, one))
     if view_unit.light is not None and unknown.light_std is not None:
-        light = term(none, (view_unit.light / math.radians(unknown.light_std))[None])
+        others.append(term(none, (view_unit.light / math.radians(unknown.light_std))[None]))
     if view_unit.camera is not None and unknown.camera_std is not None:
         position, rotation = unknown.camera_std
-        camera = term(none, (view_unit.camera / np.array([position] * 3 + [math.radians(rotation)] * 3, dtype))[None])
-    return Terms(
-        surface,
-        None if unknown.albedo is None else term(one, one / unknown.albedo_std),
-        term(one, one) if unknown.exposures else None,
-        term(none, one) if unknown.offsets else None,
-        light,
-        camera,
-    )
+        deviations = np.array([position] * 3 + [math.radians(rotation)] * 3, dtype)
+        others.append(term(none, (view_unit.camera / deviations)[None]))
+    return Terms(surface, tuple(others))
 
 
 def _shape_term(field: Heightfield, start: Float[np.ndarray, "my mx"]) -> Term:

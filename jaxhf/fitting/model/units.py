@@ -1,6 +1,6 @@
 """Units of the modes of a surface in which the loss of a fit has the same curvature along each of them."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,36 +14,22 @@ from .surface import slope_units
 _LEAST_CURVATURE = 1e-6
 
 
-class Units(NamedTuple):
-    """How the loss is curved about some unknowns.
-
-    Attributes:
-      modes: the units of the modes, see `Basis.scale`, shape (my, mx).
-      curvature: of the loss along each of them, in these units.
-      others: by how much more it is curved along each number of the other unknowns; a tree as these.
-    """
-
-    modes: Float[np.ndarray, "my mx"]
-    curvature: float
-    others: Any
-
-
-def balanced(expansion: Expansion) -> Units:
-    """These units about an expansion, see `_balanced_units`."""
+def balanced(expansion: Expansion) -> tuple[Float[np.ndarray, "my mx"], float, Any]:
+    """The units of the modes, see `Basis.scale`, in which the loss has the same curvature along each of them, that curvature,
+    and by how much more it is curved along each number of the other unknowns: a tree as these."""
     problem, unknowns = expansion.problem, expansion.unknowns
     slopes, _ = slope_units(problem.basis.base.shape, problem.field.dx, problem.field.dy)
     gradients, of_others = expansion.random_gradients()
     modes, curvature = _balanced_units(slopes, mode_curvature(problem, gradients))
-    known = {id(values): np.asarray(term.weight, np.float64) ** 2 for term, values in problem.terms.others(unknowns)}
-
-    def relative(values: Any, *draws: Any) -> Any:
+    others = []
+    for (term, values), *draws in zip(problem.terms.others(unknowns), *map(jax.tree.leaves, of_others), strict=True):
         # Of one kind and one place in each picture, as its light's first angle, or of all texels: few draws tell little more.
         squares = np.mean(np.square(draws, dtype=np.float64), axis=0)
         along = tuple(range(squares.ndim)) if squares.ndim != 2 else 0
-        total = np.broadcast_to(squares.mean(axis=along, keepdims=True), squares.shape) + known[id(values)]
-        return np.asarray(np.maximum(total / curvature, _LEAST_CURVATURE), values.dtype)
-
-    return Units(modes, curvature, jax.tree.map(relative, unknowns.without_modes(), *of_others))
+        total = np.broadcast_to(squares.mean(axis=along, keepdims=True), squares.shape)
+        total = total + np.asarray(term.weight, np.float64) ** 2
+        others.append(np.asarray(np.maximum(total / curvature, _LEAST_CURVATURE), values.dtype))
+    return modes, curvature, jax.tree.unflatten(jax.tree.structure(unknowns.without_modes()), others)
 
 
 def _balanced_units(
@@ -72,9 +58,7 @@ def mode_curvature(problem: Problem, gradients: Float[np.ndarray, "k ny nx"]) ->
     That of the pictures, the diagonal of JᵀJ, is the mean square of Jᵀz over draws of z, and over neighbouring modes; in that
     of the prior, weights count by their mean square.
 
-    Args:
-      problem: see there.
-      gradients: Jᵀz in the heights, see `Expansion.random_gradients`.
+    `gradients`: Jᵀz in the heights, see `Expansion.random_gradients`.
     """
     basis, term = problem.basis, problem.terms.surface
     rows, columns = np.asarray(basis.rows, np.float64), np.asarray(basis.columns, np.float64)

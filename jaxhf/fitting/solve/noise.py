@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..model.expansion import Expansion
-from ..model.linearise import changing_pixels
 from ..model.near_inverse import near_inverse, normal_matrix
-from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, PartMatrix, in_row
+from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, Place, in_row
 from ..model.problem import Problem
-from ..model.rows import Place, can_have_rows, first_vertices, part_by_heights
+from ..model.rows import can_have_rows, first_vertices, part_by_heights
 
 _FAR = 6.0  # times the median: four standard deviations of normal errors; what is farther off is not explained
 _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
@@ -77,16 +76,14 @@ def explains_noise(problem: Problem) -> bool:
 
 
 class Restricted:
-    """Restricted maximum likelihood about an expansion: the noise of pictures, and how much of it heights explain.
+    """Restricted maximum likelihood about an expansion, all of whose modes are varied: the noise of pictures, and how much of
+    it heights explain.
 
     Residuals r of a picture with n values have |r|² = σ² (n - tr A), A the hat matrix (Patterson and Thompson, Biometrika 58,
     545, 1971; Harville, JASA 72, 320, 1977). The trace is that of simulated fits: what they leave of noise. The prior decides
     how much of the noise heights explain, and is seldom quite the terrain's (Wahba, Annals of Statistics 13, 1378, 1985), so
     the deviations of its modes are estimated too, octave by octave: τ² = |u|² / g, u the modes in units of the prior, g how
     many of them the pictures tell. All that is in the linear model about the expansion.
-
-    Args:
-      expansion: where the fit stands, all modes varied.
     """
 
     def __init__(self, expansion: Expansion):
@@ -101,7 +98,7 @@ class Restricted:
         widths = np.ones(OCTAVES)
         noise, far, change, draws = problem.noise.copy(), np.zeros(labels.size, bool), None, [None] * _draws(labels)
         for _ in range(_ROUNDS):
-            here = problem.with_noise(noise, self._expansion.sampling)
+            here = self._expansion.with_noise(noise).problem
             factors = self._factors(here)
             matrix = self._matrix.weighted(factors * np.where(far, _NO_WEIGHT, 1.0), by_mode(widths, self._matrix.shape))
             change = matrix.solved(-matrix.gradient(matrix.roots * self._rows), _TOLERANCE, change)
@@ -114,7 +111,7 @@ class Restricted:
                 for k, which in _each_picture(labels):
                     simulated = np.concatenate([draw.left[which] for draw in draws])
                     if np.mean(simulated**2) > _LEAST_FREE:
-                        noise[k] = _rms(deviations[which]) * _bounded(left[which]) / _bounded(simulated)
+                        noise[k] = rms(deviations[which]) * _bounded(left[which]) / _bounded(simulated)
                 noise = np.maximum(noise, problem.least_noise)
             far = self._far_off(left)
             if problem.known:
@@ -130,7 +127,7 @@ class Restricted:
     def freedom(self, estimate: Estimate) -> Freedom:
         """How much of its pictures' noise a fit leaves, by simulated fits of heights that vary as was estimated."""
         problem, labels = self._expansion.problem, self._labels
-        factors = self._factors(problem.with_noise(estimate.noise, self._expansion.sampling))
+        factors = self._factors(self._expansion.with_noise(estimate.noise).problem)
         roots = factors * np.where(self._far_off(factors * self._rows), _NO_WEIGHT, 1.0)
         matrix = self._matrix.weighted(roots, np.ones(self._matrix.shape))
         wider = by_mode(estimate.widths, matrix.shape)
@@ -165,7 +162,7 @@ def _told(expansion: Expansion, labels: Labels) -> tuple[Int[np.ndarray, " value
     if place is None:
         return np.arange(labels.size), normal_matrix(expansion, np.ones(labels.size))
     rows, values = part_by_heights(expansion, place)
-    matrix = PartMatrix(expansion, np.ones(values.size), rows, place)
+    matrix = NormalMatrix(expansion, np.ones(values.size), rows, place)
     matrix.inverse = near_inverse(matrix)
     return values, matrix
 
@@ -245,18 +242,15 @@ def _values_that_tell(expansion: Expansion) -> Labels:
     than half of the noise, and more than those of half of the pixels.
     """
     problem, found = expansion.problem, []
-    for group, known in zip(problem.groups, expansion.linearised, strict=True):
+    for group, known, informing in zip(problem.groups, expansion.linearised, expansion.informing(), strict=True):
         labels = np.full(group.targets.shape, -1)
-        changing = None if known is None else changing_pixels(known)
-        for position, k in enumerate(group.indices):
-            counted = np.asarray(group.given)[position] > 0
-            if known is not None and changing is not None:
-                shown = counted & changing[position][..., None]
-                if shown.any():
-                    error = np.broadcast_to(np.asarray(known.sampling)[position][..., None], shown.shape)
-                    most = max(np.median(error[shown]), _FINE * problem.noise[k])
-                    counted = shown & (error <= most)
-            labels[position][counted] = k
+        for position, (k, told) in enumerate(zip(group.indices, informing, strict=True)):
+            if not told.any():
+                told = np.asarray(group.given)[position] > 0
+            elif known is not None:
+                error = np.broadcast_to(np.asarray(known.sampling)[position][..., None], told.shape)
+                told = told & (error <= max(np.median(error[told]), _FINE * problem.noise[k]))
+            labels[position][told] = k
         found.append(labels)
     return in_row(found).astype(int)
 
@@ -272,10 +266,10 @@ def _draws(labels: Labels) -> int:
 def _bounded(values: Float[np.ndarray, " n"]) -> float:
     """The root mean square of what is not far off."""
     sizes = np.abs(values)
-    return _rms(sizes[sizes <= _FAR * np.median(sizes)])
+    return rms(sizes[sizes <= _FAR * np.median(sizes)])
 
 
-def _rms(values: Float[np.ndarray, " n"]) -> float:
+def rms(values: Float[np.ndarray, " n"]) -> float:
     return float(np.sqrt(np.mean(values * values)))
 
 
@@ -291,6 +285,5 @@ def _weights(problem: Problem) -> Float[np.ndarray, " rows"]:
 
 def _pictures(problem: Problem) -> Labels:
     """The number of its picture, for each value."""
-    groups = problem.groups
-    numbers = [np.broadcast_to(np.reshape(group.indices, (-1, 1, 1, 1)), group.targets.shape) for group in groups]
-    return in_row(numbers).astype(int)
+    numbers = np.arange(problem.count)
+    return in_row([np.broadcast_to(group.each(numbers), group.targets.shape) for group in problem.groups]).astype(int)

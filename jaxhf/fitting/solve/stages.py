@@ -70,7 +70,7 @@ def on_finer(state: State, problems: Sequence[Problem], level: int, given: Given
     change = coarse.basis.crop(np.asarray(there, np.float64) - np.asarray(coarse.basis.base, np.float64))
     shape, dtype = fine.field.heights.shape, fine.field.heights.dtype
     base = np.asarray(fine.basis.base, np.float64) + pad(resample(change, shape), fine.basis.padding)
-    unknowns = eqx.tree_at(lambda u: u.coefficients, state.unknowns, jnp.zeros_like(fine.basis.base))
+    unknowns = state.unknowns.with_modes(jnp.zeros_like(fine.basis.base))
     if unknowns.albedo is not None and unknowns.albedo.shape != fine.albedo_shape:  # one factor for each vertex
         channels = np.moveaxis(np.asarray(unknowns.albedo, np.float64), -1, 0)
         finer = np.stack([resample(channel, shape) for channel in channels], -1)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import hashlib
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ class State:
       begin: those at which the present stage began, with coefficients 0.
       base: the surface there, shape (my, mx).
       units: of the modes, see `Basis.scale`, shape (my, mx).
-      others: the curvature along the other unknowns, see `Units`.
+      others: the curvature along the other unknowns, see `balanced`.
       noise, loss_scale: see `Problem`.
       widths: how many times wider than their prior heights vary, see `Estimate`; 1 where that is not estimated.
       step_size: 1 / λ of the next step.
@@ -65,12 +66,7 @@ class State:
     @property
     def rejections(self) -> int:
         """How many of them were rejected since the last accepted one."""
-        count = 0
-        for step in reversed(self.steps):
-            if step.accepted:
-                break
-            count += 1
-        return count
+        return len(list(itertools.takewhile(lambda step: not step.accepted, reversed(self.steps))))
 
     def posed(self, problem: Problem, share: float) -> Problem:
         """The problem of this stage, which varies such a share of the modes, but for the noise."""

@@ -19,6 +19,8 @@ _REJECTED = 0.25  # by which 1 / λ is multiplied at a rejected step, the first 
 _LEAST_GAIN = 0.01  # of what was predicted: a step that lowers the loss by less is rejected
 _GOOD = 0.75  # of it: after a step that lowers the loss by more, 1 / λ is multiplied by _HIGHER
 _HIGHER = 4.0
+_TOLERANCE = 0.1  # of a step's linear problem: solved to 0.01 steps took twice as long, and fits came no nearer
+_ITERATIONS = 120  # of conjugate gradients
 
 
 class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
@@ -58,7 +60,7 @@ class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
 
         def inverse(x: Unknowns) -> Unknowns:
             others = jax.tree.map(lambda value, curvature: value / curvature, x.without_modes(), self.others)
-            return eqx.tree_at(lambda u: u.coefficients, others, x.coefficients, is_leaf=lambda leaf: leaf is None)
+            return others.with_modes(x.coefficients)
 
         found, _ = jax.scipy.sparse.linalg.cg(product, right, tol=tolerance, maxiter=self.iterations, M=inverse)
         return found, optx.RESULTS.successful
@@ -78,10 +80,10 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     search: Any
     verbose: Callable[..., None]
 
-    def __init__(self, rejections: int, tolerance: float, iterations: int, others: Any):
+    def __init__(self, rejections: int, others: Any):
         self.rtol = self.atol = 0.0  # when a fit ends, `run` decides
         self.norm = optx.rms_norm
-        self.descent = ConjugateGradients(tolerance, iterations, others)
+        self.descent = ConjugateGradients(_TOLERANCE, _ITERATIONS, others)
         self.search = optx.ClassicalTrustRegion(
             high_cutoff=_GOOD,
             low_cutoff=_LEAST_GAIN,
@@ -111,11 +113,11 @@ class Outcome(NamedTuple):
       change: of the heights, root mean square.
     """
 
-    loss: Scalar
-    accepted: Flag
-    predicted: Scalar
+    loss: Scalar | float
+    accepted: Flag | bool
+    predicted: Scalar | float
     step_size: Scalar
-    change: Scalar
+    change: Scalar | float
 
 
 _OPTIONS: dict[str, Any] = {}
@@ -126,42 +128,40 @@ def first_position(expansion: Expansion) -> Any:
     """The form of optimistix's state of a fit, with `jax.ShapeDtypeStruct`s for its arrays.
 
     Call it once for each size of a problem: a state also holds compiled functions, which compare by identity, so that a step
-    that is given the state of another call would be compiled again. `position_at` makes states of that form.
+    that is given the state of another call would be compiled again.
     """
 
     def first(expansion: Expansion) -> Any:
         others = expansion.unknowns.without_modes()
-        solver, about = LevenbergMarquardt(0, 0.0, 0, others), (expansion.problem, expansion.linearised)
+        solver, about = LevenbergMarquardt(0, others), (expansion.problem, expansion.linearised)
         shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, about)
         return solver.init(residuals, expansion.unknowns, about, _OPTIONS, shape, None, _TAGS)
 
     return eqx.filter_eval_shape(first, expansion)
 
 
-def position_at(first: Any, unknowns: Unknowns, step_size: Float[Array, ""]) -> Any:
-    """optimistix's state at these unknowns, before anything is evaluated there; `first` is what `first_position` made.
+def position_at(form: Any, unknowns: Unknowns, step_size: Float[Array, ""]) -> Any:
+    """optimistix's state at these unknowns, before anything is evaluated there; `form`: `first_position`, or a state after it.
 
     The next step evaluates there, and always accepts: the state is then, to the bit, what it was after the step that reached
     them, if 1 / λ is the same. So a checkpoint need not hold linearised pictures.
     """
-    empty = _empty(first)
+    empty = _empty(form)
     begin = jnp.ones_like(empty.first_step), unknowns, step_size.astype(empty.search_state.step_size.dtype)
     return eqx.tree_at(lambda state: (state.first_step, state.y_eval, state.search_state.step_size), empty, begin)
 
 
 def advance(
-    unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int, tolerance: float, iterations: int
+    unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int
 ) -> tuple[Unknowns, Any, Outcome]:
     """One step: new unknowns, which are the old ones if the step is rejected, optimistix's new state, and what it did.
 
     Args:
       unknowns, position: of the step before. What the state holds of J makes room for that of the new one: it is gone.
       expansion: at `position.y_eval`.
-      others: see `ConjugateGradients`.
       rejections: how many steps before were rejected in a row.
-      tolerance, iterations: see `ConjugateGradients`.
     """
-    solver = LevenbergMarquardt(rejections, tolerance, iterations, others)
+    solver = LevenbergMarquardt(rejections, others)
     of_j, rest = _of_j(position)
     kept = on_every_device((solver, unknowns, rest, expansion), expansion.problem.mesh)
     return _advance(kept, divided(of_j, expansion.problem.mesh))

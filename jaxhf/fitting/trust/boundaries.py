@@ -26,9 +26,7 @@ class Boundaries:
     equation of restricted maximum likelihood for a variance component, made robust by Huber's proposal 2 (Richardson and
     Welsh, Biometrics 51, 1429, 1995). Heights were fitted without τ, so their covariance is H⁻¹ Jᵀ diag(s²) J H⁻¹.
 
-    Args:
-      expansion: where the fit ended.
-      rows: `pictures_by_heights` there.
+    `rows`: `pictures_by_heights` of the expansion.
     """
 
     def __init__(self, expansion: Expansion, rows: Any):

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ..history import Draws
 from ..model.expansion import Expansion
 from ..model.near_inverse import robust_matrix
+from ..model.normal_matrix import Noise
 from ..model.robust import influence_function
 from .boundaries import Boundaries
 
@@ -51,12 +52,7 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
     inverse is the covariance (Laplace's approximation). Albedo, exposures, offsets, lights and cameras vary along, so their
     doubt counts too. Draws x = H⁻¹ Jᵀz, z normal, have that covariance (Papandreou and Yuille, Gaussian sampling by local
     perturbations, NIPS 2010, section 3), so each deviation is right to 1 / √(2 · count), however the heights are correlated.
-    Where pictures bear it out, boundaries are displaced, see `Boundaries`.
-
-    Args:
-      expansion: where the fit ended; all modes are varied.
-      count: of draws.
-      report: called after each.
+    Where pictures bear it out, boundaries are displaced, see `Boundaries`. All modes of the expansion are varied.
 
     Raises:
       KeyboardInterrupt: Ctrl-C before there were two draws, or one of displaced boundaries.
@@ -83,8 +79,7 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
 
         def response(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             """What an error of the pictures, in units of their noise, makes of the heights, and what is left of it."""
-            noise = matrix.drawn(0)
-            alone = noise._replace(pictures=matrix.roots * error, modes=0 * noise.modes, others=0 * noise.others)
+            alone = Noise(matrix.roots * error, np.zeros(matrix.shape), np.zeros_like(matrix.others_weight))
             change = matrix.solved(matrix.gathered(alone), tolerance)
             return matrix.heights_of(change), error - matrix.seen(change) / matrix.roots
 
@@ -105,7 +100,6 @@ def with_unexplained(
     the loss divided, so that W stays; the prior keeps its own deviations.
 
     Args:
-      expansion: where the fit ended.
       residuals: of the pictures, in units of the noise, without those of a background that is explained.
       free: (N - p) / N, see `Freedom`; None: p is how many heights there are.
     """
@@ -117,5 +111,5 @@ def with_unexplained(
     factor = float(np.sqrt(np.mean(psi**2) * np.mean(weight) / np.mean(slope) ** 2 / share))
     if not factor > 1:
         return expansion, 1.0
-    wider = problem.with_noise(factor * problem.noise, expansion.sampling)
-    return expansion.of(dataclasses.replace(wider, loss_scale=problem.loss_scale / factor)), factor
+    wider = dataclasses.replace(problem, loss_scale=problem.loss_scale / factor)
+    return expansion.of(wider).with_noise(factor * problem.noise), factor

@@ -12,7 +12,6 @@ from ...trace.normals import vertex_normals
 from ...xla.compilation import compiled
 from ..given import Given
 from ..model.expansion import Expansion
-from ..model.linearise import changing_pixels
 from ..model.problem import Problem
 from ..model.robust import influence_function
 from ..solve.noise import Freedom, octaves
@@ -132,33 +131,20 @@ def _cause(left: Left, given: Given) -> str:
     return f"{prior}{off}; {_REFLECTANCE}"
 
 
-def informing_values(expansion: Expansion) -> list[Bool[np.ndarray, "h w c"]]:
-    """Which values of each picture depend on the heights; all of those with a weight where that is not known."""
-    found = [np.zeros((1, 1, 1), bool)] * expansion.problem.count
-    for group, known in zip(expansion.problem.groups, expansion.linearised, strict=True):
-        informing = np.asarray(group.weights) > 0
-        if known is not None:
-            informing &= changing_pixels(known)[..., None]
-        for k, values in zip(group.indices, informing, strict=True):
-            found[k] = values
-    return found
-
-
 def boundary_places(expansion: Expansion) -> list[Places]:
     """Where boundaries are in each picture."""
-    found = [Places(np.zeros((1, 1), bool), None)] * expansion.problem.count
+    found = []
     for group, known in zip(expansion.problem.groups, expansion.linearised, strict=True):
-        h, w = group.targets.shape[1:3]
-        for position, k in enumerate(group.indices):
-            if known is None:
-                found[k] = Places(np.zeros((h, w), bool), None)
-            elif known.edges is None:
-                found[k] = Places(~np.asarray(known.depends)[position], None)
-            else:
-                pixel, kind = np.asarray(known.edges.pixel)[position], np.asarray(known.edges.kind)[position]
-                silhouettes, shadows = (np.bincount(pixel[kind == which], minlength=h * w) > 0 for which in (1, 2))
-                found[k] = Places(silhouettes.reshape(h, w), shadows.reshape(h, w))
-    return found
+        n, h, w, _ = group.targets.shape
+        if known is None:
+            found.append([Places(np.zeros((h, w), bool), None)] * n)
+        elif known.edges is None:
+            found.append([Places(shaded, None) for shaded in ~np.asarray(known.depends)])
+        else:
+            edges = zip(np.asarray(known.edges.pixel), np.asarray(known.edges.kind), strict=True)
+            counts = [[np.bincount(pixel[kind == which], minlength=h * w) for which in (1, 2)] for pixel, kind in edges]
+            found.append([Places(*(count.reshape(h, w) > 0 for count in both)) for both in counts])
+    return expansion.problem.by_picture(found)
 
 
 def what_may_help(expansion: Expansion, pictures: Sequence[Left], given: Given) -> str:
@@ -266,7 +252,6 @@ def why_noise_is_unsure(problem: Problem, unknowns: int, freedom: Freedom | None
     """Why an estimate of the noise may be too small, in words; None: it is sure.
 
     Args:
-      problem: of the fit.
       unknowns: how many numbers were sought.
       freedom: None: it is not known.
     """
@@ -292,7 +277,6 @@ def chi_squared(
     and Weisberg, Residuals and influence in regression, 1982, section 2.2).
 
     Args:
-      problem: of the fit.
       residuals: in units of the noise, picture after picture.
       counts: how many of them each picture has.
       freedom: None: heights are few, and explain nothing of the noise.

@@ -1,17 +1,21 @@
 """What a fit's end is worth: what its pictures leave unexplained, how sure its heights are, and what speaks against them."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ...core.settings import Settings
+from ...core.types import AnyArray
+from ...scene.scene import Scene
 from ..given import Given
-from ..history import Stop
-from ..model.expansion import Expansion
+from ..history import Step, Stop
+from ..model.expansion import Expansion, found_scenes
 from ..model.problem import Problem
 from ..solve.noise import Freedom, Restricted, explains_noise
-from ..solve.run import Ended, with_all_modes
+from ..solve.run import Ended
 from ..solve.stages import varies_all
 from .deviations import standard_deviations, with_unexplained
 from .facts import (
@@ -19,7 +23,6 @@ from .facts import (
     boundary_places,
     chi_squared,
     dependent_channels,
-    informing_values,
     light_directions,
     misfit_of_length,
     shows_mean,
@@ -33,31 +36,67 @@ from .words import FAR_FROM_ONE, Findings, Region, warnings, where_residuals_are
 _OFF = 3.0  # standard deviations of the noise by which a background must be off to count
 
 
-class Judgement(NamedTuple):
-    """See `Fit`, whose attributes these are; images and residuals have shape (h, w, c).
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """What `fit` found.
 
     Attributes:
-      expansion: at the end, all modes varied.
+      heights: shape (ny, nx), in the dtype of the scenes' heights.
+      result: why it stopped.
+      std: standard deviation of each height, shape (ny, nx); infinite where nothing says anything about it. None where no
+        draws were asked for.
+      samples: terrains that pictures and prior allow, one for each draw, shape (draws, ny, nx): what is derived from each, a
+        slope or a volume, varies as it is unsure. None as `std`.
+      seen: whether a change of the height would change any picture, shape (ny, nx).
+      albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c); None where it was known.
+      exposures, offsets: of each picture; None where they were known.
+      noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated.
+      scenes: as they were given, with all that was found: heights, albedo, lights and cameras.
+      settings: those that were given, with all that was chosen: `render` with them makes `images` of `scenes`, but for the
+        pixels that a boundary crosses, which have more samples in a fit.
+      images: the pictures as they would be measured, (h, w) or (h, w, c) each, as their targets.
+      residuals: `images` - targets; 0 where a target has no weight.
+      regions: the three blocks of the pictures with the largest residuals.
+      warnings: what speaks against trusting the heights, a sentence each; empty where nothing does.
+      stats: steps, accepted, seconds, loss; chi2, the mean square of the pictures' residuals, by degree of freedom, in units of
+        `noise` and the error of their samples, without a background that is explained: about 1 where `noise` is right and all
+        is explained.
+      history: a `Step` for each step.
     """
 
-    expansion: Expansion
-    images: list[Float[np.ndarray, "h w c"]]
-    residuals: list[Float[np.ndarray, "h w c"]]
-    regions: tuple[Region, ...]
-    seen: Bool[np.ndarray, "ny nx"]
+    heights: Float[AnyArray, "ny nx"]
+    result: Stop
     std: Float[np.ndarray, "ny nx"] | None
     samples: Float[np.ndarray, "draws ny nx"] | None
-    chi2: float
+    seen: Bool[np.ndarray, "ny nx"]
+    albedo: Float[AnyArray, "ty tx c"] | None
+    exposures: Float[AnyArray, " pictures"] | None
+    offsets: Float[AnyArray, " pictures"] | None
+    noise: Float[np.ndarray, " pictures"]
+    scenes: tuple[Scene, ...]
+    settings: Settings
+    images: tuple[np.ndarray, ...]
+    residuals: tuple[np.ndarray, ...]
+    regions: tuple[Region, ...]
     warnings: tuple[str, ...]
+    stats: dict[str, int | float]
+    history: tuple[Step, ...]
 
 
 @np.errstate(over="ignore")  # of a fit that ended as not finite
-def judged(ended: Ended, problems: Sequence[Problem], given: Given, report: Callable[..., None] | None) -> Judgement:
-    """The judgement; `problems` are those of `run`. `report` is called after each draw."""
+def judged(
+    ended: Ended,
+    problems: Sequence[Problem],
+    scenes: tuple[Scene, ...],
+    targets: Sequence[np.ndarray],
+    given: Given,
+    report: Callable[..., None] | None,
+) -> Fit:
+    """What was found; `problems` are those of `run`. `report` is called after each draw."""
     fitted = varies_all(ended.state, problems) and bool(np.isfinite(ended.state.loss))
-    expansion, free = _restricted(with_all_modes(ended, problems, given), fitted, given)
+    expansion, free = _restricted(ended.expansion, fitted, given)
     problem = expansion.problem
-    left, residuals = _left(expansion)
+    left = _left(expansion)
     in_noise = [picture.residual for picture in left]
     counts = [picture.informing | (np.abs(picture.residual) > _OFF) for picture in left]
     counted = np.concatenate([values[which] for values, which in zip(in_noise, counts, strict=True)]).astype(np.float64)
@@ -93,8 +132,34 @@ def judged(ended: Ended, problems: Sequence[Problem], given: Given, report: Call
         draws=(0, 0) if samples is None else (given.draws, len(samples)),
         parts=parts,
     )
-    images = [picture.image for picture in left]
-    return Judgement(expansion, images, residuals, regions, seen, std, samples, chi2, warnings(findings))
+    found, state = expansion.unknowns, ended.state
+    off = [np.where(picture.residual == 0, 0, picture.image - picture.target) for picture in left]
+    images, residuals = (tuple(map(_in_shape, each, map(np.shape, targets))) for each in ([p.image for p in left], off))
+    return Fit(
+        heights=jnp.asarray(problem.basis.crop(np.asarray(problem.basis.base))),
+        result=ended.stop,
+        std=std,
+        samples=samples,
+        seen=seen,
+        albedo=found.albedo,
+        exposures=found.exposures,
+        offsets=None if found.offsets is None else found.offsets * problem.bright,
+        noise=problem.noise,
+        scenes=found_scenes(scenes, found, problem),
+        settings=problem.settings,
+        images=images,
+        residuals=residuals,
+        regions=regions,
+        warnings=warnings(findings),
+        stats={
+            "steps": len(state.history),
+            "accepted": sum(step.accepted for step in state.history),
+            "seconds": state.seconds,
+            "loss": state.loss,
+            "chi2": chi2,
+        },
+        history=state.history,
+    )
 
 
 def _restricted(expansion: Expansion, fitted: bool, given: Given) -> tuple[Expansion, Freedom | None]:
@@ -105,20 +170,21 @@ def _restricted(expansion: Expansion, fitted: bool, given: Given) -> tuple[Expan
     restricted = Restricted(expansion)
     estimate = restricted.noise(given.noise is None)
     if given.noise is None:
-        expansion = expansion.of(expansion.problem.with_noise(estimate.noise, expansion.sampling))
+        expansion = expansion.with_noise(estimate.noise)
     return expansion, restricted.freedom(estimate)
 
 
-def _left(expansion: Expansion) -> tuple[list[Left], list[Float[np.ndarray, "h w c"]]]:
-    """What is left of each picture, and picture - target."""
-    problem, informing = expansion.problem, informing_values(expansion)
-    found: dict[int, Left] = {}
-    residuals: dict[int, np.ndarray] = {}
-    for group, simulated in zip(problem.groups, expansion.pictures(), strict=True):
-        simulated, weights, measured = np.asarray(simulated), np.asarray(group.weights), np.asarray(group.targets)
-        difference = np.where(weights > 0, simulated - measured, 0)
-        for k, image, target, values, weight in zip(group.indices, simulated, measured, difference, weights, strict=True):
-            residuals[k] = values
-            numbers = float(problem.noise[k]), float(problem.brightness[k])
-            found[k] = Left(image, target, values * weight, informing[k], *numbers)
-    return [found[k] for k in sorted(found)], [residuals[k] for k in sorted(residuals)]
+def _left(expansion: Expansion) -> list[Left]:
+    """What is left of each picture."""
+    problem, groups = expansion.problem, expansion.problem.groups
+    rows = expansion.pictures(), [group.targets for group in groups], [group.weights for group in groups], expansion.informing()
+    images, targets, weights, informing = (problem.by_picture([np.asarray(part) for part in parts]) for parts in rows)
+    pairs = zip(images, targets, weights, strict=True)
+    off = [np.where(weight > 0, image - target, 0) * weight for image, target, weight in pairs]
+    numbers = problem.noise.tolist(), problem.brightness.tolist()
+    return list(map(Left, images, targets, off, informing, *numbers))
+
+
+def _in_shape(image: Float[np.ndarray, "h w c"], shape: tuple[int, ...]) -> np.ndarray:
+    """An image in the shape of its target; a grey one that was given with three channels is compared as one."""
+    return np.broadcast_to(image, (*image.shape[:2], *shape[2:])).copy() if len(shape) == 3 else image[..., 0]

@@ -1,9 +1,10 @@
 """What a fit says about its result: where the pictures are left unexplained, and what its heights cannot be trusted for."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.ndimage
 from jaxtyping import Bool, Float
 
 from ..history import Stop
@@ -15,6 +16,9 @@ _NOISY = 0.1  # of the brightness
 _REGIONS = 3
 _BLOCKS = 16  # along a picture's longer side
 _LEAST_BLOCK = 4  # pixels
+_AROUND = np.ones((3, 3))  # a pixel and its eight neighbours
+
+ndimage: Any = scipy.ndimage  # whose stubs miss much
 
 
 class Region(NamedTuple):
@@ -75,11 +79,11 @@ def where_residuals_are(residuals: Sequence[Float[np.ndarray, "h w c"]], places:
     total = at_silhouettes = at_shadows = 0.0
     for residual, place in zip(residuals, places, strict=True):
         squares = np.sum(np.square(residual, dtype=np.float64), axis=-1)
-        near = widened(place.silhouettes)
+        near = ndimage.binary_dilation(place.silhouettes, _AROUND)
         total += float(squares.sum())
         at_silhouettes += float(squares[near].sum())
         if place.shadows is not None:
-            at_shadows += float(squares[widened(place.shadows) & ~near].sum())
+            at_shadows += float(squares[ndimage.binary_dilation(place.shadows, _AROUND) & ~near].sum())
     if total == 0:
         return "they are all 0"
     rest = f"{(total - at_silhouettes - at_shadows) / total:.0%} elsewhere"
@@ -91,36 +95,21 @@ def where_residuals_are(residuals: Sequence[Float[np.ndarray, "h w c"]], places:
     )
 
 
-def widened(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """The pixels of a mask with their eight neighbours."""
-    padded = np.pad(mask, 1)
-    h, w = mask.shape
-    return np.any([padded[y : y + h, x : x + w] for y in range(3) for x in range(3)], axis=0)
-
-
 class Findings(NamedTuple):
-    """What `warnings` are made from.
+    """What `warnings` are made from; texts and numbers are None where there is nothing to be said, or none were asked for.
 
     Attributes:
-      result: why the fit stopped.
-      chi2: see `Fit.stats`.
       noise_given: whether the noise is the user's, not estimated.
-      where: see `where_residuals_are`.
-      regions: see `worst_regions`.
-      unlike_noise: what is left although it is no noise, in words; None: nothing.
-      channels: which channels are hardly more than one measurement, in words; None: none.
+      channels: which channels are hardly more than one measurement.
       help: what to try where the pictures are not explained.
-      strayed: root mean square of (heights - prior) / std over the heights that are seen; None: no prior.
       seen: which heights the pictures show.
-      mean_shown: whether pictures change as all heights move up together.
       noise_share: the least noise of a picture over its brightness.
       lights: how many directions light comes from, over all pictures.
-      scaled: by what the noise was multiplied for the standard deviations; None: there are none.
-      displaced: by how much boundaries may be, height units, and what that multiplies the deviations by; None: as `scaled`.
-      draws: asked for, made; (0, 0): none were asked for.
-      parts: the deviations of the mean height and of the heights about it; None: as `scaled`.
-      unsure_noise: why the noise that was estimated may be too small, in words; None: it was given, or is sure.
-      length: how the prior's correlation length does not fit, in words; None: it does.
+      scaled: by what the noise was multiplied for the standard deviations.
+      displaced: by how much boundaries may be, height units, and what that multiplies the deviations by.
+      draws: asked for, made.
+      parts: the deviations of the mean height and of the heights about it.
+      unsure_noise, length: why the estimated noise may be too small; how the prior's correlation length does not fit.
     """
 
     result: Stop
