@@ -19,9 +19,10 @@ from ...rendering.render import render_each
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device
-from .linearise import Linearised, can_be_linearised, changing_pixels, linearise_each, moved_each, picture_each
+from .linearise import Linearised, can_be_linearised, changing_pixels, linearise_each, moved_each
 from .pictures import Group, with_albedo
 from .problem import Problem
+from .products import picture_each
 from .robust import soften
 from .surface import Basis, Unknowns
 from .view import View

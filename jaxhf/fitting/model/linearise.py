@@ -22,9 +22,8 @@ from jaxtyping import Bool, Float, Int
 from ...boundary.guiding import has_edges
 from ...boundary.sample import BoundarySample, deciding_vertices, picture_point
 from ...boundary.term import Packed, draw_boundaries
-from ...core.autodiff import with_tangent
 from ...core.settings import Settings
-from ...preparation.world import World, make_world, resolve_settings
+from ...preparation.world import World, make_world
 from ...rendering.samples import PictureSamples
 from ...scene.camera import Camera
 from ...scene.light import Light, Sun
@@ -35,18 +34,15 @@ from ...shade.radiance import direct, has_mirrors
 from ...trace.grid import Grid
 from ...trace.hit import Hit
 from ...trace.triangle import Corners, triangle_vertices
-from ...xla.devices import Spread, map_and_spread, map_over, on_every_device, over_spread
+from ...xla.devices import Spread, map_and_spread, map_over, on_every_device
 from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
 from .pictures import Group
 from .view import KNOWN, View, moved
 
-# Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
-_TOGETHER = 1024
 # Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
 _POINTS_PER_PIXEL = 4
 _SAMPLING_ERROR = 0.25
-_LEAST_FACTOR = 1e-6  # of an albedo, about which a relative change is taken
 
 
 class Linearised(eqx.Module):
@@ -193,52 +189,6 @@ class _Seen(NamedTuple):
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*leaf.shape, count)), self.view)
 
 
-def picture_each(
-    known: Linearised,
-    group: Group,
-    heights: Float[jax.Array, "ny nx"],
-    settings: Settings,
-    mesh: Mesh,
-    view: View,
-    factors: Float[jax.Array, "ty tx k"] | None,
-) -> Float[jax.Array, "n h w c"]:
-    """The pictures that are known, with their derivatives in the heights, in what moves lights and cameras, and in the albedo's
-    factors, whose values must be those at which `linearise_each` was called."""
-
-    def values(scene: Scene) -> Float[jax.Array, "vertices n"]:
-        return vertex_values(make_world(on_every_device(group.complete(scene, heights, factors), mesh), settings))
-
-    scenes = group.scenes
-    if jax.tree.leaves(scenes.objects):  # each picture has vertices of its own
-        each = lax.map(values, scenes)
-        first = jnp.arange(each.shape[0])[:, None, None, None] * each.shape[1]
-        at_vertices = each.reshape(-1, each.shape[-1])
-    else:
-        at_vertices, first = values(jax.tree.map(lambda leaf: leaf[0], scenes)), jnp.int32(0)
-    relative = None if factors is None else factors / _apart_from_zero(lax.stop_gradient(factors))
-    # All pictures at once: a loop over them would copy what it reads of each.
-    of_samples = over_spread(mesh, _of_samples, (at_vertices, first, view, relative), known.samples)
-    light = None
-    if known.edges is not None:
-        heights = at_vertices[:, 0].at[known.edges.vertices + first].get(mode="promise_in_bounds")
-        light = jnp.moveaxis(jnp.sum(known.edges.slopes * heights[:, :, None], axis=3), 2, -1)
-
-    def one(
-        image: jax.Array, edges: LinearisedEdges | None, of_samples: jax.Array, light: jax.Array | None, view: View
-    ) -> Float[jax.Array, "h w c"]:
-        samples = PictureSamples(camera, settings, None if edges is None else edges.resampled)
-        change = samples.in_pixels(of_samples)
-        if edges is not None and light is not None:
-            light = _with_view(light, edges.view, view).reshape(-1, image.shape[-1])
-            finer, flat = samples.of_resampled(of_samples).mean(1), change.reshape(-1, image.shape[-1])
-            flat = flat.at[edges.resampled].set(finer, unique_indices=True).at[edges.pixel].add(light)
-            change = flat.reshape(change.shape)
-        return with_tangent(image, change)
-
-    camera, settings = scenes.camera, resolve_settings(settings, scenes)
-    return jax.vmap(one)(known.image, known.edges, of_samples, light, view)
-
-
 def _linearise(seen: _Seen, mesh: Mesh, channels: int, factors: Float[jax.Array, "ty tx k"] | None) -> Linearised:
     world, camera = seen.world, seen.camera
     drawn, edge_samples = None, world.settings.edge_samples or 0
@@ -292,18 +242,6 @@ def _second_differences(samples: Float[jax.Array, "rows columns c"], side: int) 
     size = jnp.abs(padded[:, 2:] + padded[:, :-2] - 2 * samples).reshape(samples.shape[0], -1, side, samples.shape[2])
     first, last = (jnp.minimum(size[:, :, a], size[:, :, b])[:, :, None] for a, b in ((0, 1), (-1, -2)))
     return jnp.concatenate([first, size[:, :, 1:-1], last], axis=2).reshape(samples.shape)
-
-
-def _with_view(change: Float[jax.Array, "chunks n c"], slopes: View, numbers: View) -> Float[jax.Array, "chunks n c"]:
-    """What samples change by, with their part from the light and the camera."""
-    for slope, values in zip(jax.tree.leaves(slopes), jax.tree.leaves(numbers), strict=True):
-        for k in range(values.shape[0]):
-            change = change + jnp.moveaxis(slope[:, :, k] * values[k], 1, -1)
-    return change
-
-
-def _apart_from_zero(factors: Float[jax.Array, "..."]) -> Float[jax.Array, "..."]:
-    return jnp.where(jnp.abs(factors) < _LEAST_FACTOR, _LEAST_FACTOR, factors)
 
 
 def _channels(light: Float[jax.Array, "*rest 3"], channels: int) -> Float[jax.Array, "*rest c"]:
@@ -384,58 +322,3 @@ def _boundary_samples(channels: int, seen: _Seen, drawn: Packed[tuple[BoundarySa
     _, pull_back = jax.vjp(positions, jnp.zeros((5, count), flows.dtype), seen.view_for(count))
     slopes, view = jax.vmap(pull_back)(flows)
     return slopes, jax.vmap(functools.partial(deciding_vertices, seen.world), out_axes=1)(samples), view
-
-
-def vertex_values(world: World) -> Float[jax.Array, "vertices n"]:
-    """Heights and, with smooth shading, the normals' components, over all surfaces."""
-    grids = [grid for _, grid, _ in world.grids]
-    heights = jnp.concatenate([grid.rows for grid in grids])[:, None]
-    normals = [grid.normals for grid in grids if grid.normals is not None]
-    return jnp.concatenate([heights, jnp.concatenate(normals)], axis=1) if normals else heights
-
-
-def _of_samples(
-    shared: tuple[Float[jax.Array, "vertices m"], jax.Array, View, Float[jax.Array, "ty tx k"] | None], rows: SampleRows
-) -> Float[jax.Array, "n chunks samples c"]:
-    """What samples of n pictures change by: their rows times what stands at the vertices, moves light and camera, and is the
-    relative change of the albedo's factors.
-
-    `shared`: these; the second is the number of the first vertex of each picture.
-    """
-    at_vertices, first, view, relative = shared
-    n, chunks, channels, k, size = rows.slopes.shape
-    joined = rows.slopes.reshape(-1, channels, k, size), (rows.vertices + first).reshape(-1, 3, size)
-    found = _by_vertices(at_vertices, *joined).reshape(n, chunks, channels, size)
-    if rows.albedo is not None and relative is not None:
-        factors = relative.reshape(-1, relative.shape[-1]).at[rows.albedo.texels].get(mode="promise_in_bounds")
-        change = jnp.einsum("nqkts,nqtsk->nqks", rows.albedo.slopes, factors)
-        found = found + (change if channels == change.shape[2] else jnp.sum(change, axis=2, keepdims=True))
-    return jax.vmap(_with_view)(jnp.moveaxis(found, 2, -1), rows.view, view)
-
-
-def _by_vertices(
-    at_vertices: Float[jax.Array, "vertices m"],
-    slopes: Float[jax.Array, "chunks c k samples"],
-    vertices: Int[jax.Array, "chunks 3 samples"],
-) -> Float[jax.Array, "chunks c samples"]:
-    """The matrix of samples times what stands at the vertices."""
-    chunks, channels, _, size = slopes.shape
-    parts = math.ceil(chunks / _TOGETHER)
-
-    def in_parts(values: jax.Array) -> jax.Array:
-        padded = jnp.pad(values, ((0, -chunks % parts), *((0, 0) for _ in values.shape[1:]))) if chunks % parts else values
-        return padded.reshape(parts, -1, *values.shape[1:])
-
-    def part(rows: tuple[jax.Array, jax.Array]) -> jax.Array:
-        slopes, vertices = rows
-        total = jnp.zeros((slopes.shape[0], channels, size), slopes.dtype)
-        # Looked up a row of four at a time and used number by number: 262144 samples took 0.8 ms, and 2.9 ms transposed. A
-        # number at a time it was 1.1 and 10 ms, with sums over the rows 11 and 3.9 ms.
-        for vertex in range(3):
-            row = at_vertices.at[vertices[:, vertex]].get(mode="promise_in_bounds")
-            for number in range(row.shape[-1]):
-                slope = slopes[:, :, vertex if number == 0 else 3 * vertex + number + 2]
-                total = total + slope * row[:, None, :, number]
-        return total
-
-    return lax.map(part, (in_parts(slopes), in_parts(vertices))).reshape(-1, channels, size)[:chunks]

@@ -22,10 +22,10 @@ from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, on_host
 from .expansion import Expansion
-from .linearise import vertex_values
 from .normal_matrix import Place
 from .pictures import Group
 from .problem import Problem
+from .products import vertex_values
 from .surface import Unknowns
 
 sp: Any = scipy.sparse  # whose stubs miss much
