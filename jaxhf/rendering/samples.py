@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from ..boundary.term import resampled_side
 from ..core.settings import Settings
+from ..core.types import AnyArray
 from ..scene.camera import Camera
 from .tiles import Tiling, sample_offset
 
@@ -24,7 +25,7 @@ class PictureSamples:
       resampled_side: see the function of this name.
     """
 
-    def __init__(self, camera: Camera, settings: Settings, resampled: Int[jax.Array, " pixels"] | None = None):
+    def __init__(self, camera: Camera, settings: Settings, resampled: Int[AnyArray, " pixels"] | None = None):
         self.tiling, self.dtype = Tiling(camera, settings), camera.world_from_camera.dtype
         self.resampled, self.resampled_side = resampled, resampled_side(settings)
 

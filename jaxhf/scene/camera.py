@@ -225,7 +225,7 @@ class Orthographic(Record):
 Camera = Perspective | Orthographic
 
 
-def cropped(camera: Camera, x: float, y: float, width: int, height: int) -> Camera:
+def cropped(camera: Camera, x: float | int, y: float | int, width: int, height: int) -> Camera:
     """The camera of a part of a picture: of `width` by `height` pixels from column x and row y on.
 
     Its matrix may be no rotation any more, see `Perspective`.

@@ -1,12 +1,11 @@
 """What does not fit on the machine is refused in one line, before anything is traced."""
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
+import jaxhf
 from jaxhf.cli import limits
 from jaxhf.cli.main import main
 from jaxhf.core.errors import UserError
@@ -49,12 +48,10 @@ def test_a_picture_that_does_not_fit(refused, monkeypatch):
 
 
 def test_a_terrain_counts_on_each_device(refused, monkeypatch):
-    """A map of 100 million heights, which is not made: only its size counts."""
-
-    heights: Any = SimpleNamespace(size=10**8, dtype=np.dtype(np.float64))
-    camera, field = SimpleNamespace(width=10, height=10), SimpleNamespace(heights=heights)
-    scene: Any = SimpleNamespace(camera=camera, heightfields=[field], heights=heights)
-    monkeypatch.setattr(limits, "available_bytes", lambda: 10e9)
+    field = jaxhf.Heightfield(np.zeros((100, 100)))
+    camera = jaxhf.Perspective.look_at((0, 0, 1), (0.5, 0.5, 0), width=10, height=10)
+    scene = jaxhf.Scene([jaxhf.Object(field)], camera, [])
+    monkeypatch.setattr(limits, "available_bytes", lambda: 1e6)
     limits.require_memory(scene, 1)
-    with pytest.raises(UserError, match="take more than 18 GB of memory on 2 devices, 10 GB are free"):
+    with pytest.raises(UserError, match=r"take more than 0\.00181 GB of memory on 2 devices, 0\.001 GB are free"):
         limits.require_memory(scene, 2)

@@ -23,6 +23,7 @@ from ...boundary.guiding import has_edges
 from ...boundary.sample import BoundarySample, deciding_vertices, picture_point
 from ...boundary.term import Packed, draw_boundaries
 from ...core.settings import Settings
+from ...core.types import AnyArray
 from ...preparation.world import World, make_world
 from ...rendering.samples import PictureSamples
 from ...scene.camera import Camera
@@ -57,9 +58,9 @@ class Linearised(eqx.Module):
       edges: of samples of moving boundaries; None where the settings ask for none.
     """
 
-    image: Float[jax.Array, "*n h w c"]
-    depends: Bool[jax.Array, "*n h w"]
-    sampling: Float[jax.Array, "*n h w"]
+    image: Float[AnyArray, "*n h w c"]
+    depends: Bool[AnyArray, "*n h w"]
+    sampling: Float[AnyArray, "*n h w"]
     samples: Spread
     edges: "LinearisedEdges | None"
 
