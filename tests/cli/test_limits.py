@@ -48,10 +48,10 @@ def test_a_picture_that_does_not_fit(refused, monkeypatch):
 
 
 def test_a_terrain_counts_on_each_device(refused, monkeypatch):
-    field = jaxhf.Heightfield(np.zeros((100, 100)))
+    field = jaxhf.Heightfield(np.zeros((100, 100), np.float32))
     camera = jaxhf.Perspective.look_at((0, 0, 1), (0.5, 0.5, 0), width=10, height=10)
     scene = jaxhf.Scene([jaxhf.Object(field)], camera, [])
-    monkeypatch.setattr(limits, "available_bytes", lambda: 1e6)
+    monkeypatch.setattr(limits, "available_bytes", lambda: 5e5)
     limits.require_memory(scene, 1)
-    with pytest.raises(UserError, match=r"take more than 0\.00181 GB of memory on 2 devices, 0\.001 GB are free"):
+    with pytest.raises(UserError, match=r"take more than 0\.000904 GB of memory on 2 devices, 0\.0005 GB are free"):
         limits.require_memory(scene, 2)
