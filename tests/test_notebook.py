@@ -48,6 +48,8 @@ def recovery_holds(text: str) -> None:
     during = float(re.findall(r"after 2 steps: ([\d.]+) m", text)[0])
     assert before > during > after
     assert after < before / 4
+    ((off, std),) = re.findall(r"mean of the heights: (-?[\d.]+) m off, ± ([\d.]+) m", text)
+    assert abs(float(off)) < 3 * float(std)
     assert 60 < float(re.findall(r"within 1 std: (\d+)%", text)[0]) < 97
 
 
