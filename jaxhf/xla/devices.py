@@ -142,18 +142,22 @@ def _at_home(mesh: Mesh) -> bool:
 
 
 def _placed(leaf: Any, mesh: Mesh, place: P) -> Any:
-    around, there = jax.sharding.get_abstract_mesh(), NamedSharding(mesh, place)
+    around = jax.sharding.get_abstract_mesh()
     if not isinstance(leaf, jax.Array):
         return leaf
+    traced = isinstance(leaf, Tracer)
+    if traced and place != P():  # within `jax.set_mesh` its axes are ones that XLA deals with, which `reshard` refuses
+        return lax.with_sharding_constraint(leaf, NamedSharding(mesh if around.empty else around, place))
     if not mesh.is_multi_process:
-        return jax.device_put(leaf, there) if around.empty else jax.reshard(leaf, place)
-    if isinstance(leaf, Tracer):
-        return leaf if place == P() else lax.with_sharding_constraint(leaf, there)
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) or leaf.sharding.device_set == set(mesh.devices.ravel()):
+        whole = not around.empty and place == P()
+        return jax.reshard(leaf, place) if whole else jax.device_put(leaf, NamedSharding(mesh, place))
+    if traced or jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) or leaf.sharding.device_set == set(mesh.devices.ravel()):
         return leaf
     # What belongs to one process can only be sent to another by way of the host, from which all start with the same.
     values = np.asarray(leaf)
-    return values if place == P() else jax.make_array_from_callback(values.shape, there, lambda index: values[index])
+    if place == P():
+        return values
+    return jax.make_array_from_callback(values.shape, NamedSharding(mesh, place), lambda index: values[index])
 
 
 def on_host(tree: Any) -> Any:

@@ -2,6 +2,7 @@
 
 import inspect
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +36,8 @@ def linearised(heights: jax.Array) -> list[jax.Array]:
         known |= {"settings": jaxhf.Settings(edge_samples=300), "unknown": jaxhf.Unknown(albedo="map")}
         given = Given(**{name: known[name] for name in Given.__dataclass_fields__})
         made, unknowns = make_problem([scene], [np.zeros((30, 40), np.float32)], given)
-    return jax.tree.leaves(_expansion._linearised(heights, unknowns.without_modes(), made))
+    made = eqx.tree_at(lambda problem: problem.basis.base, made, heights)
+    return jax.tree.leaves(_expansion._linearised(unknowns, made))
 
 
 PROGRAMS = {
