@@ -328,6 +328,13 @@ def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():
     assert fingerprint(max_steps=7, draws=5) == found[0]  # what does not decide on the steps
 
 
+@pytest.mark.deep  # a killed process has left one, too
+def test_another_process_finds_the_same_fingerprint():
+    program = "from test_fit_checkpoint import *; print(fingerprint(unknown=jaxhf.Unknown(albedo='map')))"
+    found, _ = run_python(program).communicate(timeout=120)
+    assert found.strip() == fingerprint(unknown=jaxhf.Unknown(albedo="map"))
+
+
 def test_a_damaged_checkpoint_and_that_of_another_fit_are_refused(tmp_path, monkeypatch):
     """Before anything is rendered."""
     path = tmp_path / "fit.checkpoint"

@@ -1,9 +1,10 @@
-"""The same bits for the same ray, wherever it lies in a picture or a batch, on the CPU.
+"""The same bits for the same ray, wherever it lies in a picture or a batch and however often, on the CPU.
 
 Tiles and chunks have one fixed size, which makes them one compiled kernel. Two sizes are two kernels, and nothing is promised.
 """
 
 import aimed
+import jax
 import numpy as np
 import pytest
 from compare import every_family, heightfield, numpied
@@ -51,6 +52,16 @@ def test_a_crop_has_the_bits_of_the_whole(camera, whole, crop, lights):
     assert 0.05 < large["shadow"].mean() < 0.95
     for name, value in small.items():
         np.testing.assert_array_equal(value, large[name][top : top + crop[1], left : left + crop[0]], name)
+
+
+def test_repeated_runs_have_the_same_bits():
+    """Also when everything has been compiled anew."""
+    first, again = (seen(perspective(64, 32), SUN) for _ in range(2))
+    jax.clear_caches()
+    anew = seen(perspective(64, 32), SUN)
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, again[name], name)
+        np.testing.assert_array_equal(value, anew[name], name)
 
 
 def test_rays_have_the_same_bits_in_any_order_and_number():

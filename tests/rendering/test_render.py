@@ -173,6 +173,16 @@ def test_an_offset_costs_no_bit():
         np.testing.assert_array_equal(far_aovs[name], value, name)
 
 
+@pytest.mark.deep
+@pytest.mark.x64  # of the whole picture, with smooth normals and three lights
+def test_single_precision_agrees_with_double():
+    single, single_aovs = rendered()
+    double, double_aovs = rendered(np.float64)
+    inside = (single_aovs["status"] == double_aovs["status"]) & (single_aovs["shadow"] == double_aovs["shadow"]).all(-1)
+    assert inside.mean() > 0.98  # edges
+    assert np.abs(single - double)[inside].max() < 1e-4
+
+
 @pytest.mark.optimised  # two programs, whose bits are the same as users compile them
 @pytest.mark.parametrize("transformation", [jax.jit, jax.jacfwd, jax.vmap])
 def test_there_is_no_progress_within_a_transformation(transformation):
