@@ -275,6 +275,7 @@ BAD = [
     (of_fit("max_step = 3"), 18, "unknown key 'max_step' in fit; did you mean 'max_steps'"),
     (of_picture('[[pictures.lights]]\ntype = "sky"\nradience = 1'), 18, "unknown key 'radience' in pictures[0].lights[0]"),
     (WHOLE + "\n[settings]\nsamples = 3\n", 18, "settings.samples must be a square number"),
+    (WHOLE + "\n[settings]\nshadows = 1\n", 18, "settings.shadows must be true or false, it is 1"),
     (SCENE, None, "a fit must have 'pictures', those that were measured; this is a scene"),
     (WHOLE.replace("grey", "../grey"), 15, "pictures[0].image: '../grey.npy' lies outside"),
     (PICTURE, None, "a fit must have 'scene', "),

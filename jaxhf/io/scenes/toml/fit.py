@@ -11,6 +11,7 @@ from jaxtyping import Float32
 from numpy.typing import DTypeLike
 
 from ....core.errors import ArgumentError, UserError
+from ....core.rules import OneOf, Whole
 from ....core.settings import Settings
 from ....scene.camera import Camera
 from ....scene.heightfield import Heightfield
@@ -55,6 +56,9 @@ _UNKNOWN: Keys = {
     **optional("albedo_std", "light_std", kind=number),
     **optional("exposures", "offsets", kind=flag),
     **optional("camera_std", kind=numbers(2)),
+}
+_SETTINGS: Keys = {
+    knob.name: Key({OneOf: word, Whole: whole}.get(type(knob.metadata["rule"]), flag)) for knob in dataclasses.fields(Settings)
 }
 _ARGUMENTS = {("fit",): _FIT, ("fit", "prior"): _PRIOR, ("fit", "unknown"): _UNKNOWN}
 
@@ -120,8 +124,7 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
         raise part.error("a fit must have 'pictures', those that were measured; this is a scene, for `jaxhf render`")
     values = part.read(_CASE)
     chosen = part.at("settings")
-    chosen.require_known([knob.name for knob in dataclasses.fields(Settings)])
-    settings = chosen.made(Settings, **chosen.table)
+    settings = chosen.made(Settings, **chosen.read(_SETTINGS))
     base = _base(part, values, dtype)
     if not values["pictures"]:
         raise part.at("pictures").error("pictures must hold at least one picture, they are empty")
