@@ -378,3 +378,14 @@ def smoothed(heights: np.ndarray, cells: float) -> np.ndarray:
         kernel /= kernel.sum(1, keepdims=True)
         heights = np.moveaxis(np.tensordot(kernel, heights, (1, axis)), 0, axis)
     return heights
+
+
+def map_of(truth: np.ndarray, cells: float = 8) -> jaxhf.Prior:
+    """The terrain smoothed over so many cells, and how far that is off."""
+    coarse = smoothed(truth, cells)
+    return jaxhf.Prior(coarse, float(np.sqrt(np.mean((coarse - truth) ** 2))))
+
+
+def times_nearer(prior: jaxhf.Prior, heights: object, truth: np.ndarray) -> float:
+    """How many times nearer to the truth than their map heights are."""
+    return prior.std / float(np.sqrt(np.mean((np.asarray(heights, np.float64) - truth) ** 2)))

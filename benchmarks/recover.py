@@ -25,7 +25,7 @@ import benchmark
 import jax
 import numpy as np
 import scipy.optimize
-from cases import CASES, LIGHTS, Case, Definition, Missing, Sources, names_of, noisy, smoothed, viewed
+from cases import CASES, LIGHTS, Case, Definition, Missing, Sources, map_of, names_of, noisy, smoothed, times_nearer, viewed
 from held_out import held_out
 from peers import common_work
 
@@ -247,14 +247,13 @@ def scaled(options: argparse.Namespace) -> dict[str, float | str]:
     """One size of `scale`, whose pictures a file has."""
     with np.load(options.child) as kept:
         truth, targets = kept["truth"], kept["targets"]
-    coarse = smoothed(truth, CELLS)
-    before = float(np.sqrt(np.mean((coarse - truth) ** 2)))
-    prior, scenes = jaxhf.Prior(coarse, before), _common_scenes(common_work(options.peers), coarse)
+    prior = map_of(truth, CELLS)
+    scenes = _common_scenes(common_work(options.peers), prior.heights)
     if options.window is not None:
         return windowed(scenes, list(targets), prior, truth, options)
     found, seconds = timed(scenes, list(targets), prior=prior, draws=options.draws, progress=options.verbose)
-    after = float(np.sqrt(np.mean((np.asarray(found.heights, np.float64) - truth) ** 2)))
-    numbers = {"seconds": seconds, "peak MB": peak_mb(), "steps": found.stats["steps"], "ratio": before / after}
+    ratio = times_nearer(prior, found.heights, truth)
+    numbers = {"seconds": seconds, "peak MB": peak_mb(), "steps": found.stats["steps"], "ratio": ratio}
     return numbers | {"chi2": found.stats["chi2"], "end": found.result.value, "warns of": "; ".join(names_of(found.warnings))}
 
 
@@ -269,11 +268,11 @@ def windowed(
             print(f"{done} of {count} windows, {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True)
 
     found = jaxhf.fit_windows(scenes, targets, prior=prior, window=options.window, draws=options.draws, progress=tell)
-    seconds, before = time.perf_counter() - begin, prior.std
-    after = float(np.sqrt(np.mean((np.asarray(found.heights, np.float64) - truth) ** 2)))
-    seams = np.array([window.seam for window in found.windows]) / before
+    seconds = time.perf_counter() - begin
+    seams = np.array([window.seam for window in found.windows]) / prior.std
     return {
-        "seconds": seconds, "peak MB": peak_mb(), "windows": len(found.windows), "ratio": before / after,
+        "seconds": seconds, "peak MB": peak_mb(), "windows": len(found.windows),
+        "ratio": times_nearer(prior, found.heights, truth),
         "median chi2": float(np.nanmedian([window.chi2 for window in found.windows])),
         "median seam": float(np.nanmedian(seams)), "largest seam": float(np.nanmax(seams)),
         "warns of": "; ".join(sorted({name for window in found.windows for name in names_of(window.warnings)})),

@@ -8,7 +8,6 @@ import numpy as np
 mujoco: Any = importlib.import_module("mujoco")  # its functions are unknown to type checkers
 
 SIZE = np.array([3.0, 5.0, 0.7, 0.2])
-HELD_OUT = ("buried", "beneath")  # took no part while `ray` was made
 KINDS = ("outside", "inside", "below", "vertical", "grazing", "walls", "edges")
 
 

@@ -129,8 +129,8 @@ def divided(tree: Any, mesh: Mesh) -> Any:
     copied to each."""
 
     def placed(leaf: Any) -> Any:
-        small = not isinstance(leaf, jax.Array) or leaf.size < _LEAST_DIVIDED or leaf.shape[0] % mesh.devices.size
-        return _placed(leaf, mesh, P() if small else P(mesh.axis_names))
+        whole = not isinstance(leaf, jax.Array) or leaf.size < _LEAST_DIVIDED or leaf.shape[0] % mesh.devices.size
+        return _placed(leaf, mesh, P() if whole else P(mesh.axis_names))
 
     return tree if _at_home(mesh) else jax.tree.map(placed, tree)
 

@@ -2,7 +2,6 @@
 
 from typing import cast
 
-import jaxtyping
 import numpy as np
 import pytest
 from hfields import SIZE, Reference, heights, matrix
@@ -104,10 +103,6 @@ def test_intrinsics_are_those_of_a_pinhole(intrinsics, message):
         (lambda: lidar_pattern(horizontal_fov=(10.0, -10.0)), "lidar_pattern: horizontal_fov must rise from the first"),
     ],
 )
-def test_sensors_say_what_is_wrong(call, message):
-    jaxtyping.config.update("jaxtyping_disable", True)  # as a user has it: nobody checks the annotations
-    try:
-        with pytest.raises(ArgumentError, match=f"^{message}"):
-            call()
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
+def test_sensors_say_what_is_wrong(call, message, as_users_call_it):
+    with pytest.raises(ArgumentError, match=f"^{message}"):
+        call()

@@ -6,7 +6,7 @@ In memory every image is linear, shape (h, w, 3), top row first.
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -18,8 +18,6 @@ from ..errors import FileError
 from ..files import PathLike, by_ending, reading, replacing, require_file
 from .codecs import OF_BYTES, READERS, WRITERS
 from .exr import channels_of, write_channels
-
-Transfer = Literal["srgb", "linear"]
 
 
 def load_image(path: PathLike, *, transfer: str | None = None) -> Float32[np.ndarray, "h w 3"]:
@@ -49,7 +47,7 @@ def load_numbers(path: PathLike) -> Float32[np.ndarray, "h w 3"]:
 
 
 def _load(path: PathLike, transfer: str | None, left_out: float) -> np.ndarray:
-    require("load_image", "transfer", transfer or "srgb", OneOf(Transfer))
+    require("load_image", "transfer", transfer or "srgb", OneOf(TRANSFERS))
     path = require_file(path)
     reader = by_ending(READERS, path, "read an image with")
     with reading(path):
@@ -90,7 +88,7 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         is another, or there are `aovs` of another size, or without .exr.
     """
     path = require_writable(path)
-    require("save_image", "transfer", transfer, OneOf(Transfer))
+    require("save_image", "transfer", transfer, OneOf(TRANSFERS))
     pixels = np.asarray(image)
     if pixels.dtype.kind == "V":  # bfloat16 and its like, which .npy would store without their meaning
         pixels = pixels.astype(np.float32)
