@@ -1,7 +1,7 @@
 """Terrains of ours in Mitsuba 3 (pip install mitsuba), ray by ray and as pictures, by its variant that needs no LLVM."""
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,6 +45,35 @@ def texture(mi: Any, texels: np.ndarray) -> Arrays:
 def matte(albedo: Any) -> Arrays:
     """With two sides; the albedo is a number or a texture."""
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": albedo}}
+
+
+def scattering(mi: Any, law: Callable[[float, float, float], float]) -> Any:
+    """A BSDF of ours for Mitsuba, on both sides: of the angles of incidence and emission and of the phase angle."""
+
+    class Scattering(mi.BSDF):
+        def __init__(self, props: Any):
+            mi.BSDF.__init__(self, props)
+            self.m_flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+            self.m_components = [self.m_flags]
+
+        def eval(self, _ctx: Any, si: Any, wo: Any, _active: bool = True) -> Any:
+            eye, light = np.array(si.wi), np.array(wo)
+            if eye[2] * light[2] <= 0:
+                return mi.Color3f(0)
+            i, e, g = np.arccos(np.clip([abs(light[2]), abs(eye[2]), eye @ light], -1, 1)).tolist()
+            return mi.Color3f(float(law(i, e, g) * abs(light[2])))
+
+        def sample(self, _ctx: Any, _si: Any, _one: float, _two: Any, _active: bool = True) -> Any:
+            return mi.BSDFSample3f(), mi.Color3f(0)  # lights alone are sampled
+
+        def pdf(self, _ctx: Any, _si: Any, _wo: Any, _active: bool = True) -> float:
+            return 0.0
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: bool = True) -> Any:
+            return self.eval(ctx, si, wo, active), 0.0
+
+    mi.register_bsdf("scattering", Scattering)
+    return mi.load_dict({"type": "scattering"})
 
 
 def emitter(light: Light) -> Arrays:

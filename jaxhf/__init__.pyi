@@ -30,7 +30,16 @@ from .scene.camera import Orthographic as Orthographic, Perspective as Perspecti
 from .scene.cylinder import Cylinder as Cylinder
 from .scene.heightfield import Heightfield as Heightfield
 from .scene.light import Directional as Directional, Point as Point, Sky as Sky, Sun as Sun
-from .scene.material import Matte as Matte, Mirror as Mirror
+from .scene.material import (
+    Hapke as Hapke,
+    LommelSeeliger as LommelSeeliger,
+    LunarLambert as LunarLambert,
+    Material as Material,
+    Matte as Matte,
+    Minnaert as Minnaert,
+    Mirror as Mirror,
+    OrenNayar as OrenNayar,
+)
 from .scene.scene import Object as Object, Scene as Scene
 from .scene.skirt import Skirt as Skirt
 from .scene.sun import sun as sun

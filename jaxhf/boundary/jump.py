@@ -19,6 +19,7 @@ from ..core.vector import dot, select
 from ..preparation.world import World, no_hit
 from ..scene.camera import Camera
 from ..shade.radiance import radiance_from, shadowed_radiance
+from ..shade.reflectance import depends_on_view
 from ..trace.hit import Hit, Status
 from ..trace.intersect import hit_on_triangle
 from ..xla.masked import only_where
@@ -106,11 +107,13 @@ def boundary_segment(world: World, camera: Camera, sample: BoundarySample, fold:
     return BoundarySegment(valid, jnp.where(valid, x, 0), across * jnp.sign(rate), speed)
 
 
-def radiance_jump(world: World, sample: BoundarySample, fold: Fold, beyond: Hit, active: Flag, side: Index) -> Vector:
+def radiance_jump(
+    world: World, camera: Camera, sample: BoundarySample, fold: Fold, beyond: Hit, active: Flag, side: Index
+) -> Vector:
     """One of two parts whose sum is the radiance beyond the boundary minus that on the side of `across`.
 
     Args:
-      world: the scene.
+      world, camera: the scene.
       sample, fold, beyond: from `pass_edge`.
       active: whether the sample counts.
       side: 1: what stands beyond; 0: what stands on the near side, with its sign.
@@ -119,7 +122,8 @@ def radiance_jump(world: World, sample: BoundarySample, fold: Fold, beyond: Hit,
     light = only_where(stands, _side_radiance, world, fold, beyond, side, stands)
     light = jnp.where(side == 0, -light, light)
     if world.settings.shadows:
-        shadow = only_where(active & ~stands, shadowed_radiance, world, sample.light, beyond)
+        wo = towards(world, camera, jnp.full((), -1, jnp.int32), beyond.p)[0] if depends_on_view(world) else None
+        shadow = only_where(active & ~stands, shadowed_radiance, world, sample.light, beyond, wo)
         light = jnp.where(stands, light, jnp.where(active & (side == 1), shadow, 0))
     return light
 

@@ -156,7 +156,7 @@ def _draw_edges(world: World, camera: Camera, key: jax.Array, mesh: Mesh, chunks
         samples, folds, beyond, segments = jax.vmap(functools.partial(one, world, camera, guiding))(k, u)
 
         def one_side(side: jax.Array) -> jax.Array:
-            return jax.vmap(functools.partial(radiance_jump, world, side=side))(samples, folds, beyond, segments.valid)
+            return jax.vmap(functools.partial(radiance_jump, world, camera, side=side))(samples, folds, beyond, segments.valid)
 
         # A `vmap` of a `vmap` would have to do all that `only_where` leaves out.
         light = lax.map(one_side, jnp.arange(2, dtype=jnp.int32))

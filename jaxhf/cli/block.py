@@ -14,7 +14,7 @@ from ..rendering.render import Prepared, render
 from ..scene.camera import Perspective, cropped
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Light, Sky
-from ..scene.material import Matte
+from ..scene.material import Material, Matte
 from ..scene.scene import Object, Scene
 from ..scene.skirt import Skirt
 from ..scene.texture import ImageTexture
@@ -81,17 +81,23 @@ def with_water(
 
 
 def block(
-    field: Heightfield, colours: Float[np.ndarray, "h w 3"], camera: Perspective, look: Look, base: float | None
+    field: Heightfield,
+    colours: Float[np.ndarray, "h w 3"],
+    camera: Perspective,
+    look: Look,
+    base: float | None,
+    material: Callable[[ImageTexture], Material] = Matte,
 ) -> Scene:
     """A terrain with walls and a floor, under the sun and a sky.
 
     Args:
       colours: linear, 0 to 1: of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
       base: the level of the floor; None: neither walls nor a floor.
+      material: of the terrain, from these colours.
     """
     at_vertices = colours.shape[:2] == field.heights.shape
     albedo = ImageTexture(jnp.asarray(colours, field.heights.dtype), at_vertices=at_vertices, wrap="clamp")
-    objects = [Object(field, Matte(albedo))]
+    objects = [Object(field, material(albedo))]
     if base is not None:
         objects.append(Object(Skirt.of(field, base), Matte(_WALLS)))
     return Scene(objects, camera, lights(field, look))

@@ -160,6 +160,7 @@ _MAPS = (
 # Pictures.
 
 PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel of `jaxhf view`
+MATERIALS = "matte", "lommel-seeliger", "lunar-lambert", "minnaert", "oren-nayar", "hapke"  # of `scene.material.SCATTERING`
 _DEGREES = "DEGREES"
 _PRESET = "1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]"
 _FROM = "where the camera stands, clockwise from north [110 left of the sun]"
@@ -199,6 +200,7 @@ _VIEW = Command(
             number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]", rule=POSITIVE),
             option("--ramp", metavar="FILE|NAME", help=_HEIGHT_COLOURS),
             option("--drape", metavar="IMAGE", help=_DRAPE),
+            choice("--material", MATERIALS, "the law by which it reflects [matte]", default="matte"),
             number("--water", "LEVEL", "below it is water", rule=FINITE),
             option("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet"),
         ),

@@ -1,6 +1,5 @@
 """A part of a terrain and of its pictures, for a fit of that part within the terrain that goes on around it."""
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ from ..preparation.localise import localise
 from ..rendering.render import render
 from ..scene.camera import cropped as cropped_camera
 from ..scene.heightfield import Heightfield
-from ..scene.material import Material, Matte
+from ..scene.material import map_textures
 from ..scene.scene import Object, Scene
 from ..scene.texture import ImageTexture
 
@@ -116,16 +115,15 @@ def _with_surroundings(scene: Scene, part: Heightfield, around: Heightfield, win
     objects = list(scene.objects)
     k = scene.first_heightfield
     material, world = objects[k].material, objects[k].world_from_object
-    objects[k] = Object(part, _cropped_material(material, old.heights.shape, window), world)
+    there = map_textures(material, lambda image: _cropped_texture(image, old.heights.shape, window))
+    objects[k] = Object(part, there, world)
     # Its place is given also where it is the world's: windows at the corner then share a program with the others.
     objects.append(Object(around, material, np.eye(4) if world is None else world))
     return eqx.tree_at(lambda scene: scene.objects, scene, tuple(objects))
 
 
-def _cropped_material(material: Material, shape: tuple[int, ...], window: Window) -> Material:
-    """A material whose image covers the window alone: a colour for each vertex, or more where the image has more."""
-    if not (isinstance(material, Matte) and isinstance(image := material.albedo, ImageTexture)):
-        return material
+def _cropped_texture(image: ImageTexture, shape: tuple[int, ...], window: Window) -> ImageTexture:
+    """An image that covers the window alone: a colour for each vertex, or more where the image has more."""
     size = zip(image.texels.shape, shape, strict=False)
     finer = 1 if image.at_vertices and image.texels.shape[:2] == shape else max(math.ceil(n / (m - 1)) for n, m in size)
     v, u = (
@@ -134,7 +132,7 @@ def _cropped_material(material: Material, shape: tuple[int, ...], window: Window
     )
     look_up = jnp.vectorize(image, signature="(k)->(c)")
     texels = np.asarray(look_up(jnp.stack(jnp.meshgrid(jnp.asarray(u), jnp.asarray(v)), axis=-1)))
-    return dataclasses.replace(material, albedo=ImageTexture(texels, at_vertices=True))
+    return ImageTexture(texels, at_vertices=True)
 
 
 Corners = tuple[tuple[int, int], tuple[int, int]]

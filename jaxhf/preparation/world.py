@@ -18,7 +18,7 @@ from ..core.types import Flag, Index, MatrixLeaf, Scalar
 from ..core.vector import unit
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Light, Sun
-from ..scene.material import Material
+from ..scene.material import Material, Mirror
 from ..scene.scene import Scene, Shape
 from ..scene.skirt import Skirt
 from ..trace.cylinder import make_tube
@@ -47,7 +47,7 @@ class World(eqx.Module):
     """
 
     surfaces: tuple[Surface, ...]
-    materials: tuple[Material, ...]
+    materials: tuple[Material | Mirror, ...]
     lights: tuple[Light, ...]
     ceilings: tuple[tuple[Ceiling | None, ...], ...]
     sky: tuple[Float[jax.Array, "_ 3"] | None, ...]

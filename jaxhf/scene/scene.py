@@ -17,7 +17,7 @@ from .camera import Camera
 from .cylinder import Cylinder
 from .heightfield import Heightfield
 from .light import Light, Sky, Sun
-from .material import Material, Matte
+from .material import Material, Matte, Mirror
 from .record import Record, numbers
 from .skirt import Skirt
 
@@ -35,22 +35,22 @@ class Object(Record):
 
     Attributes:
       shape: a `Heightfield`, a `Cylinder` or a `Skirt`.
-      material: `Matte` or `Mirror`.
+      material: a `Material`, such as `Matte`, or a `Mirror`.
       world_from_object: 4x4, affine and invertible; None: the object's frame is the world's.
     """
 
     shape: Shape
-    material: Material
+    material: Material | Mirror
     world_from_object: MatrixLeaf | None = eqx.field(default=None, metadata={"rule": invertible})
 
-    def __init__(self, shape: Shape, material: Material | None = None, world_from_object: Any = None):
+    def __init__(self, shape: Shape, material: Material | Mirror | None = None, world_from_object: Any = None):
         self.shape = shape
         self.material = Matte(0.7) if material is None else material
         self.world_from_object = None if world_from_object is None else float_leaf(world_from_object)
 
     def _require_consistent(self):
         require_kind("Object", "shape", self.shape, get_args(Shape), "a Heightfield, Cylinder or Skirt")
-        require_kind("Object", "material", self.material, get_args(Material), "Matte or Mirror")
+        require_kind("Object", "material", self.material, (Material, Mirror), "a Material or a Mirror")
 
     def __repr__(self) -> str:
         pose = "" if self.world_from_object is None else f", world_from_object={numbers(self.world_from_object)}"

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import dot, floor_to_power_of_two, greater, largest_component, quotient, select, unit, within
+from ..core.vector import dot, floor_to_power_of_two, greater, largest_component, quotient, rounded_clamp, select, unit, within
 from ..preparation.world import World, unblocked
 from ..scene.light import Directional, Point, Sky, Sun, casts_sharp_shadows
 from ..trace.cylinder import Tube
@@ -20,17 +20,17 @@ from ..trace.skyline import hidden_slopes, skyline_slope
 from ..trace.triangle import triangle_corners
 from ..trace.walk_start import place_on_grid
 from ..xla.materialise import materialise
+from .reflectance import brdf, brdf_under_sky
 
-# So near to zero a cosine is rounded off: 0.6 degrees round the horizon of the shading normal.
-GRAZING = 0.01
 # Altitude up to which slopes are told apart, radians.
 _STEEPEST = np.deg2rad(89.9)
 # So near to the zenith, radians, the sun has no azimuth: chords across x then do as well as any.
 _NO_AZIMUTH = 1e-4
 
 
-def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vector, Index]:
-    """What one light sends to the side of the surface that the ray came from, (3,), and how many walks ran out of steps."""
+def light_from(number: int, world: World, hit: Hit, wo: Vector | None, active: Flag) -> tuple[Vector, Index]:
+    """What of one light the side of the surface that the ray came from sends towards `wo`, (3,), and how many walks ran out of
+    steps. Without `wo`, which all but `Matte` ask for, what that side gets: its irradiance."""
     light = world.lights[number]
     if isinstance(light, Sky):
         cosine = hit.ns[2] * hit.side.astype(hit.ns.dtype)
@@ -38,14 +38,15 @@ def irradiance(number: int, world: World, hit: Hit, active: Flag) -> tuple[Vecto
         visible = ((k, grid, world.sky[k]) for k, grid, _ in world.grids)
         seen = [(k, _seen_share(grid, sky, hit)) for k, grid, sky in visible if sky is not None]
         share = select(jnp.where(hit.side > 0, hit.object, -1), seen, share)
-        return light.radiance * (jnp.pi * share), jnp.zeros((), jnp.int32)
+        even = light.radiance * (jnp.pi * share)
+        return even if wo is None else even * brdf_under_sky(world, wo, hit), jnp.zeros((), jnp.int32)
     if isinstance(light, Sun):
         share, mean, exhausted = _disc(world, light, hit, active)
         towards = quotient(mean, jnp.where(share > 0, share, 1))
-        return light.irradiance * share * _cosine(world, towards, hit), exhausted
+        return light.irradiance * share * _sent_on(world, towards, hit, wo), exhausted
     wi, arriving, distance = materialise(_towards(light, hit.p))
     lit, exhausted = _visible(number, world, wi, distance, hit, active)
-    return jnp.where(lit, arriving * _cosine(world, wi, hit), 0), exhausted
+    return jnp.where(lit, arriving * _sent_on(world, wi, hit, wo), 0), exhausted
 
 
 def _seen_share(grid: Grid, sky: Float[jax.Array, "_ 3"], hit: Hit) -> Scalar:
@@ -63,17 +64,18 @@ def sharp_lights(world: World) -> list[tuple[int, Directional | Point]]:
     return [(number, light) for number, light in enumerate(world.lights) if casts_sharp_shadows(light)]
 
 
-def unshadowed_irradiance(world: World, light: Directional | Point, hit: Hit) -> Vector:
-    """What would arrive if nothing stood between the light and the hit, and the light on that side of it."""
+def unshadowed_light(world: World, light: Directional | Point, hit: Hit, wo: Vector | None) -> Vector:
+    """`light_from` if nothing stood between the light and the hit, and the light on that side of it."""
     wi, arriving, _ = _towards(light, hit.p)
-    return arriving * _cosine(world, wi, hit)
+    return arriving * _sent_on(world, wi, hit, wo)
 
 
-def _cosine(world: World, wi: Vector, hit: Hit) -> Scalar:
-    """Of the light's direction and the shading normal on the side that the ray came from, for light that is on that side."""
-    if world.settings.shading == "smooth":
-        return rounded_clamp(dot(wi, hit.ns) * hit.side.astype(wi.dtype))
-    return jnp.abs(dot(wi, hit.ns))
+def _sent_on(world: World, wi: Vector, hit: Hit, wo: Vector | None) -> Scalar | Vector:
+    """The cosine of the light's direction and the shading normal on the side that the ray came from, for light that is on that
+    side; with `wo` times the BRDF."""
+    smooth = world.settings.shading == "smooth"
+    cosine = rounded_clamp(dot(wi, hit.ns) * hit.side.astype(wi.dtype)) if smooth else jnp.abs(dot(wi, hit.ns))
+    return cosine if wo is None else cosine * brdf(world, unit(wi), wo, hit)
 
 
 def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:
@@ -228,14 +230,3 @@ def _own_slopes(n: Vector, level: Vector, middle: Scalar) -> tuple[Scalar, Scala
     low = jnp.where(faces, jnp.where(upright, jnp.inf, slope), -jnp.inf)
     high = jnp.where(upright, jnp.where(faces, -jnp.inf, jnp.inf), jnp.where(faces, jnp.inf, slope))
     return low, high
-
-
-def rounded_clamp(cosine: Scalar) -> Scalar:
-    """max(cosine, 0), with the corner at zero replaced by a parabola that meets both sides with equal slope.
-
-    Where an interpolated normal faces away from a light that its triangle faces, the surface that it stands for is in its
-    own shade. pbrt-v2 takes the absolute value there, which lights coarse cells anew beyond the terminator. This differs from
-    max(cosine, 0) only within 0.01 of zero, by at most 0.0025.
-    """
-    low = within(cosine, -GRAZING, GRAZING)
-    return jnp.where(cosine < GRAZING, (low + GRAZING) * (low + GRAZING) / (4 * GRAZING), cosine)

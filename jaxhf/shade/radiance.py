@@ -9,14 +9,14 @@ from jax import lax
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import Flag, Index, Vector
-from ..core.vector import dot, select, unit
+from ..core.vector import GRAZING, dot, select, unit
 from ..preparation.world import World, first_hit, no_hit
 from ..scene.light import Sky
-from ..scene.material import Material, Matte, Mirror
-from ..scene.texture import ImageTexture
+from ..scene.material import Material, Mirror
 from ..trace.hit import Hit, Status
 from ..xla.masked import only_where
-from .lighting import GRAZING, irradiance, sharp_lights, unshadowed_irradiance
+from .lighting import light_from, sharp_lights, unshadowed_light
+from .reflectance import depends_on_view, has_material, matte_albedo
 
 
 def radiance(world: World, ray: Ray) -> tuple[Vector, Index]:
@@ -35,16 +35,17 @@ def radiance_from(world: World, ray: Ray, hit: Hit, active: Flag) -> Vector:
     return light + reflectance * _path(world, onwards, hit, active & mirrored, world.settings.max_depth)[0]
 
 
-def shadowed_radiance(world: World, number: Index, hit: Hit) -> Vector:
+def shadowed_radiance(world: World, number: Index, hit: Hit, wo: Vector | None) -> Vector:
     """By how much the shadow of the light of this number darkens the hit, if nothing else keeps that light from it.
 
-    Only what is matte has shadows; what it sends out is the same in all directions.
+    `wo` is as for `light_from`. A mirror has no shadows.
     """
-    albedo, dark = _albedo(world, hit), jnp.zeros_like(hit.n)
-    if albedo is None:
+    dark = jnp.zeros_like(hit.n)
+    if not _scatters(world):
         return dark
-    arriving = ((k, unshadowed_irradiance(world, light, hit)) for k, light in sharp_lights(world))
-    return jnp.where(_has_material(world, hit, Matte), albedo / jnp.pi * select(number, arriving, dark), 0)
+    albedo = matte_albedo(world, hit) if wo is None else None
+    arriving = ((k, unshadowed_light(world, light, hit, wo)) for k, light in sharp_lights(world))
+    return jnp.where(has_material(world, hit, Material), _times(albedo, select(number, arriving, dark)), 0)
 
 
 def _path(world: World, ray: Ray, leaving: Hit, active: Flag, length: int) -> tuple[Vector, Index]:
@@ -64,7 +65,7 @@ def _path(world: World, ray: Ray, leaving: Hit, active: Flag, length: int) -> tu
     return total, exhausted
 
 
-def has_mirrors(materials: Iterable[Material], settings: Settings) -> bool:
+def has_mirrors(materials: Iterable[Material | Mirror], settings: Settings) -> bool:
     """Whether light may come by way of a mirror."""
     return settings.max_depth > 0 and any(isinstance(material, Mirror) for material in materials)
 
@@ -92,26 +93,35 @@ def _bounce(world: World, ray: Ray, leaving: Hit, active: Flag) -> tuple[Ray, Hi
 def _mirrored(world: World, ray: Ray, hit: Hit) -> tuple[Ray, Vector, Flag]:
     """The mirrored ray from a hit, the mirror's reflectance, and whether there is a mirror."""
     values = [(number, jnp.asarray(m.reflectance)) for number, m in enumerate(world.materials) if isinstance(m, Mirror)]
-    return Ray(hit.p, _reflect(ray.d, hit)), select(hit.object, values), _has_material(world, hit, Mirror)
+    return Ray(hit.p, _reflect(ray.d, hit)), select(hit.object, values), has_material(world, hit, Mirror)
 
 
 def _outgoing(world: World, ray: Ray, hit: Hit, active: Flag) -> tuple[Vector, Index]:
-    """Light that a matte surface sends back along `ray`, or the sky where there is no surface."""
+    """Light that a surface scatters back along `ray`, or the sky where there is no surface."""
     met = active & (hit.status == int(Status.HIT))
     total, exhausted = jnp.zeros_like(ray.d), jnp.zeros((), jnp.int32)
-    albedo = _albedo(world, hit)
-    if albedo is not None:
-        matte = met & _has_material(world, hit, Matte)
+    if _scatters(world):
+        wo = unit(-ray.d) if depends_on_view(world) else None
+        albedo = matte_albedo(world, hit) if wo is None else None
+        lit = met & has_material(world, hit, Material)
         for number in range(len(world.lights)):
-            arriving, more = only_where(
-                matte, functools.partial(irradiance, number), world, hit, matte, skips=world.settings.early_exit
-            )
+            light = functools.partial(light_from, number)
+            arriving, more = only_where(lit, light, world, hit, wo, lit, skips=world.settings.early_exit)
             total, exhausted = total + arriving, exhausted + more
-        total = jnp.where(matte, albedo / jnp.pi * total, 0)
+        total = jnp.where(lit, _times(albedo, total), 0)
     for light in world.lights:
         if isinstance(light, Sky):
             total = total + jnp.where(active & (hit.status == int(Status.MISS)), light.radiance, 0)
     return total, exhausted
+
+
+def _scatters(world: World) -> bool:
+    return any(isinstance(material, Material) for material in world.materials)
+
+
+def _times(albedo: Vector | None, light: Vector) -> Vector:
+    """Light times a Lambertian BRDF; as it is, if it has been multiplied by another one."""
+    return light if albedo is None else albedo / jnp.pi * light
 
 
 def _reflect(d: Vector, hit: Hit) -> Vector:
@@ -126,24 +136,3 @@ def _reflect(d: Vector, hit: Hit) -> Vector:
     low = height < GRAZING
     lifted = GRAZING**2 / jnp.where(low, 2 * GRAZING - height, 1)
     return jnp.where(low, unit(out + (lifted - height) * n), out)
-
-
-def _has_material(world: World, hit: Hit, kind: type) -> Flag:
-    """Whether the hit lies on an object of this kind of material."""
-    flags = [isinstance(material, kind) for material in world.materials]
-    if all(flags):
-        return hit.object >= 0
-    found = jnp.zeros((), bool)
-    for number, flag in enumerate(flags):
-        found = found | (hit.object == number) if flag else found
-    return found
-
-
-def _albedo(world: World, hit: Hit) -> Vector | None:
-    """That of the object which was hit; None where no object is matte."""
-    values = [
-        (number, m.albedo(hit.uv) if isinstance(m.albedo, ImageTexture) else jnp.asarray(m.albedo))
-        for number, m in enumerate(world.materials)
-        if isinstance(m, Matte)
-    ]
-    return select(hit.object, values) if values else None

@@ -165,6 +165,20 @@ def test_a_boundary_moves_alone(name):
     assert_line(boundary, flow / PIXEL, 1e-3 if name in SHADED else 1e-6)
 
 
+def test_a_shadow_takes_what_the_material_sends_to_the_eye():
+    """Seen aslant, across the way in which the shadow moves."""
+    eye = np.array([0.0, -0.6, 0.8])
+    camera = jaxhf.Orthographic.look_at(
+        (SHADOW + 0.01, 0.5, 0) + 2 * eye, (SHADOW + 0.01, 0.5, 0), extent=WIDE, width=SIZE, height=SIZE
+    )
+    scene = small_scene(HEIGHT * PLATEAU, camera, (-1.0, 0.0, TAN))
+    scene = eqx.tree_at(lambda scene: scene.objects[0].material, scene, jax.tree.map(jnp.asarray, jaxhf.LommelSeeliger(0.7)))
+    interior, boundary = changes(scene, moved(heights_of, PLATEAU)(scene))
+    law = 2 / (TAN / np.hypot(1, TAN) + eye[2])
+    assert np.abs(interior).max() < 1e-6 * LIT / TAN / PIXEL
+    assert_line(boundary, -LIT * law / TAN / PIXEL)
+
+
 @pytest.mark.deep  # another program
 def test_cast_shadow_moves_with_a_point_light():
     """Light at (x, z) casts the plateau's edge to EDGE + (EDGE - x) HEIGHT / (z - HEIGHT)."""

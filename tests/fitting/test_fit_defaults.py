@@ -277,7 +277,7 @@ GOOD = Findings(
         ({"draws": (20, 7)}, "interrupted after 7 of 20"),
         ({"unsure_noise": "heights explain 95%"}, "heights explain 95%: noise= tells the fit"),
         ({"length": "its length is too short"}, "its length is too short"),
-        ({"strayed": 2.5}, "does not reflect as Matte does"),
+        ({"strayed": 2.5}, "does not reflect as its material does"),
         ({"parts": (2.0, 0.3)}, "their mean ± 2, their shape ± 0.3"),
     ],
 )

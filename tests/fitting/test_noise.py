@@ -108,7 +108,7 @@ def test_a_noise_that_pictures_cannot_tell_is_asked_for():
 @pytest.mark.deep
 def test_a_surface_that_is_not_lamberts_is_a_suspect():
     found = fitted(1, 0.6, 1, matte=False, prior=jaxhf.Prior(0.0, 0.6))
-    assert any("does not reflect as Matte does" in warning for warning in found.warnings)
+    assert any("does not reflect as its material does" in warning for warning in found.warnings)
 
 
 def test_pixels_tell_that_change_with_the_heights_that_are_sought():

@@ -18,8 +18,8 @@ from jaxhf.boundary import guiding, sample
 from jaxhf.core import affine, autodiff
 from jaxhf.preparation import ceiling, sky, world as worlds
 from jaxhf.rendering import aovs as rendering_aovs
-from jaxhf.scene import texture
-from jaxhf.shade import lighting, radiance
+from jaxhf.scene import material as materials, texture
+from jaxhf.shade import lighting, radiance, reflectance
 from jaxhf.trace import cylinder, intersect, normals, search, skirt, skyline
 from jaxhf.xla import masked
 
@@ -131,6 +131,11 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
         "plain",
         case(shading="smooth"),
         [everywhere(normals.vertex_normals), everywhere(lighting.rounded_clamp)],
+    ),
+    "another law than Lambert's": (
+        "plain",
+        case(material=jaxhf.LunarLambert(0.5)),
+        [everywhere(reflectance.brdf), within(materials.LunarLambert, "brdf")],
     ),
     # None is the identity, and nothing is inverted for it.
     "transform": ("plain", case(world=TILTED), [within(worlds, "affine"), within(affine.Affine, "inverse")]),

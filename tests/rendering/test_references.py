@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracle
 import pytest
+from reflectance import LAWS
 
 import jaxhf
 from jaxhf.core.settings import Shading
@@ -131,6 +132,26 @@ def test_light_agrees_with_mitsuba(name, which):
     assert told.sum() > 0.9 * np.isfinite(ref["t"]).sum()
     differ, off = agreement(image[told], ref["radiance"][which][told])
     assert differ <= 1e-3
+    assert off <= 2e-5
+
+
+@pytest.mark.deep  # a program for each
+@pytest.mark.parametrize("name", LAWS)
+def test_laws_of_reflectance_agree_with_mitsuba(name):
+    """On a terrain with shadows, with a BSDF of ours in Mitsuba; compared where light and normals are, see above."""
+    ref = kept("rays-hills")
+    field = jaxhf.Heightfield(ref["heights"], *ref["spacing"].tolist())
+    scene = jaxhf.Scene([jaxhf.Object(field, LAWS[name][0])], camera(ref), [jaxhf.Directional(ref["towards"])])
+    image, aovs = jaxhf.render(scene, jaxhf.Settings(samples=1, normals="six-angle"), aovs=("shadow",))
+    image, dark = np.asarray(image)[::2, ::2, 0], np.asarray(aovs["shadow"])[::2, ::2, 0]
+    eye = ref["eye"] - met_and_towards(ref, 0)[0]
+    n, ns = ref["n"], ref["ns"]
+    alike = np.logical_and.reduce([(n * to).sum(-1) * (ns * to).sum(-1) > 0 for to in (ref["towards"], eye)])
+    faces = np.abs((ns * ref["towards"]).sum(-1) / np.linalg.norm(ref["towards"])) > 0.01
+    told = (np.isfinite(ref["t"]) & alike & faces)[::2, ::2] & (~dark == ref["visible"][0][::2, ::2])
+    assert told.sum() > 0.85 * np.isfinite(ref["t"])[::2, ::2].sum()
+    differ, off = agreement(image[told], ref["by_law"][ref["laws"].tolist().index(name)][told])
+    assert differ <= 2e-3
     assert off <= 2e-5
 
 

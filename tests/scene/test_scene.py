@@ -83,7 +83,7 @@ BAD = [
     (placed(matrix(m03=NAN)), "Object: world_from_object must be finite, it is "),
     (placed(np.eye(3)), "Object: world_from_object must be a 4x4 matrix, its shape is (3, 3)"),
     (made("Object", GRID), "Object: shape must be a Heightfield, Cylinder or Skirt, it is a ndarray"),
-    (made("Object", FIELD, 0.7), "Object: material must be Matte or Mirror, it is a float"),
+    (made("Object", FIELD, 0.7), "Object: material must be a Material or a Mirror, it is a float"),
     (made("Matte", NAN), "Matte: albedo must be finite, it is [nan, nan, nan]"),
     (made("Mirror", [0, INF, 0]), "Mirror: reflectance must be finite, it is [0.0, inf, 0.0]"),
     (texture(np.ones(2)), "ImageTexture: texels must have shape (h, w, 3) or (h, w), theirs is (2,)"),

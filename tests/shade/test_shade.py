@@ -12,7 +12,7 @@ import oracle
 import pytest
 
 import jaxhf
-from jaxhf.shade.lighting import rounded_clamp
+from jaxhf.core.vector import rounded_clamp
 from jaxhf.shade.radiance import _reflect
 
 DEEP = pytest.mark.deep

@@ -20,6 +20,7 @@ from ...maps.relief import color_relief
 from ...rendering.render import Prepared, prepare
 from ...scene.camera import Perspective
 from ...scene.heightfield import Heightfield
+from ...scene.material import SCATTERING
 from ...scene.sun import sun
 from ...xla.devices import local_mesh
 from .. import arguments, limits
@@ -97,7 +98,7 @@ def run(options: argparse.Namespace) -> None:
     field = Heightfield(z, terrain.dx, terrain.dy)
     frames = _frames(options, field, base, path, film)
     camera, look = frames[0]
-    scene = block(field, colours, camera, look, base)
+    scene = block(field, colours, camera, look, base, SCATTERING[options.material])
     limits.require_memory(scene, local_mesh().size)
     ready, said = prepare(scene), "{} x {} pixels".format(*options.size)
     if film:

@@ -28,7 +28,6 @@ from ...preparation.world import World, make_world
 from ...rendering.samples import PictureSamples
 from ...scene.camera import Camera
 from ...scene.light import Light, Sun
-from ...scene.material import Matte
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 from ...shade.radiance import direct, has_mirrors
@@ -38,7 +37,7 @@ from ...trace.triangle import Corners, triangle_vertices
 from ...xla.devices import Spread, map_and_spread, map_over, on_every_device
 from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
-from .pictures import Group
+from .pictures import Group, albedo_of
 from .view import KNOWN, View, moved
 
 # Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
@@ -283,10 +282,8 @@ def _samples(channels: int, factors: tuple[int, ...] | None, seen: _Seen, points
 def _texels(world: World, hit: Hit, light: jax.Array, channels: int, factors: tuple[int, ...]) -> AlbedoRows:
     """How the light from a hit goes with the factors of the first heightfield's albedo."""
     number = world.grids[0][0]
-    material = world.materials[number]
-    assert isinstance(material, Matte)
     places, shares = jnp.zeros(4, jnp.int32), jnp.zeros((3, 4), light.dtype).at[:, 0].set(1)
-    if isinstance(texture := material.albedo, ImageTexture):
+    if isinstance(texture := albedo_of(world.materials[number]), ImageTexture):
         rows, columns, weights = texture.corners(hit.uv)
         parts = weights[None] * jnp.asarray(texture.texels)[rows, columns].T
         total = jnp.sum(parts, axis=1, keepdims=True)

@@ -14,9 +14,10 @@ from jaxtyping import Array, Float
 from ...core.errors import ArgumentError
 from ...core.precision import numbers
 from ...core.settings import Settings
+from ...core.types import AnyArray
 from ...preparation.localise import localise
 from ...preparation.world import resolve_settings
-from ...scene.material import Matte
+from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 
@@ -120,13 +121,17 @@ def with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
     """The scene with the albedo of its first heightfield multiplied."""
     k = scene.first_heightfield
     material = scene.objects[k].material
-    assert isinstance(material, Matte)
-    old = material.albedo
+    old = albedo_of(material)
     texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.asarray(old).reshape(1, 1, 3))
     shape = (*(max(pair) for pair in zip(texture.texels.shape[:2], factor.shape[:2], strict=True)), 3)
     new = jnp.broadcast_to(texture.texels, shape) * jnp.broadcast_to(factor, shape)
     albedo = new.reshape(3) if shape[:2] == (1, 1) and texture is not old else dataclasses.replace(texture, texels=new)
-    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, Matte(albedo))
+    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, dataclasses.replace(material, albedo=albedo))
+
+
+def albedo_of(material: Material | Mirror) -> Float[AnyArray, "3"] | ImageTexture | None:
+    """The albedo to which what a material scatters is proportional; None where it has none."""
+    return getattr(material, "albedo", None)
 
 
 def _stacked(scenes: Sequence[Scene]) -> tuple[Scene, Scene]:

@@ -16,13 +16,12 @@ from ...core.precision import numbers
 from ...core.settings import Settings
 from ...scene.heightfield import Heightfield
 from ...scene.light import Sky
-from ...scene.material import Matte
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 from ...xla.devices import chosen_mesh
 from ..given import Given, Unknown
 from .defaults import choose_edge_samples, choose_samples
-from .pictures import Group, make_groups
+from .pictures import Group, albedo_of, make_groups
 from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units
 from .terms import Terms, make_terms
 from .view import View, sun
@@ -242,10 +241,11 @@ def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknow
     shape, dtype, albedo = scene.heights.shape, scene.heights.dtype, None
     if unknown.albedo is not None:
         material = scene.objects[scene.first_heightfield].material
-        if not isinstance(material, Matte):
-            rule = f"is sought, so the heightfield's material must be Matte, it is {type(material).__name__}"
+        known = albedo_of(material)
+        if known is None:
+            rule = f"is sought, so the heightfield's material must have an albedo; {type(material).__name__} has none"
             raise ArgumentError("Unknown", "albedo", rule)
-        image = material.albedo.texels.shape[:2] if isinstance(material.albedo, ImageTexture) else shape
+        image = known.texels.shape[:2] if isinstance(known, ImageTexture) else shape
         albedo = jnp.ones((*(image if unknown.albedo == "map" else (1, 1)), channels), dtype)
     return Unknowns(
         jnp.zeros_like(basis.base),

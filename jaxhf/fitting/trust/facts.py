@@ -25,7 +25,7 @@ _FAR = 4.5  # times the median: three standard deviations of normal errors
 _EXPLAINED = 0.5  # share of the squared residuals that a factor or an offset of the picture must explain
 _TRIFLE = 0.1  # a factor or, over the brightness, an offset that is too small to be a cause
 _RELATIVE = 1e-5  # above what single precision leaves of a sum that is 0; oblique pictures have 1e-3 to 0.2
-_REFLECTANCE = "or the surface does not reflect as Matte does, by Lambert's law"
+_REFLECTANCE = "or the surface does not reflect as its material does (Matte is Lambert's law)"
 _FAR_FROM_PRIOR = 2.5  # of its deviations, root mean square over an octave of its modes
 _LEAST_MODES = 8  # in an octave
 _LIKE_ONE = 0.5  # correlation of the channels' residuals
@@ -168,7 +168,7 @@ def what_may_help(expansion: Expansion, pictures: Sequence[Left], given: Given) 
         )
     return (
         "mask those pixels by weights, if the scene cannot show what is there (clouds, trees, another albedo, a surface that "
-        "does not reflect as Matte does)"
+        "does not reflect as its material does)"
     )
 
 

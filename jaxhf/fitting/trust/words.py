@@ -162,7 +162,7 @@ def warnings(found: Findings) -> tuple[str, ...]:
     if strays:
         said.append(
             f"the heights differ from the prior by {found.strayed:.2g} times its std, root mean square: either std is "
-            "too small or the heights are wrong, as where the surface does not reflect as Matte does"
+            "too small or the heights are wrong, as where the surface does not reflect as its material does"
         )
     if found.length is not None and found.unlike_noise is None:
         said.append(found.length)

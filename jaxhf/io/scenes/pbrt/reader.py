@@ -227,7 +227,7 @@ class _Reader:
         world_from_object = None if np.array_equal(self.matrix, np.eye(4)) else self.matrix
         self.objects.append(Object(shape, self._made_material(), world_from_object))
 
-    def _made_material(self) -> Material:
+    def _made_material(self) -> Material | Mirror:
         """Made where a shape uses it, with the textures of that place: pbrt-v2 lets a texture follow its material."""
         args = self.material
         if args is None:

@@ -10,7 +10,7 @@ from ....scene import procedural
 from ....scene.camera import Camera, Orthographic, Perspective
 from ....scene.cylinder import Cylinder
 from ....scene.light import Directional, Light, Point, Sky, Sun
-from ....scene.material import Material, Matte, Mirror
+from ....scene.material import SCATTERING, Hapke, Material, Matte, Mirror
 from . import values as kinds
 
 
@@ -50,7 +50,7 @@ def _point(position, intensity) -> Point:
 
 # What each parameter takes of the functions and classes that make the parts of a scene.
 _KINDS: Mapping[str, kinds.Kind] = {
-    "albedo": kinds.or_word(kinds.colour, ", or the name of a texture"),
+    **dict.fromkeys(("albedo", "w"), kinds.or_word(kinds.colour, ", or the name of a texture")),
     "altitude": kinds.angle_above_horizon,
     "convention": kinds.word,
     "size": kinds.size,
@@ -61,6 +61,7 @@ _KINDS: Mapping[str, kinds.Kind] = {
     **dict.fromkeys(("width", "height", "chords", "occlusion", "seed", "count", "lines", "squares"), kinds.whole),
     **dict.fromkeys(("fov", "extent", "fx", "fy", "cx", "cy"), kinds.number),
     **dict.fromkeys(("azimuth", "latitude", "longitude", "angular_diameter", "radius", "z_min", "z_max"), kinds.number),
+    **dict.fromkeys(("limb", "k", "roughness", "b", "c", "opposition"), kinds.number),
     **dict.fromkeys(("exponent", "level", "direction", "spread", "sun_radius", "clouds"), kinds.number),
     **dict.fromkeys(("irradiance", "intensity", "radiance", "reflectance"), kinds.colour),
     **dict.fromkeys(("zenith", "horizon", "sun_radiance", "first", "second"), kinds.colour),
@@ -70,7 +71,8 @@ _KINDS: Mapping[str, kinds.Kind] = {
 def _keys(function: Callable[..., Any], *needed: str) -> Keys:
     """The parameters of a function; those without a default are needed, too."""
     given = inspect.signature(function).parameters.values()
-    return {p.name: Key(_KINDS[p.name], p.name in needed or p.default is p.empty) for p in given}
+    kinds_of = _KINDS | ({"width": kinds.number} if function is Hapke else {})
+    return {p.name: Key(kinds_of[p.name], p.name in needed or p.default is p.empty) for p in given}
 
 
 SCENE: Keys = {
@@ -92,8 +94,10 @@ LIGHTS: dict[str, tuple[Callable[..., Light], Keys]] = {
     "point": (_point, _keys(_point)),
     "sky": (Sky, _keys(Sky)),
 }
-MATERIALS: dict[str, tuple[Callable[..., Material], Keys]] = {
-    "matte": (functools.partial(Matte, albedo=0.7), _keys(functools.partial(Matte, albedo=0.7))),
+_MATTE = functools.partial(Matte, albedo=0.7)
+MATERIALS: dict[str, tuple[Callable[..., Material | Mirror], Keys]] = {
+    **{name: (kind, _keys(kind)) for name, kind in SCATTERING.items()},
+    "matte": (_MATTE, _keys(_MATTE)),
     "mirror": (Mirror, _keys(Mirror)),
 }
 TEXTURES = {name: (function, _keys(function)) for name, function in procedural.TEXTURES.items()}
