@@ -208,7 +208,7 @@ def _estimated(here: Expansion, state: State, order: Sequence[Stage], repeats: b
     stage, posed, spread = order[state.stage + 1], here.problem, spreads(here)
     before = Estimate(state.noise, state.widths)
     by_residuals = before.noise if given.noise is not None else np.maximum(spread, posed.least_noise)
-    is_open = given.prior is not None and given.prior.length is None
+    is_open = given.prior is not None and given.prior.length is None and posed.albedo is None
     sought = given.noise is None and explains_noise(posed)
     found = before._replace(noise=by_residuals)
     if stage == order[-2] and (is_open or (sought and repeats)):  # all modes of the finest heights

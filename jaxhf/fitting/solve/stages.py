@@ -71,10 +71,13 @@ def on_finer(state: State, problems: Sequence[Problem], level: int, given: Given
     shape, dtype = fine.field.heights.shape, fine.field.heights.dtype
     base = np.asarray(fine.basis.base, np.float64) + pad(resample(change, shape), fine.basis.padding)
     unknowns = state.unknowns.with_modes(jnp.zeros_like(fine.basis.base))
-    if unknowns.albedo is not None and unknowns.albedo.shape != fine.albedo_shape:  # one factor for each vertex
-        channels = np.moveaxis(np.asarray(unknowns.albedo, np.float64), -1, 0)
+    factors = coarse.factors(unknowns)
+    if factors is not None and factors.shape != fine.albedo_shape:  # one factor for each vertex
+        channels = np.moveaxis(np.asarray(factors, np.float64), -1, 0)
         finer = np.stack([resample(channel, shape) for channel in channels], -1)
-        unknowns = eqx.tree_at(lambda u: u.albedo, unknowns, jnp.asarray(finer, dtype))
+        finer = jnp.asarray(finer, dtype)
+        finer = finer if fine.albedo is None else fine.albedo.modes(finer)
+        unknowns = eqx.tree_at(lambda u: u.albedo, unknowns, finer)
     return dataclasses.replace(
         state,
         unknowns=unknowns,
