@@ -59,9 +59,14 @@ class Unknown:
     Attributes:
       albedo: "constant", one factor on the heightfield's albedo; "map", a factor for each texel of its image, or for each
         vertex where it has none; None: it is known.
-      albedo_std: the standard deviation of these factors about 1, each for itself.
+      albedo_std: the standard deviation of these factors about 1, each for itself; with `albedo_length` that of their logarithms.
+      albedo_length: correlation length of the logarithms of a map's factors, world units as dx and dy are: their correlation at
+        the distance r is exp(-r / albedo_length). So a picture with as many pixels as heights is not explained by paint alone.
+        None: each factor is for itself.
       exposures, offsets: whether each picture has an unknown factor, an unknown addend. Where the albedo is unknown too, only
         the product of exposure and albedo is known; the fit keeps near 1.
+      sky_std: the standard deviation of the logarithm of the sky's radiance in each picture: 0.7 is a factor of 2. None: it is
+        known.
       light_std: how far the direction of each picture's light, of its first Directional one, may be off: the standard deviation
         of either of two angles, degrees. None: it is known.
       camera_std: the same of each picture's camera: of its position along each axis, world units, and of its rotation about
@@ -71,8 +76,10 @@ class Unknown:
 
     albedo: Albedo | str | None = None
     albedo_std: float | int = 1.0
+    albedo_length: float | int | None = None
     exposures: bool = False
     offsets: bool = False
+    sky_std: float | int | None = None
     light_std: float | int | None = None
     camera_std: Any = None
 
@@ -83,6 +90,10 @@ class Unknown:
             raise ArgumentError("Unknown", "albedo_std", "must stand with an albedo that is sought")
         if not _is_positive(self.albedo_std):
             raise ArgumentError("Unknown", "albedo_std", f"must be positive and finite, it is {self.albedo_std!r}")
+        if self.albedo_length is not None and self.albedo != "map":
+            raise ArgumentError("Unknown", "albedo_length", 'must stand with albedo="map"')
+        _require_positive("Unknown", "albedo_length", self.albedo_length)
+        _require_positive("Unknown", "sky_std", self.sky_std)
         for name in ("exposures", "offsets"):
             value = getattr(self, name)
             require("Unknown", name, bool(value) if isinstance(value, np.bool_) else value, flag)

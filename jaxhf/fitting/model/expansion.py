@@ -133,13 +133,13 @@ def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
 
 @functools.partial(compiled, jit=eqx.filter_jit)
 def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
-    heights = problem.basis.heights(unknowns.coefficients)
+    heights, factors = problem.basis.heights(unknowns.coefficients), problem.factors(unknowns)
 
     def of(group: Group) -> Linearised | None:
         if not can_be_linearised(group.scenes, problem.settings):
             return None
         moves = _moves(unknowns, problem, group)
-        return linearise_each(group, heights, problem.settings, problem.mesh, moves, unknowns.albedo)
+        return linearise_each(group, heights, problem.settings, problem.mesh, moves, factors)
 
     return on_every_device(tuple(map(of, problem.groups)), problem.mesh)
 
@@ -180,13 +180,13 @@ def _simulate(
     heights: Float[Array, "ny nx"],
 ) -> Rows:
     """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
-    images = []
+    images, factors = [], problem.factors(unknowns)
     for group, known in zip(problem.groups, linearised, strict=True):
         if known is not None:
             moves = _moves(unknowns, problem, group)
-            image = picture_each(known, group, heights, problem.settings, problem.mesh, moves, unknowns.albedo)
+            image = picture_each(known, group, heights, problem.settings, problem.mesh, moves, factors)
         else:
-            complete = functools.partial(group.complete, heights=heights, factors=unknowns.albedo)
+            complete = functools.partial(group.complete, heights=heights, factors=factors)
             image = render_each(_views(unknowns, problem, group), complete, problem.settings, problem.mesh)
             if group.targets.shape[-1] == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
@@ -212,13 +212,14 @@ def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
 def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:
     """The scenes as they were given, with all that was found; positions keep double precision."""
     heights, found = problem.basis.crop(surface_of(unknowns, problem.basis)), list(scenes)
+    factors = problem.factors(unknowns)
     for group in problem.groups:
         new, old = ((part.lights, part.camera) for part in (_views(unknowns, problem, group), group.scenes))
         change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)
         for n, k in enumerate(group.indices):
             scene = scenes[k].with_heights(heights)
-            if unknowns.albedo is not None:
-                scene = with_albedo(scene, unknowns.albedo)
+            if factors is not None:
+                scene = with_albedo(scene, factors)
             if jax.tree.leaves(unknowns.view):
                 given = scene.lights, scene.camera
                 lights, camera = jax.tree.map(lambda leaf, more, n=n: np.asarray(leaf) + more[n], given, change)

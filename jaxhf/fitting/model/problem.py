@@ -20,6 +20,7 @@ from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 from ...xla.devices import chosen_mesh
 from ..given import Given, Unknown
+from .albedo import AlbedoField, make_albedo_field
 from .defaults import choose_edge_samples, choose_samples
 from .pictures import Group, albedo_of, make_groups
 from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units
@@ -48,6 +49,7 @@ class Problem(eqx.Module):
       settings: how to render.
       mesh: the devices that share the work.
       field: the heightfield that is sought, for its size and spacing.
+      albedo: the prior of an albedo whose factors are not independent; None: there is none such.
       albedo_shape: of `Unknowns.albedo`.
       known: whether its heights have a prior of the user's.
     """
@@ -61,10 +63,15 @@ class Problem(eqx.Module):
     bright: Float[Array, ""]
     view_unit: View
     field: Heightfield
+    albedo: AlbedoField | None
     albedo_shape: tuple[int, ...] | None = eqx.field(static=True)
     settings: Settings = eqx.field(static=True)
     mesh: Mesh = eqx.field(static=True)
     known: bool = eqx.field(static=True)
+
+    def factors(self, unknowns: Unknowns) -> Float[Array, "ty tx c"] | None:
+        """What the albedo is multiplied by; None where it is known."""
+        return unknowns.albedo if self.albedo is None or unknowns.albedo is None else self.albedo.factors(unknowns.albedo)
 
     @property
     def least_noise(self) -> Float[np.ndarray, " pictures"]:
@@ -147,19 +154,20 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
     basis = make_basis(field, base, slope_units(base.shape, field.dx, field.dy)[0], free=free)
     settings = choose_samples(scenes, given.settings)
     brightness, view_unit = _brightness(targets), _view_unit(scenes, given.unknown)
-    terms = make_terms(field, given.prior, given.unknown, base, free, view_unit)
     groups = make_groups(scenes, targets, given.weights, settings)
     unknowns = _first_unknowns(scenes, basis, max(group.targets.shape[-1] for group in groups), given.unknown, view_unit)
+    albedo = _albedo_field(field, unknowns, given.unknown)
     problem = Problem(
         groups=groups,
         basis=basis,
-        terms=terms,
+        terms=make_terms(field, given.prior, given.unknown, base, free, view_unit, albedo),
         loss_scale=jnp.asarray(LOSS_SCALE, dtype),
         noise=np.ones(len(scenes)),
         brightness=brightness,
         bright=jnp.asarray(np.median(brightness), dtype),
         view_unit=view_unit,
         field=Heightfield(field.heights, field.dx, field.dy),  # wherever it stands: other windows then share programs
+        albedo=albedo,
         albedo_shape=None if unknowns.albedo is None else unknowns.albedo.shape,
         settings=settings,
         mesh=chosen_mesh("fit", given.mesh),
@@ -193,7 +201,21 @@ def _view_unit(scenes: Sequence[Scene], unknown: Unknown) -> View:
             )
             raise ArgumentError("Unknown", "camera_std", rule)
         camera = jnp.asarray([side / 4] * 3 + [1 / 4] * 3, dtype)
-    return View(light, camera)
+    if unknown.sky_std is not None:
+        for k, scene in enumerate(scenes):
+            if not any(isinstance(light, Sky) for light in scene.lights):
+                raise ArgumentError("Unknown", "sky_std", f"must stand with a Sky, scenes[{k}] has none")
+    return View(light, camera, None if unknown.sky_std is None else jnp.ones(1, dtype))
+
+
+def _albedo_field(field: Heightfield, unknowns: Unknowns, unknown: Unknown) -> AlbedoField | None:
+    if unknowns.albedo is None or unknown.albedo_length is None:
+        return None
+    ny, nx = field.heights.shape
+    side, shape = ((ny - 1) * field.dy, (nx - 1) * field.dx), unknowns.albedo.shape[:2]
+    # The texels of an image end at the border, vertices stand on it.
+    spacing = tuple(length / (n if n != count else n - 1) for length, n, count in zip(side, shape, (ny, nx), strict=True))
+    return make_albedo_field(shape, spacing, unknown.albedo_std, unknown.albedo_length, field.heights.dtype)
 
 
 def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
@@ -246,7 +268,8 @@ def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknow
             rule = f"is sought, so the heightfield's material must have an albedo; {type(material).__name__} has none"
             raise ArgumentError("Unknown", "albedo", rule)
         image = known.texels.shape[:2] if isinstance(known, ImageTexture) else shape
-        albedo = jnp.ones((*(image if unknown.albedo == "map" else (1, 1)), channels), dtype)
+        shape = (*(image if unknown.albedo == "map" else (1, 1)), channels)
+        albedo = (jnp.ones if unknown.albedo_length is None else jnp.zeros)(shape, dtype)
     return Unknowns(
         jnp.zeros_like(basis.base),
         albedo,

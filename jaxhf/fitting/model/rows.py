@@ -147,7 +147,7 @@ def _slopes(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem
         first = jax.tree.map(lambda leaf: leaf[0], group.scenes)
 
         def values(heights: Array, group: Group = group, scene: Scene = first) -> Array:
-            return vertex_values(make_world(group.complete(scene, heights, unknowns.albedo), problem.settings))
+            return vertex_values(make_world(group.complete(scene, heights, problem.factors(unknowns)), problem.settings))
 
         _, change = jax.linearize(values, heights)
         slopes.append(lax.map(lambda k, change=change: change((phase == k).astype(heights.dtype)), jnp.arange(_REACH**2)))

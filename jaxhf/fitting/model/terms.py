@@ -12,6 +12,7 @@ from ...core.errors import ArgumentError
 from ...core.precision import numbers
 from ...scene.heightfield import Heightfield
 from ..given import Prior, Unknown
+from .albedo import AlbedoField
 from .surface import Basis, Unknowns, dct_matrix, make_heights, pad, padding, slope_units
 from .view import View
 
@@ -61,8 +62,9 @@ def make_terms(
     start: Float[np.ndarray, "my mx"],
     free: Float[np.ndarray, "my mx"] | None,
     view_unit: View,
+    albedo: AlbedoField | None,
 ) -> Terms:
-    """The priors of a fit from `start`, which is padded; `free` is that of `Basis`, `view_unit` that of `Problem`.
+    """The priors of a fit from `start`, which is padded; `free` is that of `Basis`, `view_unit` and `albedo` those of `Problem`.
 
     Factors have their mean 1, offsets 0, and what else is not told the deviation 1.
     """
@@ -77,7 +79,7 @@ def make_terms(
         surface = eqx.tree_at(lambda term: term.weight, surface, surface.weight * jnp.asarray(free, dtype))
     others = []
     if unknown.albedo is not None:
-        others.append(term(one, one / unknown.albedo_std))
+        others.append(term(one, one / unknown.albedo_std) if albedo is None else term(none, albedo.weight))
     if unknown.exposures:
         others.append(term(one, one))
     if unknown.offsets:
@@ -88,6 +90,8 @@ def make_terms(
         position, rotation = unknown.camera_std
         deviations = np.array([position] * 3 + [math.radians(rotation)] * 3, dtype)
         others.append(term(none, (view_unit.camera / deviations)[None]))
+    if view_unit.sky is not None and unknown.sky_std is not None:
+        others.append(term(none, view_unit.sky / unknown.sky_std))
     return Terms(surface, tuple(others))
 
 

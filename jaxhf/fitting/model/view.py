@@ -14,7 +14,7 @@ from ...core.affine import affine
 from ...core.types import Vector
 from ...core.vector import dot, unit
 from ...scene.camera import Camera
-from ...scene.light import Directional, Light
+from ...scene.light import Directional, Light, Sky
 from ...scene.scene import Scene
 
 
@@ -24,10 +24,12 @@ class View(eqx.Module):
     Attributes:
       light: two angles by which the first directional light is turned, about axes across it, radians (their tangents).
       camera: by how much the eye is moved, world units, and a rotation vector about it, radians, both along the world's axes.
+      sky: by how much the logarithm of the sky's radiance grows.
     """
 
     light: Float[jax.Array, "..."] | None = None
     camera: Float[jax.Array, "..."] | None = None
+    sky: Float[jax.Array, "..."] | None = None
 
 
 KNOWN = View()
@@ -39,13 +41,19 @@ def sun(lights: Sequence[Light]) -> Directional | None:
 
 
 def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[Light, ...], Camera]:
-    """The light turned and the camera moved by `view`, leaves (2,) and (6,); where these are zero, the same to the bit."""
+    """The light turned, the camera moved and the sky brighter by `view`, leaves (2,), (6,) and (1,); where these are zero, the
+    same to the bit."""
     if view.light is not None:
         light = sun(lights)
         assert light is not None
         first, second = _across(light.towards)
         towards = light.towards + view.light[0] * first + view.light[1] * second
         lights = tuple(dataclasses.replace(light, towards=towards) if other is light else other for other in lights)
+    if view.sky is not None:
+        brighter = jnp.exp(view.sky[0])
+        lights = tuple(
+            dataclasses.replace(light, radiance=brighter * light.radiance) if isinstance(light, Sky) else light for light in lights
+        )
     if view.camera is not None:
         world = affine(jnp.asarray(camera.world_from_camera))
         # Cayley's transform, of half the angle's tangent: for the angle itself that has no singular derivative at zero, and

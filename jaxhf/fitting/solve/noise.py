@@ -71,8 +71,9 @@ def _spread(left: Float[np.ndarray, " n"]) -> float:
 
 
 def explains_noise(problem: Problem) -> bool:
-    """Whether heights may explain so much of the noise that degrees of freedom count."""
-    return problem.field.heights.size > _LEAST_SHARE * problem.values
+    """Whether heights may explain so much of the noise that degrees of freedom count; not where an `AlbedoField`, which explains
+    most of it, is sought besides."""
+    return problem.albedo is None and problem.field.heights.size > _LEAST_SHARE * problem.values
 
 
 class Restricted:

@@ -139,6 +139,8 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
     else:
         units, curvature, others = balanced(here.of(widened(posed, told.widths / state.widths)).with_noise(told.noise))
         step_size = 1 / (FIRST_DAMPING * curvature)
+        if place is not None and posed.albedo is not None:  # what that can undo curves the loss less: λ goes on from below
+            step_size = max(step_size, float(state.step_size))
     begin = state.unknowns.at_base()
     following = dataclasses.replace(
         told,
@@ -208,7 +210,7 @@ def _estimated(here: Expansion, state: State, order: Sequence[Stage], repeats: b
     stage, posed, spread = order[state.stage + 1], here.problem, spreads(here)
     before = Estimate(state.noise, state.widths)
     by_residuals = before.noise if given.noise is not None else np.maximum(spread, posed.least_noise)
-    is_open = given.prior is not None and given.prior.length is None
+    is_open = given.prior is not None and given.prior.length is None and posed.albedo is None
     sought = given.noise is None and explains_noise(posed)
     found = before._replace(noise=by_residuals)
     if stage == order[-2] and (is_open or (sought and repeats)):  # all modes of the finest heights

@@ -19,6 +19,7 @@ from .state import State
 
 _REJECTIONS = 2  # in a row, at a coarse stage: the next one may do better
 _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviation that their noise leaves them with
+_FIELD_GAIN = 1e-4  # the same beside an `AlbedoField`, which leaves pictures little to say: sun and sky are still 8 degrees off
 _LEFT_GAIN = 2e-4  # the same at the end, where steps are whole ones: by 0.02 of it
 _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
@@ -71,10 +72,13 @@ def on_finer(state: State, problems: Sequence[Problem], level: int, given: Given
     shape, dtype = fine.field.heights.shape, fine.field.heights.dtype
     base = np.asarray(fine.basis.base, np.float64) + pad(resample(change, shape), fine.basis.padding)
     unknowns = state.unknowns.with_modes(jnp.zeros_like(fine.basis.base))
-    if unknowns.albedo is not None and unknowns.albedo.shape != fine.albedo_shape:  # one factor for each vertex
-        channels = np.moveaxis(np.asarray(unknowns.albedo, np.float64), -1, 0)
+    factors = coarse.factors(unknowns)
+    if factors is not None and factors.shape != fine.albedo_shape:  # one factor for each vertex
+        channels = np.moveaxis(np.asarray(factors, np.float64), -1, 0)
         finer = np.stack([resample(channel, shape) for channel in channels], -1)
-        unknowns = eqx.tree_at(lambda u: u.albedo, unknowns, jnp.asarray(finer, dtype))
+        finer = jnp.asarray(finer, dtype)
+        finer = finer if fine.albedo is None else fine.albedo.modes(finer)
+        unknowns = eqx.tree_at(lambda u: u.albedo, unknowns, finer)
     return dataclasses.replace(
         state,
         unknowns=unknowns,
@@ -100,7 +104,8 @@ def why_ended(state: State, problems: Sequence[Problem], max_steps: int, has_fac
         return Stop.NON_FINITE
     sharp = float(state.loss_scale) == LOSS_SCALE
     fine = varies_all(state, problems) and (sharp or state.stage + 2 == len(order))
-    enough = _FLAT_GAIN * problems[-1].field.heights.size if fine else _COARSE_GAIN * loss
+    flat = _FLAT_GAIN if problems[-1].albedo is None else _FIELD_GAIN
+    enough = flat * problems[-1].field.heights.size if fine else _COARSE_GAIN * loss
     if len(steps) > 1 and _is_flat(state, enough):  # the first only evaluates where the stage begins
         return Stop.CONVERGED
     # Damping that grows with each rejection leaves less and less to be gained, until that would not count.

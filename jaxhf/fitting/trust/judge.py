@@ -141,7 +141,7 @@ def judged(
         std=std,
         samples=samples,
         seen=seen,
-        albedo=found.albedo,
+        albedo=problem.factors(found),
         exposures=found.exposures,
         offsets=None if found.offsets is None else found.offsets * problem.bright,
         noise=problem.noise,

@@ -53,7 +53,7 @@ _FIT: Keys = {
 _PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number), needed=True)), **optional("length", kind=number)}
 _UNKNOWN: Keys = {
     **optional("albedo", kind=word),
-    **optional("albedo_std", "light_std", kind=number),
+    **optional("albedo_std", "albedo_length", "sky_std", "light_std", kind=number),
     **optional("exposures", "offsets", kind=flag),
     **optional("camera_std", kind=numbers(2)),
 }
