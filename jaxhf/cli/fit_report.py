@@ -44,6 +44,9 @@ def facts(case: Case, found: Fit) -> Iterator[tuple[str, str]]:
     for name, values in (("exposures", found.exposures), ("offsets", found.offsets)):
         if values is not None:
             yield name, _listed(values, 6)
+    if sought := case.unknown.get("material_std"):
+        material = found.scenes[0].objects[found.scenes[0].first_heightfield].material
+        yield "material", ", ".join(f"{name} {float(getattr(material, name)):.4g}" for name in sought)
     lights, cameras = [], []
     for given, scene in zip(case.scenes, found.scenes, strict=True):
         turned, moved, rotated = differences(given, scene)

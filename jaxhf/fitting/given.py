@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -67,6 +67,8 @@ class Unknown:
         the product of exposure and albedo is known; the fit keeps near 1.
       sky_std: the standard deviation of the logarithm of the sky's radiance in each picture: 0.7 is a factor of 2. None: it is
         known.
+      material_std: how far numbers of the heightfield's material may be off, the same in all pictures: their standard
+        deviations by name, {"limb": 0.2}. None: they are known.
       light_std: how far the direction of each picture's light, of its first Directional one, may be off: the standard deviation
         of either of two angles, degrees. None: it is known.
       camera_std: the same of each picture's camera: of its position along each axis, world units, and of its rotation about
@@ -80,6 +82,7 @@ class Unknown:
     exposures: bool = False
     offsets: bool = False
     sky_std: float | int | None = None
+    material_std: Mapping[str, float] | None = None
     light_std: float | int | None = None
     camera_std: Any = None
 
@@ -97,6 +100,11 @@ class Unknown:
         for name in ("exposures", "offsets"):
             value = getattr(self, name)
             require("Unknown", name, bool(value) if isinstance(value, np.bool_) else value, flag)
+        if self.material_std is not None and not (isinstance(self.material_std, Mapping) and self.material_std):
+            raise ArgumentError("Unknown", "material_std", f"must have deviations by name, it is {self.material_std!r}")
+        for name, deviation in (self.material_std or {}).items():
+            if not _is_positive(deviation):
+                raise ArgumentError("Unknown", "material_std", f"must be positive and finite, of {name} it is {deviation!r}")
         _require_positive("Unknown", "light_std", self.light_std)
         pair = self.camera_std
         if pair is not None and not (np.shape(pair) == (2,) and all(map(_is_positive, pair))):

@@ -27,7 +27,8 @@ CAMERAS = [
     for eye, width in (((0.6, -0.8, 0.9), 37), ((-0.6, 0.3, 1.1), 30))
 ]
 TEXELS = np.random.default_rng(1).uniform(0.2, 0.9, (3, 4, 3))
-EVERYTHING = jaxhf.Unknown(albedo="map", exposures=True, offsets=True, light_std=1.0, camera_std=(0.1, 1.0))
+KNOWN_LAW = jaxhf.Unknown(albedo="map", exposures=True, offsets=True, light_std=1.0, camera_std=(0.1, 1.0))
+EVERYTHING = dataclasses.replace(KNOWN_LAW, sky_std=1.0, material_std={"limb": 0.2})
 ROUNDING = {"single": 2e-4, "double": 1e-10}  # of the largest value: sums of some hundred terms that are rounded
 
 
@@ -36,9 +37,13 @@ def waves(ny: int, nx: int, height: float) -> np.ndarray:
     return height * (np.sin(5 * x + 2 * y) + np.cos(3 * x - 6 * y + 1))
 
 
-def scene_of(k: int, crowded: bool) -> jaxhf.Scene:
+def paint(albedo: Any, unknown: jaxhf.Unknown, limb: Any = 0.4) -> jaxhf.Material:
+    return jaxhf.LunarLambert(albedo, limb) if unknown.material_std else jaxhf.Matte(albedo)
+
+
+def scene_of(k: int, crowded: bool, unknown: jaxhf.Unknown = KNOWN_LAW) -> jaxhf.Scene:
     """The sought terrain, turned and painted; if `crowded`, between a cylinder and another heightfield, which has a hole."""
-    painted = jaxhf.Matte(jaxhf.ImageTexture(TEXELS))
+    painted = paint(jaxhf.ImageTexture(TEXELS), unknown)
     objects = [jaxhf.Object(jaxhf.Heightfield(waves(9, 8, 0.05), dx=0.09), painted, PLACE)]
     if crowded:
         holed = waves(12, 10, 0.08) - 0.3
@@ -48,19 +53,19 @@ def scene_of(k: int, crowded: bool) -> jaxhf.Scene:
     return jaxhf.Scene(objects, CAMERAS[k], (SKY, SUN, LAMP) if crowded else (SKY, SUN))
 
 
-def moved_expansion(settings: jaxhf.Settings, channels: tuple[int, ...]) -> Expansion:
+def moved_expansion(settings: jaxhf.Settings, channels: tuple[int, ...], unknown: jaxhf.Unknown) -> Expansion:
     """Of pictures with so many channels each, about unknowns that have all moved."""
     rng = np.random.default_rng(5)
     targets = [rng.uniform(0.1, 0.3, (22, camera.width, c)) for camera, c in zip(CAMERAS, channels, strict=False)]
     weights = [rng.uniform(0.5, 2.0, target.shape) for target in targets]
-    options = given(settings=settings, unknown=EVERYTHING, noise=0.01, weights=weights)
-    problem, unknowns = make_problem([scene_of(k, len(channels) > 1) for k in range(len(targets))], targets, options)
+    options = given(settings=settings, unknown=unknown, noise=0.01, weights=weights)
+    problem, unknowns = make_problem([scene_of(k, len(channels) > 1, unknown) for k in range(len(targets))], targets, options)
     rng, leaves, tree = np.random.default_rng(7), *jax.tree.flatten(unknowns)
     leaves = [leaf + jnp.asarray(0.02 * rng.standard_normal(leaf.shape), leaf.dtype) for leaf in leaves]
     return expand(jax.tree.unflatten(tree, leaves), problem)
 
 
-def by_render(expansion: Expansion, surface: jax.Array, others: Unknowns) -> list[jax.Array]:
+def by_render(expansion: Expansion, unknown: jaxhf.Unknown, surface: jax.Array, others: Unknowns) -> list[jax.Array]:
     """The same pictures in units of the noise, each by `jaxhf.render`."""
     images, problem = [], expansion.problem
     crowded = problem.count > 1
@@ -69,10 +74,13 @@ def by_render(expansion: Expansion, surface: jax.Array, others: Unknowns) -> lis
     assert others.offsets is not None
     for group in problem.groups:
         (k,) = group.indices
-        scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene_of(k, crowded), surface)
-        painted = jaxhf.Matte(jaxhf.ImageTexture(jnp.asarray(TEXELS, surface.dtype) * others.albedo))
+        scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene_of(k, crowded, unknown), surface)
+        texture = jaxhf.ImageTexture(jnp.asarray(TEXELS, surface.dtype) * others.albedo)
+        moved_limb = 0.0 if others.view.material is None else others.view.material[0, 0] * problem.view_unit.material[0]
+        painted = paint(texture, unknown, 0.4 + moved_limb)
         scene = eqx.tree_at(lambda scene: scene.objects[int(crowded)].material, scene, painted)
-        view = jax.tree.map(lambda values, unit, k=k: values[k] * unit, others.view, problem.view_unit)
+        own = dataclasses.replace(others.view, material=None), dataclasses.replace(problem.view_unit, material=None)
+        view = jax.tree.map(lambda values, unit, k=k: values[k] * unit, *own)
         lights, camera = moved(scene.lights, scene.camera, view)
         image = jaxhf.render(dataclasses.replace(scene, lights=lights, camera=camera), problem.settings)
         if group.targets.shape[-1] == 1:
@@ -87,22 +95,22 @@ FLAT = dataclasses.replace(NO_EDGES, shading="flat", samples=4)
 
 
 @pytest.mark.parametrize(
-    ("settings", "channels", "precision"),
+    ("settings", "channels", "precision", "unknown"),
     [
-        (NO_EDGES, (1,), "single"),
-        pytest.param(NO_EDGES, (1, 3), "double", marks=[pytest.mark.x64, pytest.mark.slow]),
-        pytest.param(EDGES, (3,), "double", marks=[pytest.mark.x64, pytest.mark.deep]),
-        pytest.param(FLAT, (3,), "double", marks=[pytest.mark.x64, pytest.mark.deep]),
+        (NO_EDGES, (1,), "single", EVERYTHING),
+        pytest.param(NO_EDGES, (1, 3), "double", EVERYTHING, marks=[pytest.mark.x64, pytest.mark.slow]),
+        pytest.param(EDGES, (3,), "double", KNOWN_LAW, marks=[pytest.mark.x64, pytest.mark.deep]),
+        pytest.param(FLAT, (3,), "double", KNOWN_LAW, marks=[pytest.mark.x64, pytest.mark.deep]),
     ],
     ids=["single", "crowded, double", "edges, double", "flat, double"],
 )
-def test_products_are_those_of_the_derivative_of_render(settings, channels, precision, monkeypatch):
+def test_products_are_those_of_the_derivative_of_render(settings, channels, precision, unknown, monkeypatch):
     """J and its transpose, in all unknowns at once; and the derivative in heights as a sparse matrix.
 
     A pixel that is resampled differs from `render`'s in its value, so in exposures times that, which are still there.
     """
     monkeypatch.setattr("jaxhf.fitting.model.linearise._POINTS_PER_PIXEL", 64)  # then as many are resampled as by `render`
-    here, rounding = moved_expansion(settings, channels), ROUNDING[precision]
+    here, rounding = moved_expansion(settings, channels, unknown), ROUNDING[precision]
     others = here.unknowns.without_modes()
     rng = np.random.default_rng(3)
 
@@ -113,7 +121,7 @@ def test_products_are_those_of_the_derivative_of_render(settings, channels, prec
     change, rows = drawn(at), drawn([group.targets for group in here.problem.groups])
     if settings.edge_samples:
         change = eqx.tree_at(lambda change: change[1].exposures, change, jnp.zeros(1))
-    images, expected = jax.jit(lambda at, change: jax.jvp(lambda *at: by_render(here, *at), at, change))(at, change)
+    images, expected = jax.jit(lambda at, change: jax.jvp(lambda *at: by_render(here, unknown, *at), at, change))(at, change)
     found = here.push(change)
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=rounding * np.abs(theirs).max())

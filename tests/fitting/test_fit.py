@@ -93,6 +93,22 @@ def test_a_map_of_the_albedo_comes_back():
         np.testing.assert_allclose(jaxhf.render(scene, SETTINGS)[..., 0], image, atol=1e-5)
 
 
+def test_a_number_of_the_material_comes_back():
+    """And heights with it, which are off where it is taken for known; it is found in `scenes`."""
+    laws = (jaxhf.LunarLambert(0.7, limb) for limb in (0.2, 0.7))
+    guessed, true = (jax.tree.map(jnp.asarray, law) for law in laws)
+
+    def of(law, all_scenes):
+        return [eqx.tree_at(lambda scene: scene.objects[0].material, scene, law) for scene in all_scenes]
+
+    targets = [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in of(true, scenes(TRUTH))]
+    found = jaxhf.fit(
+        of(guessed, scenes()), targets, settings=SETTINGS, noise=0.001, unknown=jaxhf.Unknown(material_std={"limb": 1.0})
+    )
+    np.testing.assert_allclose([scene.objects[0].material.limb for scene in found.scenes], 0.7, rtol=5e-3)  # pyright: ignore[reportAttributeAccessIssue]
+    assert off_in_shape(found.heights) < 0.01
+
+
 def test_exposures_and_offsets_come_back_apart(targets):
     """They trade against each other where slopes are small: a step that is solved to a tenth leaves 0.2 % of that."""
     exposures, offsets = np.array([1.0, 1.2, 0.9]), np.array([0.02, -0.01, 0.05])

@@ -20,12 +20,12 @@ from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device
 from .linearise import Linearised, can_be_linearised, changing_pixels, linearise_each, moved_each
-from .pictures import Group, with_albedo
+from .pictures import Group, with_albedo, with_material
 from .problem import Problem
 from .products import picture_each
 from .robust import soften
 from .surface import Basis, Unknowns
-from .view import View
+from .view import KNOWN, View
 
 Rows = list[Float[Array, "_ _ _ _"]]
 """A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""
@@ -186,7 +186,8 @@ def _simulate(
             moves = _moves(unknowns, problem, group)
             image = picture_each(known, group, heights, problem.settings, problem.mesh, moves, factors)
         else:
-            complete = functools.partial(group.complete, heights=heights, factors=factors)
+            seen = _common(unknowns, problem)
+            complete = functools.partial(group.complete, heights=heights, factors=factors, numbers=seen)
             image = render_each(_views(unknowns, problem, group), complete, problem.settings, problem.mesh)
             if group.targets.shape[-1] == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
@@ -200,8 +201,14 @@ def _simulate(
 
 def _moves(unknowns: Unknowns, problem: Problem, group: Group) -> View:
     """By what the light and the camera of each picture of a group are `moved`."""
-    which = np.array(group.indices)
-    return jax.tree.map(lambda values, unit: values[which] * unit[None], unknowns.view, problem.view_unit)
+    which = np.array(group.indices)  # what pictures share has one row for all
+    return jax.tree.map(lambda values, unit: values[which % len(values)] * unit[None], unknowns.view, problem.view_unit)
+
+
+def _common(unknowns: Unknowns, problem: Problem) -> View:
+    """By what a material's numbers are moved in all pictures."""
+    material = unknowns.view.material
+    return KNOWN if material is None else View(material=material[0] * problem.view_unit.material, names=unknowns.view.names)
 
 
 def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
@@ -217,7 +224,7 @@ def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) 
         new, old = ((part.lights, part.camera) for part in (_views(unknowns, problem, group), group.scenes))
         change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)
         for n, k in enumerate(group.indices):
-            scene = scenes[k].with_heights(heights)
+            scene = with_material(scenes[k].with_heights(heights), jax.tree.map(np.asarray, _common(unknowns, problem)))
             if factors is not None:
                 scene = with_albedo(scene, factors)
             if jax.tree.leaves(unknowns.view):

@@ -28,6 +28,7 @@ from ...preparation.world import World, make_world
 from ...rendering.samples import PictureSamples
 from ...scene.camera import Camera
 from ...scene.light import Light, Sun
+from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 from ...shade.radiance import direct, has_mirrors
@@ -38,7 +39,7 @@ from ...xla.devices import Spread, map_and_spread, map_over, on_every_device
 from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
 from .pictures import Group, albedo_of
-from .view import KNOWN, View, moved
+from .view import KNOWN, View, moved, with_numbers
 
 # Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
 _POINTS_PER_PIXEL = 4
@@ -166,27 +167,36 @@ def moved_each(scenes: Scene, view: View) -> Scene:
 
 
 class _Seen(NamedTuple):
-    """What a picture shows, under the light and from the camera as they are moved; these as they were given, and by what."""
+    """What a picture shows, under the light, from the camera and of the material as they are moved; these as they were given,
+    and by what."""
 
     world: World
     camera: Camera
-    given: tuple[tuple[Light, ...], Camera]
+    given: tuple[tuple[Light, ...], Camera, Material | Mirror]
     view: View
 
     @classmethod
     def of(cls, scene: Scene, view: View, settings: Settings) -> "_Seen":
         lights, camera = moved(scene.lights, scene.camera, view)
-        world = make_world(scene.with_lights(lights), settings)
-        return cls(world, camera, (scene.lights, scene.camera), view)
+        world, material = make_world(scene.with_lights(lights), settings), scene.objects[scene.first_heightfield].material
+        return cls(_with_material(world, material, view), camera, (scene.lights, scene.camera, material), view)
 
     def moved(self, view: View) -> tuple[World, Camera]:
         """The world and its camera with other such numbers."""
-        lights, camera = moved(*self.given, view)
-        return dataclasses.replace(self.world, lights=lights), camera
+        *seen, material = self.given
+        lights, camera = moved(*seen, view)
+        return _with_material(dataclasses.replace(self.world, lights=lights), material, view), camera
 
     def view_for(self, count: int) -> View:
         """The same numbers for each of so many samples, which come last."""
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*leaf.shape, count)), self.view)
+
+
+def _with_material(world: World, material: Material | Mirror, view: View) -> World:
+    """The world with the first heightfield's material, its numbers moved."""
+    number, *_ = world.grids[0]
+    materials = (with_numbers(material, view) if k == number else other for k, other in enumerate(world.materials))
+    return dataclasses.replace(world, materials=tuple(materials)) if view.names else world
 
 
 def _linearise(seen: _Seen, mesh: Mesh, channels: int, factors: Float[jax.Array, "ty tx k"] | None) -> Linearised:

@@ -20,6 +20,7 @@ from ...preparation.world import resolve_settings
 from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
+from .view import KNOWN, View, with_numbers
 
 
 class Group(eqx.Module):
@@ -46,9 +47,16 @@ class Group(eqx.Module):
         stack = np.stack if isinstance(values, np.ndarray) else jnp.stack
         return stack([values[k] for k in self.indices]).reshape(-1, 1, 1, 1)
 
-    def complete(self, scene: Scene, heights: Float[Array, "ny nx"], factors: Float[Array, "ty tx c"] | None = None) -> Scene:
-        """One picture's leaves of `scenes`, with those that are shared, these heights, and an albedo times these factors."""
-        scene = _with_heights(eqx.combine(scene, self.shared), heights)
+    def complete(
+        self,
+        scene: Scene,
+        heights: Float[Array, "ny nx"],
+        factors: Float[Array, "ty tx c"] | None = None,
+        numbers: View = KNOWN,
+    ) -> Scene:
+        """One picture's leaves of `scenes`, with those that are shared, these heights, an albedo times these factors, and a
+        material whose numbers are moved."""
+        scene = with_material(_with_heights(eqx.combine(scene, self.shared), heights), numbers)
         return scene if factors is None else with_albedo(scene, factors)
 
 
@@ -115,6 +123,15 @@ def make_groups(
 def _with_heights(scene: Scene, heights: Array | None) -> Scene:
     """`scene` over other heights of its first heightfield; None where they are to be filled in later."""
     return eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene, heights, is_leaf=lambda leaf: leaf is None)
+
+
+def with_material(scene: Scene, numbers: View) -> Scene:
+    """The scene with numbers of its first heightfield's material moved."""
+    if not numbers.names:
+        return scene
+    k = scene.first_heightfield
+    material = with_numbers(scene.objects[k].material, numbers)
+    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, material)
 
 
 def with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:

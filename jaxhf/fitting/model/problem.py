@@ -205,7 +205,16 @@ def _view_unit(scenes: Sequence[Scene], unknown: Unknown) -> View:
         for k, scene in enumerate(scenes):
             if not any(isinstance(light, Sky) for light in scene.lights):
                 raise ArgumentError("Unknown", "sky_std", f"must stand with a Sky, scenes[{k}] has none")
-    return View(light, camera, None if unknown.sky_std is None else jnp.ones(1, dtype))
+    sky, names = None if unknown.sky_std is None else jnp.ones(1, dtype), tuple(unknown.material_std or ())
+    material = jnp.asarray([(unknown.material_std or {})[name] for name in names], dtype) if names else None
+    for k, scene in enumerate(scenes):
+        kind = scene.objects[scene.first_heightfield].material
+        for name in names:
+            if np.shape(getattr(kind, name, None)) != () or getattr(kind, name, None) is None:
+                known = [field.name for field in dataclasses.fields(kind) if np.shape(getattr(kind, field.name)) == ()]
+                rule = f"must name numbers of the material of scenes[{k}], {type(kind).__name__}: {known}; it names {name!r}"
+                raise ArgumentError("Unknown", "material_std", rule)
+    return View(light, camera, sky, material, names)
 
 
 def _albedo_field(field: Heightfield, unknowns: Unknowns, unknown: Unknown) -> AlbedoField | None:
@@ -257,6 +266,13 @@ def _brightness(targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
     return np.where(np.asarray(bright) > 0, bright, 1.0)
 
 
+def _at_rest(unit: View, count: int) -> View:
+    """Numbers that are 0: of each picture, and of the material that all of them show."""
+    found = jax.tree.map(lambda unit: jnp.zeros((count, unit.size), unit.dtype), unit)
+    common = None if unit.material is None else jnp.zeros_like(unit.material)[None]
+    return dataclasses.replace(found, material=common)
+
+
 def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknown: Unknown, view_unit: View) -> Unknowns:
     """Those from which a fit starts: coefficients 0, the albedo, lights and cameras of the scenes, exposure 1 and offset 0."""
     scene, count = scenes[0], len(scenes)
@@ -275,5 +291,5 @@ def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknow
         albedo,
         jnp.ones(count, dtype) if unknown.exposures else None,
         jnp.zeros(count, dtype) if unknown.offsets else None,
-        jax.tree.map(lambda unit: jnp.zeros((count, unit.size), dtype), view_unit),
+        _at_rest(view_unit, count),
     )

@@ -92,6 +92,8 @@ def make_terms(
         others.append(term(none, (view_unit.camera / deviations)[None]))
     if view_unit.sky is not None and unknown.sky_std is not None:
         others.append(term(none, view_unit.sky / unknown.sky_std))
+    if view_unit.material is not None:  # whose unit is its deviation
+        others.append(term(none, one))
     return Terms(surface, tuple(others))
 
 

@@ -19,17 +19,21 @@ from ...scene.scene import Scene
 
 
 class View(eqx.Module):
-    """What stands for each number of a light's direction and of a camera's pose; None for what is known.
+    """What stands for each number of a light's direction and of a camera's pose, and for what all pictures see alike; None for
+    what is known.
 
     Attributes:
       light: two angles by which the first directional light is turned, about axes across it, radians (their tangents).
       camera: by how much the eye is moved, world units, and a rotation vector about it, radians, both along the world's axes.
       sky: by how much the logarithm of the sky's radiance grows.
+      material: by how much numbers of the first heightfield's material grow, and their names.
     """
 
     light: Float[jax.Array, "..."] | None = None
     camera: Float[jax.Array, "..."] | None = None
     sky: Float[jax.Array, "..."] | None = None
+    material: Float[jax.Array, "..."] | None = None
+    names: tuple[str, ...] = eqx.field(static=True, default=())
 
 
 KNOWN = View()
@@ -52,7 +56,8 @@ def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[
     if view.sky is not None:
         brighter = jnp.exp(view.sky[0])
         lights = tuple(
-            dataclasses.replace(light, radiance=brighter * light.radiance) if isinstance(light, Sky) else light for light in lights
+            dataclasses.replace(light, radiance=brighter * light.radiance) if isinstance(light, Sky) else light
+            for light in lights
         )
     if view.camera is not None:
         world = affine(jnp.asarray(camera.world_from_camera))
@@ -71,6 +76,15 @@ def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[
         matrix = jnp.asarray(camera.world_from_camera).at[:3].set(jnp.stack(columns, axis=1))
         camera = eqx.tree_at(lambda camera: camera.world_from_camera, camera, matrix)
     return lights, camera
+
+
+def with_numbers(material: Any, view: View) -> Any:
+    """A material with the numbers that `view` seeks moved by it."""
+    changes = () if view.material is None else view.material
+    for name, change in zip(view.names, changes, strict=True):
+        moved_number = jnp.asarray(getattr(material, name)) + change
+        material = eqx.tree_at(lambda material, name=name: getattr(material, name), material, moved_number)
+    return material
 
 
 def differences(scene: Scene, other: Scene) -> tuple[float, float, float]:

@@ -56,6 +56,7 @@ _UNKNOWN: Keys = {
     **optional("albedo_std", "albedo_length", "sky_std", "light_std", kind=number),
     **optional("exposures", "offsets", kind=flag),
     **optional("camera_std", kind=numbers(2)),
+    **optional("material_std", kind=table),
 }
 _SETTINGS: Keys = {
     knob.name: Key({OneOf: word, Whole: whole}.get(type(knob.metadata["rule"]), flag)) for knob in dataclasses.fields(Settings)

@@ -71,7 +71,7 @@ _KINDS: Mapping[str, kinds.Kind] = {
 def _keys(function: Callable[..., Any], *needed: str) -> Keys:
     """The parameters of a function; those without a default are needed, too."""
     given = inspect.signature(function).parameters.values()
-    kinds_of = _KINDS | ({"width": kinds.number} if function is Hapke else {})
+    kinds_of = {**_KINDS, "width": kinds.number} if function is Hapke else _KINDS  # of pictures a whole number
     return {p.name: Key(kinds_of[p.name], p.name in needed or p.default is p.empty) for p in given}
 
 
