@@ -84,6 +84,9 @@ class Definition(NamedTuple):
 
 
 WARNINGS = {  # a name for each sentence of `Fit.warnings`, by words of it
+    "do not use": "do not use these heights",
+    "no noise": "is no noise",
+    "strayed": "heights differ from the prior",
     "chi2": "chi2 is",
     "no nearer": "it came no nearer",
     "stalled": "it stalled",

@@ -266,6 +266,8 @@ GOOD = Findings(
         ({"chi2": 0.25}, "the noise that was given is 2 times what is left"),
         ({"result": jaxhf.Stop.MAX_STEPS}, "stopped by max_steps"),
         ({"strayed": 2.5}, "2.5 times its std"),
+        ({"strayed": 2.5}, "do not use these heights before the cause is found: the scene does not explain the pictures, and"),
+        ({"unlike_noise": "what is left is no noise", "strayed": None}, "may be further off than what they began from"),
         ({"seen": np.arange(20).reshape(4, 5) > 4}, "no picture shows 5 of 20 heights (25%): they are what the prior makes"),
         ({"seen": np.arange(20).reshape(4, 5) > 4, "strayed": None}, "they are a smooth continuation of their neighbours"),
         ({"seen": np.zeros((4, 5), bool), "strayed": None}, "they are the start"),

@@ -256,6 +256,10 @@ REFUSED: dict[str, list[dict[str, Any]]] = {  # the argument that is to be named
     "albedo": [unknown(albedo="known")],
     "albedo_std": [unknown(albedo_std=2), unknown(albedo="map", albedo_std=0)],
     "light_std": [unknown(light_std=0), unknown(light_std=60), {"scenes": lambda: lamps(), **unknown(light_std=1)}],
+    "material_std": [
+        *(unknown(material_std=std) for std in ({}, "limb", {"limb": 0})),
+        *(unknown(material_std={name: 0.1}) for name in ("limb", "albedo")),  # of Matte
+    ],
     "camera_std": [unknown(camera_std=std) for std in (3, (1, 0), (3, 1), (0.1, 60))],
     "exposures": [unknown(exposures="yes")],
     "scenes": [{"scenes": list}],

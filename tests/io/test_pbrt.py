@@ -58,13 +58,13 @@ def test_a_whole_scene(tmp_path):
         LightSource "point" "color I" [1 2 3] "color scale" [2 2 .5]
         Material "mirror"
         Shape "cylinder" "float radius" 2 "float zmin" [-3] "float zmax" [4.] "float phimax" [360]
-        Material "matte" "color Kd" [.4 .2 .1]
+        Material "matte" "color Kd" [.4 .2 .1] "float sigma" 15
         Shape "heightfield" "integer nu" [3] "integer nv" [2] "float Pz" [0 1 2  3 4 5]
         WorldEnd""",
     )
     field = jaxhf.Heightfield(np.array([[0, 1, 2], [3, 4, 5]], np.float32), dx=0.5, dy=1.0)
     expected = jaxhf.Scene(
-        [Object(Cylinder(2, -3, 4), Mirror(0.9)), Object(field, Matte((0.4, 0.2, 0.1)))],
+        [Object(Cylinder(2, -3, 4), Mirror(0.9)), Object(field, jaxhf.OrenNayar((0.4, 0.2, 0.1), 15))],
         jaxhf.Perspective(np.eye(4), 30, width=320, height=200),
         [Point((0, 0, 0), (2, 4, 1.5))],
         samples=5,
@@ -266,7 +266,7 @@ WORLD_ERRORS = [
     ("\n" + CAMERA, 3, "Camera must not follow WorldBegin"),
     (f"{FIELD} WorldEnd\n\nIdentity", 4, "Identity must not follow WorldEnd"),
     ('\nShape "sphere"', 3, 'unknown Shape "sphere"; known: cylinder, heightfield'),
-    (f'{MATTE}\n"float sigma"\n10', 4, "sigma must be 0 (rough surfaces are not supported), it is 10.0"),
+    (f'{MATTE}\n"float sigma"\n-10', 4, "sigma must be 0 to 90 degrees, it is -10.0"),
     (f'{MATTE}\n"color Kd" [.5]', 3, "'color Kd' takes 3 numbers, found 1 number"),
     (f'{MATTE}\n"float Kd" .5', 3, "Material \"matte\" takes 'color Kd' or 'texture Kd', not 'float Kd'"),
     (f'{MATTE}\n"color Kd" [1 -1 1]', 3, "Kd must be 0 or more, it is [ 1. -1.  1.]"),

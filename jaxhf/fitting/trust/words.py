@@ -138,6 +138,11 @@ def warnings(found: Findings) -> tuple[str, ...]:
     said = []
     unexplained = found.chi2 > FAR_FROM_ONE
     strays = found.strayed is not None and found.strayed > _STRAYED
+    if strays or found.unlike_noise is not None:
+        said.append(
+            "do not use these heights before the cause is found: the scene does not explain the pictures, and the heights may "
+            f"be further off than {'what they began from' if found.strayed is None else 'the prior'}, whatever their deviations"
+        )
     if unexplained:
         worst = "; ".join(map(str, found.regions))
         said.append(

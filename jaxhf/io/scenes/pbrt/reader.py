@@ -5,6 +5,7 @@ that is not there. What is read means what pbrt-v2 makes of it, but for the name
 which they stand, not to the first one.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +23,7 @@ from ....scene.camera import Perspective
 from ....scene.cylinder import Cylinder
 from ....scene.heightfield import Heightfield
 from ....scene.light import Directional, Light, Point
-from ....scene.material import Material, Matte, Mirror
+from ....scene.material import Material, Matte, Mirror, OrenNayar
 from ....scene.scene import Object, Scene
 from ....scene.texture import ImageTexture
 from ...errors import SceneError, nearest, resolve_inside
@@ -236,8 +237,9 @@ class _Reader:
             if args.kind == "mirror":
                 return Mirror(args["color Kr"])
             name, known = args["texture Kd"], self.textures
+            matte = functools.partial(OrenNayar, roughness=args["float sigma"]) if args["float sigma"] else Matte
             if name is None:
-                return Matte(args["color Kd"])
+                return matte(args["color Kd"])
             if name not in known:
                 hint = nearest(name[:60], known) if known else "there is none"
                 raise args.error("texture Kd", f"unknown texture {name!r}; {hint}")
@@ -245,7 +247,7 @@ class _Reader:
             if path not in self.images:
                 with located(place):
                     self.images[path] = ImageTexture(load_image(path, transfer="srgb"))
-            return Matte(self.images[path])
+            return matte(self.images[path])
 
 
 def _heightfield(args: Arguments, dtype: np.dtype) -> Heightfield:

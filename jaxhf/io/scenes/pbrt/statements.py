@@ -50,7 +50,7 @@ _RULES: Mapping[str, Rule] = {
     **dict.fromkeys(("color I", "color L", "color scale", "color Kd", "color Kr"), (lambda c: min(c) >= 0, "be 0 or more")),
     "integer maxdepth": (lambda depth: depth == 5, "be 5"),
     "float fov": (lambda fov: 0 < fov < 180, "lie between 0 and 180 degrees"),
-    "float sigma": (lambda sigma: sigma == 0, "be 0 (rough surfaces are not supported)"),
+    "float sigma": (lambda sigma: 0 <= sigma <= 90, "be 0 to 90 degrees"),
     "float phimax": (lambda phi: phi == 360, "be 360 (parts of a circle are not supported)"),
 }
 _COUNTS = {"color": 3, "point": 3, "float Pz": None}  # of values, by type or declaration: else one; None: any number
