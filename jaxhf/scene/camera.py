@@ -7,44 +7,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from ..core.affine import Affine, affine, invertible
-from ..core.errors import ArgumentError, whole_number
+from ..core.affine import affine, invertible
+from ..core.errors import whole_number
 from ..core.ray import Ray
 from ..core.rules import OneOf, Whole, require
-from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, VECTOR, MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf
+from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf
 from ..core.vector import dot, unit
 from .framing import framing_pose
 from .heightfield import Heightfield
+from .pose import look_at_pose, require_pose
+from .projection import Projection, camera_from_world, film, screen
 from .record import Record, known, numbers
 
 Convention = Literal["opencv", "opengl"]
 _PIXELS = Whole(1, unit="pixels")  # along a side of a picture
-
-
-class Projection(eqx.Module):
-    """p -> linear @ p + offset, four numbers (X, Y, W, depth): the point is seen at (X / W, Y / W), if its depth is positive.
-
-    Homogeneous coordinates (Riesenfeld, IEEE CG&A 1981): what is linear in p can be cut at the picture's border before
-    the division.
-    """
-
-    linear: Float[jax.Array, "4 3"]
-    offset: Float[jax.Array, "4"]
-
-    def __call__(self, p: Vector) -> Float[jax.Array, "4"]:
-        return self.linear[:, 0] * p[0] + self.linear[:, 1] * p[1] + self.linear[:, 2] * p[2] + self.offset
-
-    def of(self, world: Affine) -> "Projection":
-        """The same projection for points in another frame; `world` maps that frame to the world's."""
-        columns = [
-            self.linear[:, 0] * world.linear[0, k]
-            + self.linear[:, 1] * world.linear[1, k]
-            + self.linear[:, 2] * world.linear[2, k]
-            for k in range(3)
-        ]
-        return Projection(jnp.stack(columns, axis=1), self(world.offset))
 
 
 class Perspective(Record):
@@ -68,7 +45,7 @@ class Perspective(Record):
         cls, eye: Any, target: Any, up: Any = (0, 0, 1), fov: Any = 45.0, *, width: int = 512, height: int = 512
     ) -> "Perspective":
         """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
-        return cls(_look_at(eye, target, up), fov, width=width, height=height)
+        return cls(look_at_pose(eye, target, up), fov, width=width, height=height)
 
     @classmethod
     def from_intrinsics(
@@ -105,14 +82,14 @@ class Perspective(Record):
         for name, leaf in lens.items():
             require("from_intrinsics", name, leaf, POSITIVE if name in ("fx", "fy") else FINITE)
         pose = float_leaf(world_from_camera)
-        _require_pose(pose)
+        require_pose(pose)
         leaves, xp = [pose, *lens.values()], np
         if traced := [leaf.dtype for leaf in leaves if isinstance(leaf, jax.Array)]:
             leaves, xp = [jnp.asarray(leaf, jnp.result_type(*traced)) for leaf in leaves], jnp
         pose, fx, fy, cx, cy = leaves
         side = 1 if convention == "opengl" else -1
         right, up, backward = pose[:3, 0], side * pose[:3, 1], side * pose[:3, 2]
-        # Rays go along column 2 + sx tan(fov / 2) column 0 + sy tan(fov / 2) column 1, see `_screen`.
+        # Rays go along column 2 + sx tan(fov / 2) column 0 + sy tan(fov / 2) column 1, see `screen`.
         f = fx if width <= height else fy
         middle = right * ((width / 2 - cx) / fx) + up * ((cy - height / 2) / fy) - backward
         columns = xp.stack([right * (f / fx), up * (f / fy), middle, pose[:3, 3]], axis=1)
@@ -155,7 +132,7 @@ class Perspective(Record):
     def ray(self, x: Scalar, y: Scalar) -> Ray:
         """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""
         world = affine(jnp.asarray(self.world_from_camera))
-        sx, sy = _screen(self, x, y)
+        sx, sy = screen(self, x, y)
         half = jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2)
         along = world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))
         if self._ahead is None:
@@ -166,8 +143,8 @@ class Perspective(Record):
 
     def film_from_world(self) -> Projection:
         """The projection of points in the world to pixels, the inverse of `ray`."""
-        camera = _camera_from_world(self)
-        return _film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
+        camera = camera_from_world(self)
+        return film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
 
     def viewpoint(self) -> tuple[Vector, bool]:
         """The position of the eye, and True: it is a point."""
@@ -198,21 +175,21 @@ class Orthographic(Record):
         cls, eye: Any, target: Any, up: Any = (0, 0, 1), extent: Any = 1.0, *, width: int = 512, height: int = 512
     ) -> "Orthographic":
         """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
-        return cls(_look_at(eye, target, up), extent, width=width, height=height)
+        return cls(look_at_pose(eye, target, up), extent, width=width, height=height)
 
     def ray(self, x: Scalar, y: Scalar) -> Ray:
         """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""
         world = affine(jnp.asarray(self.world_from_camera))
-        sx, sy = _screen(self, x, y)
+        sx, sy = screen(self, x, y)
         half = jnp.asarray(self.extent) / 2
         origin, d = world.point(jnp.stack([sx * half, sy * half, jnp.zeros_like(half)])), unit(world.linear[:, 2])
         return Ray(origin, d, None if self._ahead is None else self._ahead * dot(world.linear[:, 2], d))
 
     def film_from_world(self) -> Projection:
         """The projection of points in the world to pixels, the inverse of `ray`."""
-        camera = _camera_from_world(self)
+        camera = camera_from_world(self)
         half = jnp.asarray(self.extent) / 2
-        return _film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
+        return film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
 
     def viewpoint(self) -> tuple[Vector, bool]:
         """The direction towards the eye, and False: it is infinitely far away."""
@@ -231,7 +208,7 @@ def cropped(camera: Camera, x: float | int, y: float | int, width: int, height: 
     Its matrix may be no rotation any more, see `Perspective`.
     """
     matrix = np.array(camera.world_from_camera, np.float64)
-    sx, sy = _screen(camera, x + width / 2, y + height / 2)
+    sx, sy = screen(camera, x + width / 2, y + height / 2)
     times = min(width, height) / min(camera.width, camera.height)
     if isinstance(camera, Perspective):
         half, moved = np.tan(np.radians(np.asarray(camera.fov, np.float64)) / 2), 2
@@ -250,61 +227,6 @@ def _shown(camera: Camera, lens: str) -> str:
     else:
         pose = f"eye={numbers(matrix[:3, 3])}, looking={numbers(matrix[:3, 2])}"
     return f"{type(camera).__name__}({pose}, {lens}, {camera.width} x {camera.height})"
-
-
-def _screen(camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:
-    """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
-    short = min(camera.width, camera.height)
-    return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
-
-
-def _camera_from_world(camera: Camera) -> Affine:
-    inverse = affine(jnp.asarray(camera.world_from_camera)).inverse()
-    return inverse if camera._ahead is None else Affine(inverse.linear, inverse.offset.at[2].add(camera._ahead))
-
-
-def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
-    """The inverse of `_screen`: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
-    scale = min(camera.width, camera.height) / (2 * half)
-
-    def rows(p: Any, w: Any) -> jax.Array:
-        return jnp.stack([p[0] * scale + w * (camera.width / 2), -p[1] * scale + w * (camera.height / 2), w, p[2]])
-
-    return Projection(rows(camera_from_world.linear, w), rows(camera_from_world.offset, w_offset))
-
-
-def _look_at(eye: Any, target: Any, up: Any) -> Any:
-    eye, target, up = leaves = float_leaf(eye), float_leaf(target), float_leaf(up)
-    for name, leaf in zip(("eye", "target", "up"), leaves, strict=True):
-        require("look_at", name, leaf, VECTOR)
-    host = all(isinstance(leaf, np.ndarray) for leaf in leaves)
-    xp = np if host else jnp
-
-    def direction(v):
-        return v / np.sqrt((v * v).sum()) if host else unit(jnp.asarray(v))
-
-    if host and not (target - eye).any():
-        raise ArgumentError("look_at", "target", f"must differ from eye, both are {eye.tolist()}")
-    forward = direction(target - eye)
-    right = xp.cross(forward, up)
-    if host and not np.linalg.norm(right) > 1e-9 * np.linalg.norm(up):
-        raise ArgumentError(
-            "look_at", "up", f"must not point along the view, it is {up.tolist()} for the view {forward.tolist()}"
-        )
-    right = direction(right)
-    columns = xp.stack([right, xp.cross(right, forward), forward, eye], axis=1)
-    return xp.concatenate([columns, xp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=columns.dtype)])
-
-
-def _require_pose(matrix: Any) -> None:
-    """Raises ArgumentError on a matrix that does more than rotate and translate, as the wrong one of two would."""
-    require("from_intrinsics", "world_from_camera", matrix, invertible)
-    if isinstance(matrix, np.ndarray):
-        turn = matrix[:3, :3]
-        if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
-            raise ArgumentError(
-                "from_intrinsics", "world_from_camera", f"must rotate without scaling or mirroring, it is {turn.tolist()}"
-            )
 
 
 def require_size(owner: str, width: Any, height: Any) -> None:
