@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ..core.affine import affine, invertible
 from ..core.errors import whole_number
@@ -16,9 +17,11 @@ from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, MatrixLeaf, Scalar, Sc
 from ..core.vector import dot, unit
 from .framing import framing_pose
 from .heightfield import Heightfield
+from .mapped import geotransformed, resected_rpc
 from .pose import look_at_pose, require_pose
-from .projection import Projection, camera_from_world, film, screen
+from .projection import Projection, camera_from_world, film, projected, screen
 from .record import Record, known, numbers
+from .resection import resected, resected_in_parallel
 
 Convention = Literal["opencv", "opengl"]
 _PIXELS = Whole(1, unit="pixels")  # along a side of a picture
@@ -97,6 +100,53 @@ class Perspective(Record):
         return cls(xp.concatenate([columns, pose[3:]]), fov, width=width, height=height)
 
     @classmethod
+    def from_points(cls, points: Any, pixels: Any, *, width: int, height: int, max_error: float = 1.0) -> "Perspective":
+        """The camera that sees known points at known pixels: a pinhole's resection, by least squares in double precision.
+
+        It takes all that a pinhole may be, in 11 numbers: place, direction, focal length, principal point, pixels that are not
+        square or skew. So `world_from_camera` may be no rotation.
+
+        Args:
+          points: (n, 3), at least 6 and better 20, world units, not all in one plane: as high and as low as what is to be seen.
+          pixels: (n, 2), where each is seen: right and down from the picture's top left corner. The centre of the top left
+            pixel is (0.5, 0.5) here, which OpenCV calls (0, 0): add 0.5 to its numbers. Without distortion.
+          width, height: of the picture, pixels.
+          max_error: how far a pixel may be from where the camera sees its point; it tells pixels that are another point's.
+            The distances are those of `camera.project(points)` from `pixels`.
+
+        Raises:
+          ValueError: a pixel is farther off; points are too few, in a plane, behind the camera or so far away that rays are
+            parallel; pixels are on a line or mirrored; a number is not finite or is traced.
+        """
+        require_size("from_points", width, height)
+        return cls(*resected(points, pixels, width, height, max_error), width=width, height=height)
+
+    @classmethod
+    def from_rpc(
+        cls, rpcs: Any, terrain: Any, *, width: int, height: int, geoid: float = 0.0, max_error: float = 0.05
+    ) -> "Perspective":
+        """The pinhole that sees a terrain where the RPC model of a satellite's picture does (NIMA, STDI-0002, 2000, RPC00B).
+
+        It is fitted to GDAL's transformer in a box around that part of the terrain which is in the picture. A scanner that
+        builds its picture line by line is no pinhole: the error grows as the part's width in pixels times its relief.
+
+        Args:
+          rpcs: rasterio's `dataset.rpcs`. For a window of the picture, subtract its first column from `samp_off` and its first
+            row from `line_off`; gdal_translate does so.
+          terrain: a `Terrain` with a reference system, as `load_heights` gives it. Needs rasterio.
+          width, height: of the picture, pixels.
+          geoid: what is added to the terrain's heights, metres. The model's heights count from the ellipsoid; most elevation
+            models' from the geoid, whose height above the ellipsoid this is then, -106 to 85 on the Earth.
+          max_error: how far the camera may be off in the box, pixels.
+
+        Raises:
+          ValueError: one camera is farther off, the terrain is not in the picture or has no place on a globe, or `rpcs` are
+            none of rasterio's.
+        """
+        require_size("from_rpc", width, height)
+        return cls(*resected_rpc(rpcs, terrain, width, height, geoid, max_error), width=width, height=height)
+
+    @classmethod
     def framing(
         cls,
         field: Heightfield,
@@ -146,6 +196,13 @@ class Perspective(Record):
         camera = camera_from_world(self)
         return film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
 
+    def project(self, points: Any) -> Float[np.ndarray, "*n 2"]:
+        """Where points (..., 3) of the world are seen: (..., 2), pixels right and down from the top left corner.
+
+        In double precision, of numbers that are not traced; nan where a point is not in front of the camera.
+        """
+        return projected(self, points, lambda depth: depth * np.tan(np.radians(np.asarray(self.fov, np.float64)) / 2))
+
     def viewpoint(self) -> tuple[Vector, bool]:
         """The position of the eye, and True: it is a point."""
         world = affine(jnp.asarray(self.world_from_camera))
@@ -177,6 +234,32 @@ class Orthographic(Record):
         """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
         return cls(look_at_pose(eye, target, up), extent, width=width, height=height)
 
+    @classmethod
+    def from_points(cls, points: Any, pixels: Any, *, width: int, height: int, max_error: float = 1.0) -> "Orthographic":
+        """The camera that sees at least four known points at known pixels by parallel rays, which may be oblique.
+
+        Arguments and errors are those of `Perspective.from_points`. For pictures from so far away that errors of pixels hide
+        the perspective.
+        """
+        require_size("from_points", width, height)
+        return cls(*resected_in_parallel(points, pixels, width, height, max_error), width=width, height=height)
+
+    @classmethod
+    def from_geotransform(cls, transform: Any, terrain: Any, *, width: int, height: int) -> "Orthographic":
+        """The camera of an orthophoto: it looks straight down on a terrain, from above its highest point.
+
+        Args:
+          transform: rasterio's `dataset.transform`, from the picture's columns and rows to coordinates in the terrain's
+            reference system; it may rotate, and pixels need not be square. GDAL's six numbers: `Affine.from_gdal(*numbers)`.
+          terrain: a `Terrain`, as `load_heights` gives it, also one in degrees.
+          width, height: of the picture, pixels.
+
+        Raises:
+          ValueError: `transform` is no Affine or flattens the picture, or the terrain has no heights.
+        """
+        require_size("from_geotransform", width, height)
+        return cls(*geotransformed(transform, terrain, width, height), width=width, height=height)
+
     def ray(self, x: Scalar, y: Scalar) -> Ray:
         """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""
         world = affine(jnp.asarray(self.world_from_camera))
@@ -190,6 +273,10 @@ class Orthographic(Record):
         camera = camera_from_world(self)
         half = jnp.asarray(self.extent) / 2
         return film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
+
+    def project(self, points: Any) -> Float[np.ndarray, "*n 2"]:
+        """Where points of the world are seen, as `Perspective.project`."""
+        return projected(self, points, lambda depth: np.asarray(self.extent, np.float64) / 2)
 
     def viewpoint(self) -> tuple[Vector, bool]:
         """The direction towards the eye, and False: it is infinitely far away."""

@@ -1,14 +1,17 @@
 """Where the points of a picture lie in a camera's frame, and where points of the world lie in the picture."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from ..core.affine import Affine, affine
-from ..core.types import Scalar, Vector
+from ..core.errors import ArgumentError
+from ..core.types import Scalar, Vector, float_leaf
 
 
 class Projection(eqx.Module):
@@ -54,3 +57,13 @@ def film(camera: Any, camera_from_world: Affine, half: Scalar, w: Vector, w_offs
         return jnp.stack([p[0] * scale + w * (camera.width / 2), -p[1] * scale + w * (camera.height / 2), w, p[2]])
 
     return Projection(rows(camera_from_world.linear, w), rows(camera_from_world.offset, w_offset))
+
+
+def projected(camera: Any, points: Any, half: Callable[[Any], Any]) -> Float[np.ndarray, "*n 2"]:
+    """The same by `half` of what the shorter side spans at a depth, on the host: see `Perspective.project`."""
+    matrix, given = np.asarray(camera.world_from_camera, np.float64), np.asarray(float_leaf(points), np.float64)
+    if given.shape[-1:] != (3,):
+        raise ArgumentError("project", "points", f"must have shape (..., 3), theirs is {given.shape}")
+    x, y, depth = np.moveaxis((given - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T, -1, 0)
+    scale = min(camera.width, camera.height) / 2 / np.where(depth > 0, half(depth), np.nan)
+    return np.stack([camera.width / 2 + scale * x, camera.height / 2 - scale * y], axis=-1)
