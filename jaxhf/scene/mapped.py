@@ -67,8 +67,10 @@ def geotransformed(transform: Any, terrain: Any, width: int, height: int) -> tup
     if not all(hasattr(transform, name) for name in "abcdef"):
         rule = "must be an Affine, as rasterio's dataset.transform or Affine.from_gdal(*numbers)"
         raise ArgumentError(owner, "transform", f"{rule}, it is {transform!r}")
-    low, high = _levels(owner, terrain)
     to_file = np.array([[transform.a, transform.b, transform.c], [transform.d, transform.e, transform.f]], np.float64)
+    if not (np.isfinite(to_file).all() and np.linalg.det(to_file[:, :2])):
+        raise ArgumentError(owner, "transform", f"must be finite and invertible, it is {to_file.tolist()}")
+    low, high = _levels(owner, terrain)
     # What the terrain's own x and y are in its file: offset + scale * x
     grid = np.array(terrain.in_file)
     scale = grid[:2] / [terrain.dx, terrain.dy]
