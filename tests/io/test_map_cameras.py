@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxhf
+from jaxhf.io.terrain.georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference
 from jaxhf.scene.procedural import fractal
 
 rasterio = pytest.importorskip("rasterio")
@@ -120,6 +121,24 @@ def test_a_terrain_is_seen_where_gdal_has_it(tmp_path, rpcs, side, relief, crs):
     assert off.max() < 0.05
 
 
+@pytest.mark.deep  # of the figures in docs/guides/cameras.md
+@pytest.mark.parametrize(
+    ("rpcs", "crs", "alone", "left"), [(COAST, "EPSG:32610", 0.35, 0.007), (SHARP, "EPSG:32652", 3.9, 0.04)]
+)
+def test_how_far_a_scanner_is_from_a_pinhole(tmp_path, rpcs, crs, alone, left):
+    """Over 5 km; and how much of that two heights 10 m apart differ in, which are seen at the same pixel."""
+    terrain = jaxhf.load_heights(path := file_of(tmp_path / "a.tif", rpcs, 5e3, 500, crs))
+    camera = jaxhf.Perspective.from_rpc(rpcs, terrain, width=40000, height=40000, max_error=9.0)
+    world, place = on_surface(path, terrain)
+    off = camera.project(world) - by_gdal(rpcs, place)
+    assert alone * 0.8 < np.linalg.norm(off, axis=1).max() < alone * 1.2
+    ray = world - np.asarray(camera.world_from_camera)[:3, 3]
+    higher = world + ray * (10 / ray[:, 2:])
+    latitude, longitude, z = terrain.geodetic(*higher.T)
+    change = camera.project(higher) - by_gdal(rpcs, np.stack([longitude, latitude, z], axis=1)) - off
+    assert left * 0.8 < np.linalg.norm(change, axis=1).max() < left * 1.2
+
+
 @pytest.mark.deep  # test_resection.py has a picture from 700 km
 def test_a_picture_shows_what_the_model_sees(tmp_path):
     """A window of it, in single precision; what each pixel shows is where GDAL has the pixel's middle."""
@@ -176,6 +195,21 @@ def test_the_moon_has_its_own_longitudes(tmp_path):
     latitude, longitude, _ = jaxhf.load_heights(path).geodetic([3e5, 4e5], 2e5, 0)
     np.testing.assert_allclose(longitude, np.degrees(np.array([3e5, 4e5]) / 1737400), rtol=1e-9)
     np.testing.assert_allclose(latitude, np.degrees(2e5 / 1737400), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("crs", "x", "y"), [("EPSG:32632", 7.2e5, 5.2e6), ("EPSG:32632", 3e5, 5.2e6), ("EPSG:32732", 7.2e5, 5e6)]
+)
+def test_a_maps_north_is_told_from_the_true_one(tmp_path, crs, x, y):
+    """By tan(convergence) = tan(longitude from the zone's middle) sin(latitude), which on the ellipsoid is off by less than 0.1 %."""
+    terrain = jaxhf.load_heights(geotiffs.write(tmp_path / "a.tif", np.zeros((9, 9), np.float32), (30, 0, x, 0, -30, y), crs))
+    latitude, longitude = np.radians(terrain.place)
+    expected = np.degrees(np.arctan(np.tan(longitude - np.radians(9)) * np.sin(latitude)))
+    np.testing.assert_allclose(terrain.convergence, expected, rtol=1e-3)
+    assert abs(expected) > 1.5
+    degrees = jaxhf.Terrain(np.zeros((3, 3)), 1e-3, 1e-3, 8, 46, CoordinateSystem(True, WGS84), Georeference(WGS84_DEGREES))
+    assert abs(degrees.in_metres().convergence) < 1e-9
+    assert np.isnan(jaxhf.Terrain(np.zeros((3, 3))).convergence)
 
 
 def test_what_no_perspective_sees_is_refused(tmp_path):

@@ -133,6 +133,20 @@ class Terrain:
             raise ArgumentError("Terrain", "place", f"must be given as latitude and longitude, {found}")
         return latitude, longitude
 
+    @property
+    def convergence(self) -> float:
+        """By how much its y axis points clockwise of true north at its middle, degrees; needs rasterio.
+
+        An azimuth from true north, as of `sun` and of pictures' metadata, minus this counts from the y axis. nan where its
+        georeference does not say.
+        """
+        (ny, nx), step = self.heights.shape, 1e-3 * (len(self.heights) - 1) * self.dy
+        y = self.y0 + (ny - 1) / 2 * self.dy + step * np.array([-1, 1])
+        latitude, longitude, _ = self.geodetic(self.x0 + (nx - 1) / 2 * self.dx, y, 0)
+        east = (longitude[1] - longitude[0] + 180) % 360 - 180
+        per_east, per_north = metres_per_degree(float(latitude.mean()))
+        return math.degrees(math.atan2(east * per_east, (latitude[1] - latitude[0]) * per_north))
+
     def geodetic(self, x: Any, y: Any, z: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Latitudes and longitudes of points in its x and y, degrees, and z in metres; needs rasterio.
 
