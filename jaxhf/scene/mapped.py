@@ -3,7 +3,7 @@
 A terrain here is whatever has the attributes of `jaxhf.Terrain`, which stands behind this package in the flow.
 """
 
-import importlib
+import math
 from typing import Any
 
 import numpy as np
@@ -24,8 +24,8 @@ def resected_rpc(
 ) -> tuple[Float[np.ndarray, "4 4"], float]:
     """The matrix and the angle of view of the pinhole nearest to an RPC model, see `Perspective.from_rpc`."""
     owner = "from_rpc"
-    import_extra("rasterio", "an RPC model needs", "geo")
-    if not isinstance(rpcs, importlib.import_module("rasterio.rpc").RPC):
+    rasterio = import_extra("rasterio", "an RPC model needs", "geo")
+    if not isinstance(rpcs, rasterio.rpc.RPC):
         raise ArgumentError(owner, "rpcs", f"must be an RPC of rasterio's, as dataset.rpcs, it is {rpcs!r}")
     low, high = _levels(owner, terrain)
     require(owner, "geoid", geoid, FINITE)
@@ -41,7 +41,7 @@ def resected_rpc(
         latitude, longitude, above = (values.ravel() for values in terrain.geodetic(x, y, z))
         if not np.isfinite(latitude + longitude).all():
             raise ArgumentError(owner, "terrain", "must have a place on a globe, its georeference does not say it")
-        with importlib.import_module("rasterio.transform").RPCTransformer(rpcs) as model:
+        with rasterio.transform.RPCTransformer(rpcs) as model:
             rows, columns = model.rowcol(longitude, latitude, above + geoid, op=np.positive)
         shown = (columns >= 0) & (columns <= width) & (rows >= 0) & (rows <= height)
         if not shown.any():
@@ -88,7 +88,7 @@ def _levels(owner: str, terrain: Any) -> tuple[float, float]:
     """The lowest and the highest of a terrain's heights."""
     if not hasattr(terrain, "in_file"):
         raise ArgumentError(owner, "terrain", f"must be a Terrain, as load_heights gives it, it is a {type(terrain).__name__}")
-    known = terrain.heights[np.isfinite(terrain.heights)]
-    if not known.size:
-        raise ArgumentError(owner, "terrain", "must have heights, it has none")
-    return float(known.min()), float(known.max())
+    low, high = (float(of.reduce(terrain.heights, axis=None)) for of in (np.fmin, np.fmax))
+    if not math.isfinite(high - low):
+        raise ArgumentError(owner, "terrain", f"must have heights, nan being none; they go from {low} to {high}")
+    return low, high

@@ -31,7 +31,6 @@ def resected(points: Any, pixels: Any, width: int, height: int, max_error: float
     to_pixels = np.array([[size, 0, centre[0]], [0, size, centre[1]], [0, 0, 1]])
     seen = p @ (to_pixels @ projection).T
     _require_close(seen[:, :2] / seen[:, 2:], pixels, max_error)
-    _require_in_front(seen[:, 2])
     if np.linalg.norm(projection[2, :3]) < _PARALLEL or np.linalg.det(projection[:, :3]) < 0:
         rule = "must be seen in perspective; these are seen by parallel rays (Orthographic.from_points)"
         raise ArgumentError(_OWNER, "points", f"{rule}, or mirrored (pixels count right and down)")
@@ -127,14 +126,11 @@ def _linear(p: Float[np.ndarray, "n 4"], uv: Float[np.ndarray, "n 2"]) -> Float[
         raise ArgumentError(_OWNER, "points", "must tell cameras apart, several see them so: most lie in one plane")
     projection = directions[-1].reshape(3, 4)
     depths = p @ projection[2]
-    _require_in_front(depths * np.sign(np.median(depths)))
-    return projection / projection[2, 3]
-
-
-def _require_in_front(depths: Float[np.ndarray, "n"]) -> None:
-    if not (depths > 0).all():
+    ahead = depths * np.sign(np.median(depths))
+    if not (ahead > 0).all():
         rule = "must lie in front of the camera that sees most of them; it lies behind, or its pixel is another's"
-        raise ArgumentError(_OWNER, f"points[{int(depths.argmin())}]", rule)
+        raise ArgumentError(_OWNER, f"points[{int(ahead.argmin())}]", rule)
+    return projection / projection[2, 3]
 
 
 def _least_squares(p: np.ndarray, uv: np.ndarray, start: Float[np.ndarray, "3 4"]) -> Float[np.ndarray, "3 4"]:

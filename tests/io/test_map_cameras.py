@@ -76,7 +76,7 @@ def file_of(path, rpcs, side: float, relief: float, crs: str = "EPSG:32610"):
     """Hills of single precision around the middle of a model's terrain; `side` is in the units of the reference system."""
     (x,), (y,) = warp.transform("EPSG:4326", crs, [rpcs.long_off], [rpcs.lat_off])
     step = side / (N - 1)
-    heights = fractal([N, N], seed=3, exponent=2.2, range=(100, 100 + relief)).astype(np.float32)
+    heights = (100 + relief * fractal([N, N], seed=3, exponent=2.2)).astype(np.float32)
     return geotiffs.write(path, heights[::-1], (step, 0, x - side / 2 - step / 2, 0, -step, y + side / 2 + step / 2), crs)
 
 
@@ -103,6 +103,7 @@ def by_gdal(rpcs, place: np.ndarray) -> np.ndarray:
     ("rpcs", "side", "relief", "crs"),
     [
         (COAST, 1700, 50, "EPSG:32610"),
+        (COAST, 1600, 0, "EPSG:32610"),
         (COAST, 0.018, 400, "EPSG:4326"),
         (SHARP, 500, 50, "EPSG:32652"),
         (SHARP, 350, 300, "EPSG:32652"),
@@ -201,7 +202,7 @@ def test_the_moon_has_its_own_longitudes(tmp_path):
     ("crs", "x", "y"), [("EPSG:32632", 7.2e5, 5.2e6), ("EPSG:32632", 3e5, 5.2e6), ("EPSG:32732", 7.2e5, 5e6)]
 )
 def test_a_maps_north_is_told_from_the_true_one(tmp_path, crs, x, y):
-    """By tan(convergence) = tan(longitude from the zone's middle) sin(latitude), which on the ellipsoid is off by less than 0.1 %."""
+    """By tan(convergence) = tan(longitude from the zone's middle) sin(latitude), on the ellipsoid less than 0.1 % off."""
     terrain = jaxhf.load_heights(geotiffs.write(tmp_path / "a.tif", np.zeros((9, 9), np.float32), (30, 0, x, 0, -30, y), crs))
     latitude, longitude = np.radians(terrain.place)
     expected = np.degrees(np.arctan(np.tan(longitude - np.radians(9)) * np.sin(latitude)))
@@ -220,7 +221,7 @@ def test_what_no_perspective_sees_is_refused(tmp_path):
          "nearly so (pixels must lie within max_error = 0.05 pixels of where one camera sees the points; "),
         (COAST, terrain, {"width": 99, "height": 99}, "terrain must be in the picture of 99 x 99 pixels, it is at columns 3"),
         (COAST, bare, {}, "terrain must have a place on a globe, its georeference does not say it"),
-        (COAST, dataclasses.replace(terrain, heights=holes), {}, "terrain must have heights, it has none"),
+        (COAST, dataclasses.replace(terrain, heights=holes), {}, "terrain must have heights, nan being none; they go from nan"),
         (COAST, terrain.heights, {}, "terrain must be a Terrain, as load_heights gives it, it is a ndarray"),
         (None, terrain, {}, "rpcs must be an RPC of rasterio's, as dataset.rpcs, it is None"),
         (COAST, terrain, {"geoid": np.nan}, "geoid must be finite, it is nan"),
@@ -266,6 +267,9 @@ def test_an_orthophoto_shows_what_its_geotransform_says(tmp_path, place, degrees
         np.testing.assert_allclose(np.asarray(aovs["uv"])[met], np.stack([u, v], axis=-1)[met], atol=2e-6)
         assert met.mean() > 0.3
         assert np.asarray(camera.world_from_camera)[2, 3] > 2 * heights.max()
+        if not degrees:
+            side = np.linalg.norm(numbers[[0, 3]]) * width if width < height else np.linalg.norm(numbers[[1, 4]]) * height
+            np.testing.assert_allclose(camera.extent, side)
 
 
 def test_what_is_no_geotransform_is_refused(tmp_path):

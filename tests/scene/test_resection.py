@@ -141,6 +141,7 @@ def test_parallel_rays_see_all_points_where_an_affine_map_has_them():
         camera = jaxhf.Orthographic.from_points(given, (given - UTM) @ linear.T + offset, width=width, height=height)
         np.testing.assert_allclose(camera.project(others), (others - UTM) @ linear.T + offset, atol=1e-9)
         assert np.asarray(camera.world_from_camera)[2, 2] < 0  # from above
+        np.testing.assert_allclose(camera.extent, min(width, height) / np.linalg.norm(linear[0 if width < height else 1]))
     pixels = (others - UTM) @ linear.T + offset + np.random.default_rng(2).normal(0, 0.3, (100, 2))
     residual = jaxhf.Orthographic.from_points(others, pixels, **SIZE, max_error=3).project(others) - pixels
     slopes = np.concatenate([others - UTM, np.ones((100, 1))], axis=1)
