@@ -274,22 +274,20 @@ def test_an_orthophoto_shows_what_its_geotransform_says(tmp_path, place, degrees
 
 def test_what_is_no_geotransform_is_refused(tmp_path):
     terrain = jaxhf.Terrain(np.eye(3, dtype=np.float32))
+    Affine = rasterio.Affine
     for transform, ground, message in (
-        ((0, 1, 0, 3, 0, -1), terrain, "from_geotransform: transform must be an Affine, as rasterio's dataset.transform or "),
         (
-            rasterio.Affine(1, 1, 0, 1, 1, 0),
+            (0, 1, 0, 3, 0, -1),
             terrain,
-            "from_geotransform: transform must be finite and invertible, it is [[1",
+            "transform must be an Affine, as rasterio's dataset.transform or Affine.from_gdal",
         ),
-        (
-            rasterio.Affine(1, 0, 0, 0, -1, 2.5),
-            terrain.heights,
-            "from_geotransform: terrain must be a Terrain, as load",
-        ),
+        (Affine(1, 1, 0, 1, 1, 0), terrain, "transform must be finite and invertible, it is [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0"),
+        (Affine(1, 0, np.nan, 0, -1, 0), terrain, "transform must be finite and invertible, it is [[1.0, 0.0, nan], ["),
+        (Affine(1, 0, 0, 0, -1, 2.5), terrain.heights, "terrain must be a Terrain, as load_heights gives it, it is a ndarray"),
     ):
-        with pytest.raises(jaxhf.ArgumentError, match=f"^{re.escape(message)}"):
+        with pytest.raises(jaxhf.ArgumentError, match=f"^from_geotransform: {re.escape(message)}"):
             jaxhf.Orthographic.from_geotransform(transform, ground, width=3, height=3)
-    camera = jaxhf.Orthographic.from_geotransform(rasterio.Affine(1, 0, 0, 0, -1, 2.5), terrain, width=3, height=3)
+    camera = jaxhf.Orthographic.from_geotransform(Affine(1, 0, 0, 0, -1, 2.5), terrain, width=3, height=3)
     ray = camera.ray(jnp.float32(0.5), jnp.float32(2.0))
     np.testing.assert_allclose(ray.o, [0.5, 0.5, 5])
     np.testing.assert_allclose(ray.d, [0, 0, -1])
