@@ -128,7 +128,7 @@ class Perspective(Record):
         """The pinhole that sees a terrain where the RPC model of a satellite's picture does (NIMA, STDI-0002, 2000, RPC00B).
 
         It is fitted to GDAL's transformer in a box around that part of the terrain which is in the picture. A scanner that
-        builds its picture line by line is no pinhole: the error grows as the part's width in pixels times its relief.
+        builds its picture line by line is no pinhole: the error grows with the square of that part's width.
 
         Args:
           rpcs: rasterio's `dataset.rpcs`. For a window of the picture, subtract its first column from `samp_off` and its first
