@@ -40,6 +40,8 @@ walk: trace/walk*.py trace/[ps][ye]*.py -> rendering/test_cast.py shade/test_pen
 normals: trace/normals.py -> scene/test_scene.py rendering/test_cast.py -k=normal
 normals: trace/intersect.py -> trace/test_leaving.py trace/test_extremes.py rendering/test_cast.py shade/test_shade.py
 cameras: scene/camera.py -> scene/test_scene.py scene/test_framing.py scene/test_projections.py scene/test_far_camera.py
+cameras: scene/pose.py scene/projection.py -> scene/test_scene.py scene/test_projections.py scene/test_far_camera.py
+cameras: scene/resection.py scene/mapped.py -> scene/test_resection.py io/test_map_cameras.py
 cameras: scene/framing.py -> scene/test_framing.py scene/test_projections.py scene/test_scene.py
 lights: scene/sun.py -> scene/test_sun.py
 lights: scene/light.py -> scene/test_scene.py scene/test_sun.py shade/test_shade.py

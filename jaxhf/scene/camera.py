@@ -9,42 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..core.affine import Affine, affine, invertible
-from ..core.errors import ArgumentError, whole_number
+from ..core.affine import affine, invertible
+from ..core.errors import whole_number
 from ..core.ray import Ray
 from ..core.rules import OneOf, Whole, require
-from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, VECTOR, MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf
+from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf
 from ..core.vector import dot, unit
 from .framing import framing_pose
 from .heightfield import Heightfield
+from .mapped import geotransformed, resected_rpc
+from .pose import look_at_pose, require_pose
+from .projection import Projection, camera_from_world, film, projected, screen
 from .record import Record, known, numbers
+from .resection import resected, resected_in_parallel
 
 Convention = Literal["opencv", "opengl"]
 _PIXELS = Whole(1, unit="pixels")  # along a side of a picture
-
-
-class Projection(eqx.Module):
-    """p -> linear @ p + offset, four numbers (X, Y, W, depth): the point is seen at (X / W, Y / W), if its depth is positive.
-
-    Homogeneous coordinates (Riesenfeld, IEEE CG&A 1981): what is linear in p can be cut at the picture's border before
-    the division.
-    """
-
-    linear: Float[jax.Array, "4 3"]
-    offset: Float[jax.Array, "4"]
-
-    def __call__(self, p: Vector) -> Float[jax.Array, "4"]:
-        return self.linear[:, 0] * p[0] + self.linear[:, 1] * p[1] + self.linear[:, 2] * p[2] + self.offset
-
-    def of(self, world: Affine) -> "Projection":
-        """The same projection for points in another frame; `world` maps that frame to the world's."""
-        columns = [
-            self.linear[:, 0] * world.linear[0, k]
-            + self.linear[:, 1] * world.linear[1, k]
-            + self.linear[:, 2] * world.linear[2, k]
-            for k in range(3)
-        ]
-        return Projection(jnp.stack(columns, axis=1), self(world.offset))
 
 
 class Perspective(Record):
@@ -68,7 +48,7 @@ class Perspective(Record):
         cls, eye: Any, target: Any, up: Any = (0, 0, 1), fov: Any = 45.0, *, width: int = 512, height: int = 512
     ) -> "Perspective":
         """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
-        return cls(_look_at(eye, target, up), fov, width=width, height=height)
+        return cls(look_at_pose(eye, target, up), fov, width=width, height=height)
 
     @classmethod
     def from_intrinsics(
@@ -105,19 +85,66 @@ class Perspective(Record):
         for name, leaf in lens.items():
             require("from_intrinsics", name, leaf, POSITIVE if name in ("fx", "fy") else FINITE)
         pose = float_leaf(world_from_camera)
-        _require_pose(pose)
+        require_pose(pose)
         leaves, xp = [pose, *lens.values()], np
         if traced := [leaf.dtype for leaf in leaves if isinstance(leaf, jax.Array)]:
             leaves, xp = [jnp.asarray(leaf, jnp.result_type(*traced)) for leaf in leaves], jnp
         pose, fx, fy, cx, cy = leaves
         side = 1 if convention == "opengl" else -1
         right, up, backward = pose[:3, 0], side * pose[:3, 1], side * pose[:3, 2]
-        # Rays go along column 2 + sx tan(fov / 2) column 0 + sy tan(fov / 2) column 1, see `_screen`.
+        # Rays go along column 2 + sx tan(fov / 2) column 0 + sy tan(fov / 2) column 1, see `screen`.
         f = fx if width <= height else fy
         middle = right * ((width / 2 - cx) / fx) + up * ((cy - height / 2) / fy) - backward
         columns = xp.stack([right * (f / fx), up * (f / fy), middle, pose[:3, 3]], axis=1)
         fov = xp.rad2deg(2 * xp.arctan(min(width, height) / 2 / f))
         return cls(xp.concatenate([columns, pose[3:]]), fov, width=width, height=height)
+
+    @classmethod
+    def from_points(cls, points: Any, pixels: Any, *, width: int, height: int, max_error: float = 1.0) -> "Perspective":
+        """The camera that sees known points at known pixels: a pinhole's resection, by least squares in double precision.
+
+        It takes all that a pinhole may be, in 11 numbers: place, direction, focal length, principal point, pixels that are not
+        square or skew. So `world_from_camera` may be no rotation.
+
+        Args:
+          points: (n, 3), at least 6 and better 20, world units, not all in one plane: as high and as low as what is to be seen.
+          pixels: (n, 2), where each is seen: right and down from the picture's top left corner. The centre of the top left
+            pixel is (0.5, 0.5) here, which OpenCV calls (0, 0): add 0.5 to its numbers. Without distortion.
+          width, height: of the picture, pixels.
+          max_error: how far a pixel may be from where the camera sees its point; it tells pixels that are another point's.
+            The distances are those of `camera.project(points)` from `pixels`.
+
+        Raises:
+          ValueError: a pixel is farther off; points are too few, in a plane, behind the camera or so far away that rays are
+            parallel; pixels are on a line or mirrored; a number is not finite or is traced.
+        """
+        require_size("from_points", width, height)
+        return cls(*resected(points, pixels, width, height, max_error), width=width, height=height)
+
+    @classmethod
+    def from_rpc(
+        cls, rpcs: Any, terrain: Any, *, width: int, height: int, geoid: float = 0.0, max_error: float = 0.05
+    ) -> "Perspective":
+        """The pinhole that sees a terrain where the RPC model of a satellite's picture does (NIMA, STDI-0002, 2000, RPC00B).
+
+        It is fitted to GDAL's transformer in a box around that part of the terrain which is in the picture. A scanner that
+        builds its picture line by line is no pinhole: the error grows with the square of that part's width.
+
+        Args:
+          rpcs: rasterio's `dataset.rpcs`. For a window of the picture, subtract its first column from `samp_off` and its first
+            row from `line_off`; gdal_translate does so.
+          terrain: a `Terrain` with a reference system, as `load_heights` gives it. Needs rasterio.
+          width, height: of the picture, pixels.
+          geoid: what is added to the terrain's heights, metres. The model's heights count from the ellipsoid; most elevation
+            models' from the geoid, whose height above the ellipsoid this is then, -106 to 85 on the Earth.
+          max_error: how far the camera may be off in the box, pixels.
+
+        Raises:
+          ValueError: one camera is farther off, the terrain is not in the picture or has no place on a globe, or `rpcs` are
+            none of rasterio's.
+        """
+        require_size("from_rpc", width, height)
+        return cls(*resected_rpc(rpcs, terrain, width, height, geoid, max_error), width=width, height=height)
 
     @classmethod
     def framing(
@@ -155,7 +182,7 @@ class Perspective(Record):
     def ray(self, x: Scalar, y: Scalar) -> Ray:
         """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""
         world = affine(jnp.asarray(self.world_from_camera))
-        sx, sy = _screen(self, x, y)
+        sx, sy = screen(self, x, y)
         half = jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2)
         along = world.vector(jnp.stack([sx * half, sy * half, jnp.ones_like(half)]))
         if self._ahead is None:
@@ -166,8 +193,15 @@ class Perspective(Record):
 
     def film_from_world(self) -> Projection:
         """The projection of points in the world to pixels, the inverse of `ray`."""
-        camera = _camera_from_world(self)
-        return _film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
+        camera = camera_from_world(self)
+        return film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
+
+    def project(self, points: Any) -> Float[np.ndarray, "*n 2"]:
+        """Where points (..., 3) of the world are seen: (..., 2), pixels right and down from the top left corner.
+
+        In double precision, of numbers that are not traced; nan where a point is not in front of the camera.
+        """
+        return projected(self, points, lambda depth: depth * np.tan(np.radians(np.asarray(self.fov, np.float64)) / 2))
 
     def viewpoint(self) -> tuple[Vector, bool]:
         """The position of the eye, and True: it is a point."""
@@ -198,21 +232,51 @@ class Orthographic(Record):
         cls, eye: Any, target: Any, up: Any = (0, 0, 1), extent: Any = 1.0, *, width: int = 512, height: int = 512
     ) -> "Orthographic":
         """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
-        return cls(_look_at(eye, target, up), extent, width=width, height=height)
+        return cls(look_at_pose(eye, target, up), extent, width=width, height=height)
+
+    @classmethod
+    def from_points(cls, points: Any, pixels: Any, *, width: int, height: int, max_error: float = 1.0) -> "Orthographic":
+        """The camera that sees at least four known points at known pixels by parallel rays, which may be oblique.
+
+        Arguments and errors are those of `Perspective.from_points`. For pictures from so far away that errors of pixels hide
+        the perspective.
+        """
+        require_size("from_points", width, height)
+        return cls(*resected_in_parallel(points, pixels, width, height, max_error), width=width, height=height)
+
+    @classmethod
+    def from_geotransform(cls, transform: Any, terrain: Any, *, width: int, height: int) -> "Orthographic":
+        """The camera of an orthophoto: it looks straight down on a terrain, from above its highest point.
+
+        Args:
+          transform: rasterio's `dataset.transform`, from the picture's columns and rows to coordinates in the terrain's
+            reference system; it may rotate, and pixels need not be square. GDAL's six numbers: `Affine.from_gdal(*numbers)`.
+          terrain: a `Terrain`, as `load_heights` gives it, also one in degrees.
+          width, height: of the picture, pixels.
+
+        Raises:
+          ValueError: `transform` is no Affine or flattens the picture, or the terrain has no heights.
+        """
+        require_size("from_geotransform", width, height)
+        return cls(*geotransformed(transform, terrain, width, height), width=width, height=height)
 
     def ray(self, x: Scalar, y: Scalar) -> Ray:
         """The ray through the point (x, y) of the picture: pixels, from its top left corner; `d` has length 1."""
         world = affine(jnp.asarray(self.world_from_camera))
-        sx, sy = _screen(self, x, y)
+        sx, sy = screen(self, x, y)
         half = jnp.asarray(self.extent) / 2
         origin, d = world.point(jnp.stack([sx * half, sy * half, jnp.zeros_like(half)])), unit(world.linear[:, 2])
         return Ray(origin, d, None if self._ahead is None else self._ahead * dot(world.linear[:, 2], d))
 
     def film_from_world(self) -> Projection:
         """The projection of points in the world to pixels, the inverse of `ray`."""
-        camera = _camera_from_world(self)
+        camera = camera_from_world(self)
         half = jnp.asarray(self.extent) / 2
-        return _film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
+        return film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
+
+    def project(self, points: Any) -> Float[np.ndarray, "*n 2"]:
+        """Where points of the world are seen, as `Perspective.project`."""
+        return projected(self, points, lambda depth: np.asarray(self.extent, np.float64) / 2)
 
     def viewpoint(self) -> tuple[Vector, bool]:
         """The direction towards the eye, and False: it is infinitely far away."""
@@ -231,7 +295,7 @@ def cropped(camera: Camera, x: float | int, y: float | int, width: int, height: 
     Its matrix may be no rotation any more, see `Perspective`.
     """
     matrix = np.array(camera.world_from_camera, np.float64)
-    sx, sy = _screen(camera, x + width / 2, y + height / 2)
+    sx, sy = screen(camera, x + width / 2, y + height / 2)
     times = min(width, height) / min(camera.width, camera.height)
     if isinstance(camera, Perspective):
         half, moved = np.tan(np.radians(np.asarray(camera.fov, np.float64)) / 2), 2
@@ -250,61 +314,6 @@ def _shown(camera: Camera, lens: str) -> str:
     else:
         pose = f"eye={numbers(matrix[:3, 3])}, looking={numbers(matrix[:3, 2])}"
     return f"{type(camera).__name__}({pose}, {lens}, {camera.width} x {camera.height})"
-
-
-def _screen(camera: Camera, x: Any, y: Any) -> tuple[Any, Any]:
-    """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
-    short = min(camera.width, camera.height)
-    return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
-
-
-def _camera_from_world(camera: Camera) -> Affine:
-    inverse = affine(jnp.asarray(camera.world_from_camera)).inverse()
-    return inverse if camera._ahead is None else Affine(inverse.linear, inverse.offset.at[2].add(camera._ahead))
-
-
-def _film(camera: Camera, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
-    """The inverse of `_screen`: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
-    scale = min(camera.width, camera.height) / (2 * half)
-
-    def rows(p: Any, w: Any) -> jax.Array:
-        return jnp.stack([p[0] * scale + w * (camera.width / 2), -p[1] * scale + w * (camera.height / 2), w, p[2]])
-
-    return Projection(rows(camera_from_world.linear, w), rows(camera_from_world.offset, w_offset))
-
-
-def _look_at(eye: Any, target: Any, up: Any) -> Any:
-    eye, target, up = leaves = float_leaf(eye), float_leaf(target), float_leaf(up)
-    for name, leaf in zip(("eye", "target", "up"), leaves, strict=True):
-        require("look_at", name, leaf, VECTOR)
-    host = all(isinstance(leaf, np.ndarray) for leaf in leaves)
-    xp = np if host else jnp
-
-    def direction(v):
-        return v / np.sqrt((v * v).sum()) if host else unit(jnp.asarray(v))
-
-    if host and not (target - eye).any():
-        raise ArgumentError("look_at", "target", f"must differ from eye, both are {eye.tolist()}")
-    forward = direction(target - eye)
-    right = xp.cross(forward, up)
-    if host and not np.linalg.norm(right) > 1e-9 * np.linalg.norm(up):
-        raise ArgumentError(
-            "look_at", "up", f"must not point along the view, it is {up.tolist()} for the view {forward.tolist()}"
-        )
-    right = direction(right)
-    columns = xp.stack([right, xp.cross(right, forward), forward, eye], axis=1)
-    return xp.concatenate([columns, xp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=columns.dtype)])
-
-
-def _require_pose(matrix: Any) -> None:
-    """Raises ArgumentError on a matrix that does more than rotate and translate, as the wrong one of two would."""
-    require("from_intrinsics", "world_from_camera", matrix, invertible)
-    if isinstance(matrix, np.ndarray):
-        turn = matrix[:3, :3]
-        if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
-            raise ArgumentError(
-                "from_intrinsics", "world_from_camera", f"must rotate without scaling or mirroring, it is {turn.tolist()}"
-            )
 
 
 def require_size(owner: str, width: Any, height: Any) -> None:

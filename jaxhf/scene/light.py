@@ -55,7 +55,7 @@ class Directional(Record):
     def at(
         cls: type[D], time: Any, latitude: Any, longitude: Any, irradiance: Any = None, *, refraction: bool = False, **more: Any
     ) -> D:
-        """Light from where the sun stands at a time and place; y counts as true north.
+        """Light from where the sun stands at a time and place; y counts as true north, see `Terrain.convergence`.
 
         Args:
           time, latitude, longitude, refraction: one of each, as for `sun`.

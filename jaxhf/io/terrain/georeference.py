@@ -3,7 +3,9 @@
 import importlib
 import math
 import re
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from ...core.extras import import_extra
 from ..errors import FileError
@@ -104,12 +106,27 @@ def geographic(wkt: str, x: float, y: float) -> tuple[float, float]:
     """The latitude and longitude of a point in a reference system, degrees; not finite where it has none."""
     if re.match(_GEOGRAPHIC, wkt):
         return y, x
+    (latitude,), (longitude,) = _transformed(wkt, "EPSG:4326", [x], [y])
+    return latitude, longitude
+
+
+def on_globe(wkt: str, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Latitudes and longitudes of points in a reference system, degrees: on WGS84, or on the globe of another body; nan where
+    it has none."""
+    globe = _globe(wkt) or WGS84
+    earth = math.isclose(globe.axis, WGS84.axis, rel_tol=0.01)
+    target = "EPSG:4326" if earth else f"+proj=longlat +a={globe.axis} +f={globe.flattening} +no_defs"
+    latitude, longitude = _transformed(wkt, target, x.ravel(), y.ravel())
+    return np.reshape(latitude, x.shape), np.reshape(longitude, x.shape)
+
+
+def _transformed(wkt: str, target: str, x: Any, y: Any) -> tuple[Any, Any]:
     rasterio = import_extra("rasterio", "finding the latitude and longitude of a terrain needs", "geo")
     warp = importlib.import_module("rasterio.warp")
     try:
-        (longitude,), (latitude,) = warp.transform(rasterio.crs.CRS.from_wkt(wkt), "EPSG:4326", [x], [y])
+        longitude, latitude = warp.transform(rasterio.crs.CRS.from_wkt(wkt), target, x, y)
     except rasterio.errors.RasterioError:  # a local system has no place on the globe
-        return math.nan, math.nan
+        return np.full(len(x), np.nan), np.full(len(x), np.nan)
     return latitude, longitude
 
 

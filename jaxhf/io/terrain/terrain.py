@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from .georeference import (
     coordinate_system,
     geographic,
     metres_per_degree,
+    on_globe,
 )
 
 if TYPE_CHECKING:
@@ -130,6 +132,33 @@ class Terrain:
             found = f"it is in {self.georeference.name}" if self.georeference and wkt else "it has no georeference"
             raise ArgumentError("Terrain", "place", f"must be given as latitude and longitude, {found}")
         return latitude, longitude
+
+    @property
+    def convergence(self) -> float:
+        """By how much its y axis points clockwise of true north at its middle, degrees; needs rasterio.
+
+        An azimuth from true north, as of `sun` and of pictures' metadata, minus this counts from the y axis. nan where its
+        georeference does not say.
+        """
+        (ny, nx), step = self.heights.shape, 1e-3 * (len(self.heights) - 1) * self.dy
+        y = self.y0 + (ny - 1) / 2 * self.dy + step * np.array([-1, 1])
+        latitude, longitude, _ = self.geodetic(self.x0 + (nx - 1) / 2 * self.dx, y, 0)
+        east = (longitude[1] - longitude[0] + 180) % 360 - 180
+        per_east, per_north = metres_per_degree(float(latitude.mean()))
+        return math.degrees(math.atan2(east * per_east, (latitude[1] - latitude[0]) * per_north))
+
+    def geodetic(self, x: Any, y: Any, z: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Latitudes and longitudes of points in its x and y, degrees, and z in metres; needs rasterio.
+
+        On WGS84, or on the globe of another body; nan where its georeference does not say. z is in the unit of its heights, and
+        counts from their zero.
+        """
+        place = self.georeference or Georeference()
+        x, y, z = np.broadcast_arrays(*(np.asarray(values, np.float64) for values in (x, y, z)))
+        x, y = (offset + scale * v for offset, scale, v in zip(place.offset, place.scale, (x, y), strict=True))
+        latitude, longitude = on_globe(place.wkt, x, y) if place.wkt else (x + np.nan, y + np.nan)
+        feet = re.search(r"foot|feet|\bft", (place.height_unit or place.unit).lower())
+        return latitude, longitude, z * (0.3048 if feet else 1)
 
     def heightfield(self, dtype: DTypeLike | None = None) -> "Heightfield":
         """The surface, to be rendered.

@@ -1,0 +1,69 @@
+"""Where the points of a picture lie in a camera's frame, and where points of the world lie in the picture."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..core.affine import Affine, affine
+from ..core.errors import ArgumentError
+from ..core.types import Scalar, Vector, float_leaf
+
+
+class Projection(eqx.Module):
+    """p -> linear @ p + offset, four numbers (X, Y, W, depth): the point is seen at (X / W, Y / W), if its depth is positive.
+
+    Homogeneous coordinates (Riesenfeld, IEEE CG&A 1981): what is linear in p can be cut at the picture's border before
+    the division.
+    """
+
+    linear: Float[jax.Array, "4 3"]
+    offset: Float[jax.Array, "4"]
+
+    def __call__(self, p: Vector) -> Float[jax.Array, "4"]:
+        return self.linear[:, 0] * p[0] + self.linear[:, 1] * p[1] + self.linear[:, 2] * p[2] + self.offset
+
+    def of(self, world: Affine) -> "Projection":
+        """The same projection for points in another frame; `world` maps that frame to the world's."""
+        columns = [
+            self.linear[:, 0] * world.linear[0, k]
+            + self.linear[:, 1] * world.linear[1, k]
+            + self.linear[:, 2] * world.linear[2, k]
+            for k in range(3)
+        ]
+        return Projection(jnp.stack(columns, axis=1), self(world.offset))
+
+
+def screen(camera: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
+    short = min(camera.width, camera.height)
+    return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
+
+
+def camera_from_world(camera: Any) -> Affine:
+    inverse = affine(jnp.asarray(camera.world_from_camera)).inverse()
+    return inverse if camera._ahead is None else Affine(inverse.linear, inverse.offset.at[2].add(camera._ahead))
+
+
+def film(camera: Any, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
+    """The inverse of `screen`: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
+    scale = min(camera.width, camera.height) / (2 * half)
+
+    def rows(p: Any, w: Any) -> jax.Array:
+        return jnp.stack([p[0] * scale + w * (camera.width / 2), -p[1] * scale + w * (camera.height / 2), w, p[2]])
+
+    return Projection(rows(camera_from_world.linear, w), rows(camera_from_world.offset, w_offset))
+
+
+def projected(camera: Any, points: Any, half: Callable[[Any], Any]) -> Float[np.ndarray, "*n 2"]:
+    """The same by `half` of what the shorter side spans at a depth, on the host: see `Perspective.project`."""
+    matrix, given = np.asarray(camera.world_from_camera, np.float64), np.asarray(float_leaf(points), np.float64)
+    if given.shape[-1:] != (3,):
+        raise ArgumentError("project", "points", f"must have shape (..., 3), theirs is {given.shape}")
+    x, y, depth = np.moveaxis((given - matrix[:3, 3]) @ np.linalg.inv(matrix[:3, :3]).T, -1, 0)
+    scale = min(camera.width, camera.height) / 2 / np.where(depth > 0, half(depth), np.nan)
+    return np.stack([camera.width / 2 + scale * x, camera.height / 2 - scale * y], axis=-1)
