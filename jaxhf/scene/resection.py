@@ -30,10 +30,15 @@ def resected(points: Any, pixels: Any, width: int, height: int, max_error: float
     projection = _least_squares(p, uv, _linear(p, uv))
     to_pixels = np.array([[size, 0, centre[0]], [0, size, centre[1]], [0, 0, 1]])
     seen = p @ (to_pixels @ projection).T
-    _require_close(seen[:, :2] / seen[:, 2:], pixels, max_error)
-    if np.linalg.norm(projection[2, :3]) < _PARALLEL or np.linalg.det(projection[:, :3]) < 0:
-        rule = "must be seen in perspective; these are seen by parallel rays (Orthographic.from_points)"
-        raise ArgumentError(_OWNER, "points", f"{rule}, or mirrored (pixels count right and down)")
+    off = _require_close(seen[:, :2] / seen[:, 2:], pixels, max_error)
+    tapering = np.linalg.norm(projection[2, :3])  # what depths differ by, beside their mean
+    if tapering < _PARALLEL or np.linalg.det(projection[:, :3]) < 0:
+        if tapering > max(_PARALLEL, off / size):
+            raise ArgumentError(
+                _OWNER, "pixels", "must count right and down from the top left corner, these show a mirror image"
+            )
+        rule = "must be seen in perspective, these by parallel rays, as far as their pixels tell: Orthographic.from_points"
+        raise ArgumentError(_OWNER, "points", rule)
     eye = middle - axes @ np.linalg.solve(projection[:, :3], projection[:, 3])
     linear = (to_pixels @ projection[:, :3]) @ np.linalg.inv(axes)
     linear /= np.linalg.norm(linear[2])
@@ -103,13 +108,15 @@ def _deviations(name: str, given: np.ndarray, rule: str) -> np.ndarray:
     return turn.T * sizes / np.sqrt(len(given))
 
 
-def _require_close(seen: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"], max_error: float) -> None:
+def _require_close(seen: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"], max_error: float) -> float:
+    """The root mean square of distances in the picture."""
     require(_OWNER, "max_error", max_error, POSITIVE)
     off = np.linalg.norm(seen - pixels, axis=1)
-    if not off.max() <= max_error:
-        k, usual = int(off.argmax()), np.sqrt(np.mean(off**2))
+    k, usual = int(off.argmax()), math.sqrt(np.mean(off**2))
+    if not off[k] <= max_error:
         rule = f"must lie within max_error = {max_error:g} pixels of where one camera sees the points"
         raise ArgumentError(_OWNER, "pixels", f"{rule}; pixels[{k}] is {off[k]:.3g} off, their root mean square {usual:.3g}")
+    return usual
 
 
 def _equations(p: Float[np.ndarray, "n 4"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "two_n 12"]:

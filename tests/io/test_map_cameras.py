@@ -80,6 +80,11 @@ def file_of(path, rpcs, side: float, relief: float, crs: str = "EPSG:32610"):
     return geotiffs.write(path, heights[::-1], (step, 0, x - side / 2 - step / 2, 0, -step, y + side / 2 + step / 2), crs)
 
 
+def mapped(transform, column: np.ndarray, row: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    a, b, c, d, e, f, *_ = transform
+    return a * column + b * row + c, d * column + e * row + f
+
+
 def on_surface(path, terrain) -> tuple[np.ndarray, np.ndarray]:
     """1e4 points on cells' diagonals: in the world, and by GDAL as longitude, latitude and height."""
     rng = np.random.default_rng(0)
@@ -87,7 +92,7 @@ def on_surface(path, terrain) -> tuple[np.ndarray, np.ndarray]:
     z = terrain.heights.astype(np.float64)
     z = z[iy, ix] + t * (z[iy + 1, ix + 1] - z[iy, ix])
     with rasterio.open(path) as file:
-        place = warp.transform(file.crs, "EPSG:4326", *(file.transform @ (ix + t + 0.5, N - 1 - iy - t + 0.5)))
+        place = warp.transform(file.crs, "EPSG:4326", *mapped(file.transform, ix + t + 0.5, N - 1 - iy - t + 0.5))
     world = [terrain.x0 + (ix + t) * terrain.dx, terrain.y0 + (iy + t) * terrain.dy, z]
     return np.stack(world, axis=1), np.stack([*place, z], axis=1)
 
@@ -259,7 +264,7 @@ def test_an_orthophoto_shows_what_its_geotransform_says(tmp_path, place, degrees
         scene = jaxhf.Scene([jaxhf.Object(terrain.heightfield())], camera, [jaxhf.Directional((0, 0, 1))])
         _, aovs = jaxhf.render(scene, aovs=("status", "uv"))
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        x, y = transform @ (columns, rows)
+        x, y = mapped(transform, columns, rows)
         u = ((x - grid[2]) / grid[0] - 0.5) / 39
         v = ((y - grid[5]) / -grid[4] + 29.5) / 29
         met = np.asarray(aovs["status"]) == jaxhf.Status.HIT

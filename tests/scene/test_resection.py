@@ -187,8 +187,9 @@ WRONG = [
     (POINTS, PIXELS * [1, 0], "pixels must not lie on one line"),
     (BEHIND, by_hand(BEHIND, 2e3, 1e3)[0], "points[7] must lie in front of the camera that sees most of them; it lies behind"),
     (POINTS, edited(PIXELS, 5, PIXELS[5] + [30, 0]), "pixels must lie within max_error = 1 pixels of where one camera sees"),
-    (POINTS, PIXELS * [1, -1], "points must be seen in perspective; these are seen by parallel rays (Orthographic.from_p"),
-    (POINTS, (POINTS - UTM) @ np.array([[0.5, 0, 0.1], [0, -0.5, 0.2]]).T, "points must be seen in perspective; these are se"),
+    (POINTS, PIXELS * [1, -1], "pixels must count right and down from the top left corner, these show a mirror image"),
+    (POINTS, PIXELS[:, ::-1], "pixels must count right and down from the top left corner, these show a mirror image"),
+    (POINTS, (POINTS - UTM) @ np.array([[0.5, 0, 0.1], [0, -0.5, 0.2]]).T, "points must be seen in perspective, these by pa"),
 ]  # fmt: skip
 
 
@@ -196,6 +197,23 @@ WRONG = [
 def test_what_tells_no_camera_is_refused(points, pixels, message):
     with pytest.raises(jaxhf.ArgumentError, match=f"^from_points: {re.escape(message)}"):
         jaxhf.Perspective.from_points(points, pixels, **SIZE)
+
+
+def test_noise_that_hides_the_perspective_is_told_from_a_mirror():
+    """Of a plain from 700 km: where the noise turns depths round, parallel rays are named."""
+    points = scattered(200, 1e4, 1.0)
+    exact, *_ = by_hand(points, 7e5, 1e4)
+    refused = 0
+    for seed in range(20):
+        pixels = exact + np.random.default_rng(seed).normal(0, 0.3, exact.shape)
+        try:
+            jaxhf.Perspective.from_points(points, pixels, **SIZE, max_error=3.0)
+        except jaxhf.ArgumentError as error:
+            refused += "Orthographic.from_points" in str(error)
+            np.testing.assert_allclose(
+                jaxhf.Orthographic.from_points(points, pixels, **SIZE, max_error=3.0).project(points), exact, atol=1.0
+            )
+    assert 0 < refused < 20
 
 
 def test_other_arguments_are_refused():
