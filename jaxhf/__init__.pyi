@@ -31,6 +31,7 @@ from .scene.cylinder import Cylinder as Cylinder
 from .scene.heightfield import Heightfield as Heightfield
 from .scene.light import Directional as Directional, Point as Point, Sky as Sky, Sun as Sun
 from .scene.material import Matte as Matte, Mirror as Mirror
+from .scene.nested import nested as nested
 from .scene.scene import Object as Object, Scene as Scene
 from .scene.skirt import Skirt as Skirt
 from .scene.sun import sun as sun
