@@ -97,6 +97,26 @@ def test_other_lights_shine_on_it_as_on_one_grid(light):
     assert np.mean(np.abs(nested - one).max(-1) > 1e-3 * np.max(one)) <= 2 / 4096
 
 
+@pytest.mark.deep
+def test_the_fine_terrain_sees_as_much_of_the_sky_as_on_one_grid():
+    """The coarse one sees it from its own vertices, and so differs; but it does see less where the fine one hides it."""
+    *_, fine, around, whole = terrains()
+    light, weight = jaxhf.Sky(1.0, occlusion=4), np.random.default_rng(0).normal(size=(64, 64, 3)).astype(np.float32)
+    (nested, known), one = picture("orthographic", light, fine, around, aovs=("object",)), picture("orthographic", light, whole)
+    off = np.abs(nested - one).max(-1)
+    inside = np.asarray(known["object"]) == 0
+    assert off[inside].max() < 1e-4
+    assert off.mean() < 0.02 < np.abs(picture("orthographic", light, unmarked(fine), unmarked(around)) - one).max()
+
+    def total(heights):
+        moved = dataclasses.replace(fine, heights=heights)
+        return jnp.sum(weight * picture("orthographic", light, moved, around))
+
+    change = np.random.default_rng(1).normal(size=fine.heights.shape) * ~seam_of(fine)  # which lies on the other's edges
+    forward = jax.jvp(total, (fine.heights,), (jnp.asarray(change, jnp.float32),))[1]
+    np.testing.assert_allclose(jnp.vdot(jax.grad(total)(fine.heights), change), forward, rtol=1e-3)
+
+
 def places_on_seam(count, seed=0):
     """Points on the seam, many of them at vertices, in fine cells from its corner."""
     random = np.random.default_rng(seed)
