@@ -40,6 +40,7 @@ from .scene.material import (
     Mirror as Mirror,
     OrenNayar as OrenNayar,
 )
+from .scene.nested import nested as nested
 from .scene.scene import Object as Object, Scene as Scene
 from .scene.skirt import Skirt as Skirt
 from .scene.sun import sun as sun

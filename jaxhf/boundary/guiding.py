@@ -16,9 +16,9 @@ from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sun
 from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube
-from ..trace.edges import EdgeFlags, present_edges
+from ..trace.edges import EdgeFlags
 from ..trace.grid import Grid
-from .silhouette import EdgeWeights, Viewpoint, folds, lit_lengths, seen_lengths, silhouettes
+from .silhouette import EdgeWeights, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
 _TOTAL_WEIGHT = 2**30
@@ -99,7 +99,7 @@ def boundary_length(world: World, camera: Camera) -> Scalar:
 def _standing(grid: Grid, camera: Camera, lights: list[Viewpoint], shading: Shading) -> EdgeFlags:
     """Edges across which what is seen jumps at the edge itself; one that is a silhouette for several counts once."""
     if shading == "flat":
-        return present_edges(grid.z)
+        return all_edges(grid)
     flags = silhouettes(grid, camera.viewpoint())
     for light in lights:
         flags = flags | silhouettes(grid, light)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ..core.types import Vector
 from ..scene.camera import Camera
-from ..trace.edges import STEPS, EdgeFlags, compare_sides, whole_cells
+from ..trace.edges import STEPS, EdgeFlags, compare_sides, present_edges, whole_cells
 from ..trace.grid import Grid
 from ..xla.materialise import materialise
 
@@ -26,9 +26,23 @@ def silhouettes(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     """The edges with exactly one of their two triangles facing the viewpoint, and those that have only one triangle.
 
     (Hertzmann and Zorin, Illustrating smooth surfaces, SIGGRAPH 2000, section 4.1, on polygons.) Edges at the border and
-    at holes have one triangle.
+    at holes have one triangle, but where the surface goes on in another grid.
     """
-    return compare_sides(*_facing(grid, viewpoint), lambda a, b: a != b)
+    return _without_seam(grid, compare_sides(*_facing(grid, viewpoint), lambda a, b: a != b))
+
+
+def all_edges(grid: Grid) -> EdgeFlags:
+    """The edges with at least one triangle, but for those with one where the surface goes on in another grid."""
+    return _without_seam(grid, present_edges(grid.z))
+
+
+def _without_seam(grid: Grid, flags: EdgeFlags) -> EdgeFlags:
+    if grid.seam is None:
+        return flags
+    present, (ny, nx) = whole_cells(grid.z), grid.shape
+    beyond = jnp.pad(grid.seam, ((0, 1), (0, 1)))
+    on_seam = jnp.stack([grid.seam & beyond[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS])
+    return flags & ~(on_seam & compare_sides(present, present, lambda a, b: a != b))
 
 
 def folds(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:

@@ -32,7 +32,7 @@ def localise(scene: Scene) -> Scene:
     def moved_object(obj: Object) -> Object:
         shape, corner = obj.shape, _grid_corner(obj.shape)
         if isinstance(shape, Heightfield):
-            shape = Heightfield(shape.heights, shape.dx, shape.dy)
+            shape = Heightfield(shape.heights, shape.dx, shape.dy, seam=shape.seam)
         elif isinstance(shape, Skirt):
             shape = dataclasses.replace(shape, x0=0.0, y0=0.0)
         world: Any = np.eye(4) if obj.world_from_object is None else obj.world_from_object

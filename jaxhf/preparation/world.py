@@ -82,9 +82,18 @@ def make_world(scene: Scene, settings: Settings) -> World:
         materials=tuple(obj.material for obj in scene.objects),
         lights=scene.lights,
         ceilings=make_ceilings(surfaces, scene.lights, settings),
-        sky=tuple(visible_sky(surface, azimuths) if azimuths and isinstance(surface, Grid) else None for surface in surfaces),
+        sky=tuple(
+            visible_sky(surface, azimuths, _joined_to(surface, surfaces)) if azimuths and isinstance(surface, Grid) else None
+            for surface in surfaces
+        ),
         settings=settings,
     )
+
+
+def _joined_to(grid: Grid, surfaces: tuple[Surface, ...]) -> list[Grid]:
+    """The other grids with which it is one surface."""
+    grids = (surface for surface in surfaces if isinstance(surface, Grid) and surface is not grid)
+    return [other for other in grids if other.seam is not None and grid.seam is not None]
 
 
 def make_ceilings(

@@ -35,6 +35,9 @@ class Heightfield(eqx.Module):
       dx, dy: cell size, object units; one alone counts for both. With neither given the grid spans pbrt's unit square.
       x0, y0: where vertex (0, 0) stands. They are metadata in double precision and never enter single-precision
         arithmetic: an offset of 5e6 costs no accuracy.
+      seam: at vertices where the surface goes on in another heightfield, its slopes (dz/dx, dz/dy), as `nested` gives them;
+        nan elsewhere; shape (ny, nx, 2). Smooth shading takes these, a border along them bounds nothing, and a fit holds their
+        heights. None: it goes on nowhere.
     """
 
     heights: Float[AnyArray, "ny nx"]
@@ -42,8 +45,17 @@ class Heightfield(eqx.Module):
     dy: float = eqx.field(static=True)
     x0: float = eqx.field(static=True)
     y0: float = eqx.field(static=True)
+    seam: Float[AnyArray, "ny nx 2"] | None
 
-    def __init__(self, heights: Any, dx: float | None = None, dy: float | None = None, x0: float = 0.0, y0: float = 0.0):
+    def __init__(
+        self,
+        heights: Any,
+        dx: float | None = None,
+        dy: float | None = None,
+        x0: float = 0.0,
+        y0: float = 0.0,
+        seam: Any = None,
+    ):
         self.heights = height_leaf("Heightfield", "heights", heights)
         shape = self.heights.shape
         if len(shape) != 2 or min(shape) < 2:
@@ -73,6 +85,9 @@ class Heightfield(eqx.Module):
         for name in ("x0", "y0"):
             if not math.isfinite(getattr(self, name)):
                 raise ArgumentError("Heightfield", name, f"must be finite, it is {getattr(self, name)}")
+        self.seam = None if seam is None else height_leaf("Heightfield", "seam", seam, self.heights.dtype)
+        if self.seam is not None and self.seam.shape != (*shape, 2):
+            raise ArgumentError("Heightfield", "seam", f"must have shape {(*shape, 2)}, its shape is {self.seam.shape}")
 
     def __repr__(self) -> str:
         heights = known(self.heights)

@@ -125,8 +125,9 @@ class Sky(Record):
 
     Attributes:
       radiance: one number or (r, g, b).
-      occlusion: in how many azimuths, at even steps, each heightfield hides the sky from its own upper side, see `horizon`: 16
-        are good for some per cent. The visible sky is computed at the vertices and interpolated between them. None: in none.
+      occlusion: in how many azimuths, at even steps, each heightfield hides the sky from its own upper side, see `horizon`, and
+        from those with which it is one surface, see `nested`: 16 are good for some per cent. The visible sky is computed at the
+        vertices and interpolated between them. None: in none.
     """
 
     radiance: VectorLeaf = eqx.field(converter=rgb_leaf, metadata={"rule": COLOUR})

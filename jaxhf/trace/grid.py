@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
 from ..core.affine import Affine
 from ..core.errors import UserError
@@ -40,6 +40,7 @@ class Grid(eqx.Module):
       perturbation: what is added at the vertices of the triangle that a ray meets, for derivatives of one ray in those
         numbers alone; None: nothing.
       first: the place of the first vertex in `rows` and `normals`; None: 0, else they hold several grids, see `joined`.
+      seam: the vertices where the surface goes on in another grid; None: there are none.
     """
 
     rows: Float[jax.Array, " vertices"]
@@ -54,6 +55,7 @@ class Grid(eqx.Module):
     early_exit: bool = eqx.field(static=True)
     perturbation: Corners | None = None
     first: Index | None = None
+    seam: Bool[jax.Array, "ny nx"] | None = None
 
     @property
     def z(self) -> Float[jax.Array, "ny nx"]:
@@ -95,12 +97,21 @@ def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Se
         grid_from_world = Affine(object_from_world.linear / cell[:, None], (object_from_world.offset - ground) / cell)
     normals = None
     if settings.shading == "smooth":
-        normals = vertex_normals(heights, field.dx, field.dy, settings.normals or "six").reshape(-1, 3)
+        normals = _at_seam(field, vertex_normals(heights, field.dx, field.dy, settings.normals or "six")).reshape(-1, 3)
     pyramid = make_pyramid(lax.stop_gradient(z), z_top, 0 if settings.traversal == "dda" else None)
     return Grid(
         z.reshape(-1), z_top, pyramid, normals, world_from_grid, grid_from_world, object_from_world, (ny, nx),
-        settings.max_steps, settings.early_exit,
+        settings.max_steps, settings.early_exit, seam=None if field.seam is None else jnp.isfinite(field.seam[..., 0]),
     )  # fmt: skip
+
+
+def _at_seam(field: Heightfield, normals: Float[jax.Array, "ny nx 3"]) -> Float[jax.Array, "ny nx 3"]:
+    """Normals with those of the seam put in: all of one weight, that of a vertex with all of its triangles."""
+    if field.seam is None:
+        return normals
+    up = jnp.full((*normals.shape[:2], 1), lax.stop_gradient(jnp.max(normals[..., 2])))
+    given = up * jnp.concatenate([-jnp.asarray(field.seam), jnp.ones_like(up)], axis=-1)
+    return jnp.where(jnp.isfinite(given).all(-1, keepdims=True), given, normals)
 
 
 def joined(grids: Grid) -> tuple[Grid, Grid]:

@@ -58,7 +58,8 @@ def _over_footprint(grid: Grid, o: Vector) -> tuple[Flag, Scalar]:
     u, v = o[0] - ix.astype(o.dtype), o[1] - iy.astype(o.dtype)
     heights = triangle_corners(grid.rows, grid.shape[1], ix, iy, v > u, grid.first)
     a, b, c = plane_through(heights, v > u)
-    return covers & jnp.isfinite(sum(heights)), lax.stop_gradient(o[2] - (c + a * u + b * v))
+    whole = jnp.isfinite(sum(corners(grid.rows, grid.shape[1], ix, iy, grid.first)))  # of a hole's cells three may be there
+    return covers & whole, lax.stop_gradient(o[2] - (c + a * u + b * v))
 
 
 def _rounding(grid: Grid, o: Vector) -> float:

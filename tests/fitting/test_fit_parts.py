@@ -46,6 +46,23 @@ def test_what_is_known_beforehand_counts_in_standard_deviations():
         np.testing.assert_allclose(residual, expected, rtol=1e-5)
 
 
+def test_heights_are_held_where_the_surface_goes_on():
+    """On the seam and the ring beyond it, as they are in the scene, whatever the start and the prior say there."""
+    fine = jaxhf.Heightfield(TRUTH, 0.1)
+    field, around = jaxhf.nested(fine, jaxhf.Heightfield(np.full((12, 12), 0.05), 0.3, x0=-1.2, y0=-1.2))
+    objects = [jaxhf.Object(field), jaxhf.Object(around)]
+    within = [dataclasses.replace(scene, objects=objects) for scene in scenes()]
+    ring = np.ones((12, 12), bool)
+    ring[2:-2, 2:-2] = False
+    for prior in (None, jaxhf.Prior(0.2, 0.1)):
+        problem, unknowns = make_problem(within, pictures(), given_with(start=0.3, prior=prior))
+        assert problem.basis.free is not None
+        np.testing.assert_array_equal(problem.basis.free, ~ring)
+        found = problem.basis.heights(jnp.ones_like(unknowns.coefficients))
+        np.testing.assert_array_equal(found[ring], field.heights[ring])
+        assert (np.abs(problem.basis.base[~ring] - 0.3) < 1e-6).all()
+
+
 def test_without_a_prior_long_waves_may_be_high():
     """All heights together by a quarter of the longer side, and waves by less, as 1 / (1 + frequency)²."""
     field, start = jaxhf.Heightfield(np.zeros((9, 13)), dx=0.5, dy=0.5), np.full((9, 13), 2.0)

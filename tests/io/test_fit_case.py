@@ -335,3 +335,25 @@ def test_what_fit_refuses_is_named_with_its_line(folder, text, message):
 def test_what_fit_refuses_though_no_file_says_it(folder):
     error = case(folder, WHOLE).located(jaxhf.ArgumentError("fit", "max_steps", "must be more"))
     assert str(error) == f"{folder}/case.toml: fit.max_steps must be more"
+
+
+@pytest.mark.parametrize("name", ["prior.npy", "prior.npz", "half.npy"])
+def test_a_prior_goes_with_the_terrain_into_its_surroundings(folder, name):
+    """Over the footprint of the terrain as it is given, whatever of it is left there; a file that says where it lies may."""
+    random, (y, x) = np.random.default_rng(0), np.indices((35, 40))
+    plane = (y + 3.0 * x).astype(np.float32)
+    jaxhf.save_heights(folder / "fine.npz", jaxhf.Terrain(random.random((35, 40), np.float32), 1.0, 1.0, 70.0, 60.0))
+    jaxhf.save_heights(folder / "coarse.npz", jaxhf.Terrain(random.random((20, 20), np.float32), 8.0, 8.0))
+    jaxhf.save_heights(folder / "prior.npz", jaxhf.Terrain(np.pad(plane, 5, "reflect", reflect_type="odd"), 1, 1, 65, 55))
+    np.save(folder / "prior.npy", plane)
+    np.save(folder / "half.npy", plane[::2, ::3])
+    terrain = 'file = "fine.npz"\n[[objects]]\nshape = "heightfield"\nfile = "coarse.npz"\naround = true'
+    heights = "heights = [[0, 1, 2], [3, 4, 5], [6, 7, 9]]"
+    known = f'[fit]\nprior = {{ heights = "{name}", std = 1 }}\n'
+    found = case(folder, SCENE.replace(heights, terrain) + PICTURE + known)
+    field = found.scenes[0].heightfields[0]
+    ny, nx = field.heights.shape
+    y, x = field.y0 - 60 + np.arange(ny), field.x0 - 70 + np.arange(nx)
+    assert (ny, nx) == (27, 35)  # three and four coarse cells, and the ring
+    expected = y.clip(0, 34)[:, None] + 3 * x.clip(0, 39)
+    np.testing.assert_allclose(found.prior["heights"], expected, atol=1e-4)

@@ -198,6 +198,38 @@ def test_terrain_files_keep_their_place_and_their_holes(tmp_path):
     assert (land.dx, land.dy) == (jaxhf.jacksboro().dx, jaxhf.jacksboro().dy)
 
 
+NESTED = """
+[[objects]]
+shape = "heightfield"
+file = "fine.npz"
+transform = [{ translate = [0, 0, 5] }]
+
+[[objects]]
+shape = "heightfield"
+file = "coarse.npz"
+albedo = 0.2
+around = true
+"""
+
+
+def write_nested(folder):
+    random = np.random.default_rng(0)
+    fine = jaxhf.Terrain(random.random((35, 40), np.float32), 1.0, 1.0, 70.0, 60.0)
+    coarse = jaxhf.Terrain(random.random((20, 20), np.float32), 8.0, 8.0)
+    jaxhf.save_heights(folder / "fine.npz", fine)
+    jaxhf.save_heights(folder / "coarse.npz", coarse)
+    return [terrain.heightfield() for terrain in (fine, coarse)]
+
+
+def test_a_coarser_terrain_goes_on_around_a_heightfield(tmp_path):
+    fields = write_nested(tmp_path)
+    scene = read(tmp_path, CAMERA + NESTED)
+    moved = np.eye(4) + 5 * np.eye(4, k=1) * [[0], [0], [1], [0]]
+    paints = Matte(0.7), Matte(0.2)
+    pairs = zip(jaxhf.nested(*fields), paints, strict=True)
+    assert_same(scene.objects, tuple(jaxhf.Object(field, paint, moved) for field, paint in pairs))
+
+
 # Scenes with one more line in one of their tables.
 field = f'{CAMERA}[[objects]]\nshape = "heightfield"\n{{}}\n'.format
 surface = f"{CAMERA}{FIELD}{{}}\n".format
@@ -218,6 +250,8 @@ world_from_camera = [
 
 EYE = 'type = "perspective"\neye = '
 SLANTED = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 1, 1]]"
+CYLINDER = f'{CAMERA}[[objects]]\nshape = "cylinder"\n'
+AROUND = '[[objects]]\nshape = "heightfield"\nheights = [[0, 0], [0, 0]]\naround = true\n'
 SKY = '[[lights]]\ntype = "sky"\nradiance = 1\n'
 # The text, the line of the mistake (None: no line), and what the message says: one of each rule, where it is kept.
 MISTAKES = [
@@ -274,6 +308,11 @@ MISTAKES = [
     (light('type = "point"\nposition = [0, 0, 1]\nintensity = -3'), 13, "lights[0].intensity must be 0 or more, it is -3"),
     (light(f'type = "directional"\n{BY_DATE.replace("T12", "T23")}'), 12, "time must be one at which the sun is up, its al"),
     (light(f'type = "directional"\n{BY_DATE.replace("Z", "")}'), 12, "time must be a date and time with its offset from UTC"),
+    # Surroundings.
+    (surface("around = true"), 10, "objects[0].around must stand below another heightfield, it is the first"),
+    (f"{CYLINDER}{AROUND}", 11, "objects[1].around must stand below a heightfield, there it is below a cylinder"),
+    (f"{CAMERA}{FIELD}{AROUND}", 13, "objects[1].around: nested: fields must hold 3 cells of the next coarser one each"),
+    (surface(f"{AROUND}transform = [{{ scale = 2 }}]"), 14, "transform must stand without around: it has that of objects[0]"),
     # Other files.
     (field('file = "/etc/passwd"'), 8, "'/etc/passwd' lies outside the scene's folder"),
     (texture('image = "../x.png"'), 11, "textures.t.image: '../x.png' lies outside the scene's folder"),

@@ -145,10 +145,14 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
     length = None if given.prior is None else given.prior.length
     start = _without_holes(np.asarray(first.heights)) if given.start is None else given.start
     heights = make_heights("fit", "start", start, field)
-    free = None
+    free, held = None, np.zeros(heights.shape, bool)
     if given.prior is not None and not np.asarray(numbers(given.prior.std)).all():
         held = np.broadcast_to(np.asarray(numbers(given.prior.std)) == 0, heights.shape)
         heights = np.where(held, make_heights("Prior", "heights", given.prior.heights, field), heights)
+    if field.seam is not None:
+        seam = np.isfinite(np.asarray(field.seam)).all(-1)
+        held, heights = held | seam, np.where(seam, np.asarray(first.heights), heights)
+    if held.any():
         free = pad((~held).astype(np.float64), padding(field, length))
     base = pad(heights, padding(field, length))
     basis = make_basis(field, base, slope_units(base.shape, field.dx, field.dy)[0], free=free)

@@ -5,7 +5,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ....scene.heightfield import Heightfield
 from ...errors import FileError
@@ -25,6 +25,7 @@ class Provenance:
       path: that file.
       like: that, where it is a GeoTIFF whose georeference the heights have: the table moves it by none of dx, dy, x0 and y0.
       z_scale, nodata: of its table, or their defaults.
+      posts: the rows and the columns of its grid that the heightfield has, see `nested`; None: all.
     """
 
     placed: Terrain | None = None
@@ -33,12 +34,32 @@ class Provenance:
     like: Path | None = None
     z_scale: float = 1.0
     nodata: float | None = None
+    posts: tuple[Int[np.ndarray, " ny"], Int[np.ndarray, " nx"]] | None = None
 
     @classmethod
     def of(cls, field: Heightfield, grid: Collection[str] = (), z_scale: float = 1.0) -> "Provenance":
         """That of heights in no file. They have a `crs` if `grid`, the keys of their table, has x0, y0 and the cell size."""
         crs = CoordinateSystem() if {"x0", "y0"} <= set(grid) and not {"dx", "dy"}.isdisjoint(grid) else None
         return cls(Terrain(np.asarray(field.heights), field.dx, field.dy, field.x0, field.y0, crs), z_scale=z_scale)
+
+    def seen_by(self, field: Heightfield) -> "Provenance":
+        """That of a heightfield whose posts are among its own, or go on beyond."""
+        if self.placed is None:
+            return self
+        y, x = ((field.y0 - self.placed.y0) / self.placed.dy, (field.x0 - self.placed.x0) / self.placed.dx)
+        rows, columns = (round(first) + np.arange(n) for first, n in zip((y, x), field.heights.shape, strict=True))
+        return dataclasses.replace(self, posts=(rows, columns))
+
+    def at_posts(self, heights: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "ny nx"]:
+        """Heights over its footprint at the heightfield's posts; beyond, those of its border."""
+        if self.posts is None or self.placed is None:
+            return heights
+        in_cells = CoordinateSystem()
+        own = Terrain(self.placed.heights, crs=in_cells)
+        dy, dx = ((n - 1) / (m - 1) for n, m in zip(own.heights.shape, heights.shape, strict=True))
+        heights = at_vertices(Terrain(heights, dx, dy, crs=in_cells), own)
+        rows, columns = (np.clip(at, 0, n - 1) for at, n in zip(self.posts, heights.shape, strict=True))
+        return heights[rows[:, None], columns[None, :]]
 
     def grid(self, path: Path, other: Terrain) -> Terrain | None:
         """Its grid in coordinates that can be compared with those of `other`, which is the file `path`.
@@ -69,6 +90,7 @@ def known_heights(field: Provenance, deviations: bool, path: Path) -> Float[np.n
         if terrain.crs.degrees and not grid.crs.degrees:
             raise FileError("it must lie in the coordinates of the terrain, it lies in degrees")
         heights = at_vertices(terrain, grid)
+    heights = field.at_posts(heights)
     holes = np.argwhere(np.isnan(heights))
     if len(holes):
         iy, ix = holes[0].tolist()

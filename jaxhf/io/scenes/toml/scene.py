@@ -23,6 +23,7 @@ from ....scene.camera import Camera
 from ....scene.cylinder import Cylinder
 from ....scene.heightfield import Heightfield
 from ....scene.light import Light
+from ....scene.nested import nested
 from ....scene.scene import Object, Scene
 from ....scene.texture import ImageTexture, Wrap
 from ...errors import SceneError, nearest
@@ -70,7 +71,7 @@ def read_samples(part: Part) -> int:
 def read_world(part: Part, dtype: np.dtype) -> tuple[list[Object], list[Light], Provenance]:
     """The objects of a scene with its textures, its lights, and where the first heightfield is from."""
     textures = {name: _texture(part.at("textures", name)) for name in part.table.get("textures", {})}
-    objects = [_object(item, textures, dtype) for item in part.all("objects")]
+    objects = _nested(part.all("objects"), [_object(item, textures, dtype) for item in part.all("objects")])
     known = [field for _, field in objects if field is not None]
     terrain = next((field.stored for field in known if field.stored), None)
     return [item for item, _ in objects], read_lights(part, terrain), known[0] if known else Provenance()
@@ -135,6 +136,35 @@ def _object(part: Part, textures: dict[str, ImageTexture], dtype: np.dtype) -> t
     else:
         shape, known = part.made(Cylinder, **{name: values[name] for name in CYLINDER & values.keys()}), None
     return Object(shape, material, world), known
+
+
+def _nested(parts: list[Part], made: list[tuple[Object, Provenance | None]]) -> list[tuple[Object, Provenance | None]]:
+    """The objects, those that go `around` a heightfield before them fitted to that."""
+    begins = [k for k, part in enumerate(parts) if not part.table.get("around")]
+    if parts and begins[:1] != [0]:
+        raise parts[0].at("around").error(f"{parts[0].at('around').name} must stand below another heightfield, it is the first")
+    for begin, end in zip(begins, [*begins[1:], len(parts)], strict=True):
+        if end - begin == 1:
+            continue
+        place, objects, known = parts[begin + 1].at("around"), *zip(*made[begin:end], strict=True)
+        if any(field is None for field in known):
+            raise place.error(f"{place.name} must stand below a heightfield, there it is below a cylinder")
+        for part, field in zip(parts[begin:end], known, strict=True):
+            crs = field.stored and field.stored.crs
+            if crs and crs.degrees and not {"x0", "y0"} <= part.table.keys():
+                raise place.error(
+                    f"{place.name} must go with files in metres, {part.name} is in degrees (gdalwarp projects it)"
+                )
+            if part is not parts[begin] and (given := part.at_most_one("transform", "matrix")):
+                raise part.at(given).error(
+                    f"{part.at(given).name} must stand without around: it has that of {parts[begin].name}"
+                )
+        fields = place.made(nested, *(item.shape for item in objects))
+        made[begin:end] = [
+            (Object(field, item.material, objects[0].world_from_object), before.seen_by(field))
+            for field, item, before in zip(fields, objects, known, strict=True)
+        ]
+    return made
 
 
 def _painted(part: Part, value: Any, textures: dict[str, ImageTexture]) -> Any:

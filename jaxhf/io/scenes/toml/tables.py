@@ -110,7 +110,7 @@ ORIGINS: dict[str, Keys] = {  # where a heightfield comes from
     "file": {**optional("file", kind=kinds.word), **optional("nodata", kind=kinds.number)},
     "source": optional("source", kind=kinds.word),
 }
-GRID = optional("dx", "dy", "x0", "y0", "z_scale", kind=kinds.number)
+GRID: Keys = {**optional("dx", "dy", "x0", "y0", "z_scale", kind=kinds.number), **optional("around", kind=kinds.flag)}
 CYLINDER = _keys(Cylinder)
 OBJECT: Keys = {
     **optional("shape", "material", kind=kinds.word),
