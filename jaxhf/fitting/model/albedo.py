@@ -38,7 +38,9 @@ def _transformed(rows: Any, columns: Any, values: Float[Array, "ty tx c"]) -> Fl
     return jnp.einsum("ki,ijc,lj->klc", rows, values, columns, precision=lax.Precision.HIGHEST)
 
 
-def make_albedo_field(shape: tuple[int, ...], spacing: tuple[float, float], std: float, length: float, dtype: Any) -> AlbedoField:
+def make_albedo_field(
+    shape: tuple[int, ...], spacing: tuple[float, float], std: float, length: float, dtype: Any
+) -> AlbedoField:
     """The field of these texels or vertices, of spacing (y, x), whose logarithm has this deviation and the correlation
     exp(-distance / length).
 

@@ -52,7 +52,8 @@ def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[
     if view.sky is not None:
         brighter = jnp.exp(view.sky[0])
         lights = tuple(
-            dataclasses.replace(light, radiance=brighter * light.radiance) if isinstance(light, Sky) else light for light in lights
+            dataclasses.replace(light, radiance=brighter * light.radiance) if isinstance(light, Sky) else light
+            for light in lights
         )
     if view.camera is not None:
         world = affine(jnp.asarray(camera.world_from_camera))
