@@ -88,7 +88,9 @@ def least_varying(picture: np.ndarray) -> np.ndarray:
 
 
 def angles(found: jaxhf.Scene) -> tuple[float, float]:
-    east, north, up = np.asarray(found.lights[0].towards, np.float64)
+    sun = found.lights[0]
+    assert isinstance(sun, jaxhf.Directional)
+    east, north, up = np.asarray(sun.towards, np.float64)
     return float(np.degrees(np.arctan2(east, north)) % 360), float(np.degrees(np.arctan2(up, np.hypot(east, north))))
 
 
@@ -108,7 +110,7 @@ def cosines(terrain: jaxhf.Terrain, sun: tuple[float, float]) -> np.ndarray:
 
 def dates(place: tuple[float, float], sun: tuple[float, float]) -> list[str]:
     """When in 2017 the sun stood most like this, before and after midsummer, in UTC."""
-    times = np.arange("2017-01-01T13:00", "2018-01-01", 10, "datetime64[m]")
+    times = np.datetime64("2017-01-01T00:00") + np.timedelta64(10, "m") * np.arange(6 * 24 * 365)
     azimuth, altitude = jaxhf.sun(times, *place)
     off = np.hypot((azimuth - sun[0]) * np.cos(np.radians(sun[1])), altitude - sun[1])
     half = times < np.datetime64("2017-06-21")

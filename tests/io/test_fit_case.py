@@ -52,7 +52,16 @@ noise = 0.02
 draws = 9
 max_steps = 7
 prior = {{ heights = "prior.npy", std = 0.5, length = 4 }}
-unknown = {{ albedo = "map", albedo_std = 0.5, exposures = true, offsets = false, light_std = 1, camera_std = [2, 0.5] }}
+
+[fit.unknown]
+albedo = "map"
+albedo_std = 0.5
+albedo_length = 3
+exposures = true
+offsets = false
+sky_std = 0.7
+light_std = 1
+camera_std = [2, 0.5]
 """
 WHOLE = SCENE + PICTURE
 
@@ -83,7 +92,7 @@ def test_every_key_arrives(folder):
     assert found.settings == jaxhf.Settings(shadows=False, samples=9)
     np.testing.assert_array_equal(found.prior.pop("heights"), np.arange(9).reshape(3, 3))
     assert (found.options, found.prior) == ({"start": 3, "draws": 9, "max_steps": 7}, {"std": 0.5, "length": 4})
-    assert tuple(found.unknown.values()) == ("map", 0.5, 1, True, False, [2, 0.5])
+    assert tuple(found.unknown.values()) == ("map", 0.5, 3, 0.7, 1, True, False, [2, 0.5])
     assert found.unknown.keys() == {field.name for field in dataclasses.fields(jaxhf.Unknown)}
     first, second = found.scenes
     assert first.heights is second.heights
