@@ -132,9 +132,12 @@ def find_sun(run: benchmark.Run, given: Photograph, options: argparse.Namespace)
     for name, angle, truth in zip(("azimuth", "altitude"), sun, SUN, strict=True):
         run.claim(abs(angle - truth) <= OFF, f"the sun's {name} is {angle:.1f}, within {OFF:g} of {truth:g}")
     cosine = cosines(terrain, sun)
-    before, after = (likeness(part, cosine, given.counts) for part in (picture, np.asarray(found.albedo)[::-1, :, 0]))
-    run.row("correlation with n · l", {"picture": before, "albedo": after})
-    run.claim(abs(after) < CORRELATION, f"the albedo's correlation with n · l is {after:.2f}, less than {CORRELATION:g}")
+    albedo = np.asarray(found.albedo)[::-1, :, 0]
+    parts = {"picture": picture, "albedo": albedo, "corrected picture": picture / found.images[0] * albedo}
+    like = {name: likeness(part, cosine, given.counts) for name, part in parts.items()}
+    run.row("correlation with n · l", like)
+    for name in ("albedo", "corrected picture"):
+        run.claim(abs(like[name]) < CORRELATION, f"the {name}'s correlation with n · l is {like[name]:.2f}")
     return sun
 
 

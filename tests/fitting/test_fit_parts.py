@@ -49,7 +49,7 @@ def test_what_is_known_beforehand_counts_in_standard_deviations():
 def test_without_a_prior_long_waves_may_be_high():
     """All heights together by a quarter of the longer side, and waves by less, as 1 / (1 + frequency)²."""
     field, start = jaxhf.Heightfield(np.zeros((9, 13)), dx=0.5, dy=0.5), np.full((9, 13), 2.0)
-    term = make_terms(field, None, jaxhf.Unknown(), start, None, View()).surface
+    term = make_terms(field, None, jaxhf.Unknown(), start, None, View(), None).surface
     wave = np.sqrt(2) * np.cos(np.pi * 3 * (np.arange(13) + 0.5) / 13) * np.ones((9, 1))  # of mean square 1
     for heights, place in ((start + 6 / 4, (0, 0)), (start + 6 / 4 / (1 + 3) ** 2 * wave, (0, 3))):
         residuals = np.array(term.of_surface(jnp.zeros((9, 13)), basis_of(field, heights)))
@@ -62,7 +62,7 @@ def test_errors_of_a_prior_are_correlated_as_whittle_said():
     """Its covariance as a matrix: prior_std at every vertex, and between two of them by the distance in world units."""
     ny, nx, std = 25, 31, np.linspace(1, 3, 25 * 31).reshape(25, 31)
     field = jaxhf.Heightfield(np.zeros((ny, nx)), dx=0.5, dy=1.0)
-    term = make_terms(field, jaxhf.Prior(0.0, std, 3.0), jaxhf.Unknown(), np.zeros((ny, nx)), None, View()).surface
+    term = make_terms(field, jaxhf.Prior(0.0, std, 3.0), jaxhf.Unknown(), np.zeros((ny, nx)), None, View(), None).surface
     basis = basis_of(field, np.asarray(term.mean, np.float64))
     still = jnp.zeros(term.mean.shape)
     rows = jax.jacfwd(lambda modes: term.of_surface(modes, basis))(still).reshape(still.size, -1)
