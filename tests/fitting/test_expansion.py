@@ -27,8 +27,8 @@ CAMERAS = [
     for eye, width in (((0.6, -0.8, 0.9), 37), ((-0.6, 0.3, 1.1), 30))
 ]
 TEXELS = np.random.default_rng(1).uniform(0.2, 0.9, (3, 4, 3))
-KNOWN_LAW = jaxhf.Unknown(albedo="map", exposures=True, offsets=True, light_std=1.0, camera_std=(0.1, 1.0))
-EVERYTHING = dataclasses.replace(KNOWN_LAW, sky_std=1.0, material_std={"limb": 0.2})
+KNOWN_LAW = jaxhf.Unknown(albedo="map", exposures=True, offsets=True, light_std=1.0, camera_std=(0.1, 1.0), sky_std=0.5)
+EVERYTHING = dataclasses.replace(KNOWN_LAW, material_std={"limb": 0.2})
 ROUNDING = {"single": 2e-4, "double": 1e-10}  # of the largest value: sums of some hundred terms that are rounded
 
 

@@ -66,7 +66,7 @@ def test_heights_are_held_where_the_surface_goes_on():
 def test_without_a_prior_long_waves_may_be_high():
     """All heights together by a quarter of the longer side, and waves by less, as 1 / (1 + frequency)²."""
     field, start = jaxhf.Heightfield(np.zeros((9, 13)), dx=0.5, dy=0.5), np.full((9, 13), 2.0)
-    term = make_terms(field, None, jaxhf.Unknown(), start, None, View()).surface
+    term = make_terms(field, None, jaxhf.Unknown(), start, None, View(), None).surface
     wave = np.sqrt(2) * np.cos(np.pi * 3 * (np.arange(13) + 0.5) / 13) * np.ones((9, 1))  # of mean square 1
     for heights, place in ((start + 6 / 4, (0, 0)), (start + 6 / 4 / (1 + 3) ** 2 * wave, (0, 3))):
         residuals = np.array(term.of_surface(jnp.zeros((9, 13)), basis_of(field, heights)))
@@ -79,7 +79,7 @@ def test_errors_of_a_prior_are_correlated_as_whittle_said():
     """Its covariance as a matrix: prior_std at every vertex, and between two of them by the distance in world units."""
     ny, nx, std = 25, 31, np.linspace(1, 3, 25 * 31).reshape(25, 31)
     field = jaxhf.Heightfield(np.zeros((ny, nx)), dx=0.5, dy=1.0)
-    term = make_terms(field, jaxhf.Prior(0.0, std, 3.0), jaxhf.Unknown(), np.zeros((ny, nx)), None, View()).surface
+    term = make_terms(field, jaxhf.Prior(0.0, std, 3.0), jaxhf.Unknown(), np.zeros((ny, nx)), None, View(), None).surface
     basis = basis_of(field, np.asarray(term.mean, np.float64))
     still = jnp.zeros(term.mean.shape)
     rows = jax.jacfwd(lambda modes: term.of_surface(modes, basis))(still).reshape(still.size, -1)
@@ -261,7 +261,7 @@ REFUSED: dict[str, list[dict[str, Any]]] = {  # the argument that is to be named
     "targets[2]": [{"targets": [*BLACK[:2], np.where(np.arange(SIZE) == 2, np.nan, BLACK[0])]}],
     "weights": [{"weights": [None]}, {"weights": 1.0}],
     "weights[0]": [{"weights": [w, None, None]} for w in (np.ones(3), np.zeros((SIZE, SIZE)), "mask.png")],
-    "noise": [{"noise": noise} for noise in (0, "low", np.ones((24, 24)))],
+    "noise": [*({"noise": noise} for noise in (0, "low", np.ones((24, 24)))), unknown(albedo="map", albedo_length=0.1)],
     "prior": [{"prior": TRUTH}],
     "heights": [prior(heights="map.tif"), prior(heights=lambda: 3), prior(heights=np.array([[0.0, np.nan], [0.0, 0.0]]))],
     "std": [prior(std=std) for std in (np.ones((5, 5)), -21, 0, "low", np.inf)],
@@ -272,6 +272,8 @@ REFUSED: dict[str, list[dict[str, Any]]] = {  # the argument that is to be named
     "unknown": [{"unknown": "albedo"}],
     "albedo": [unknown(albedo="known")],
     "albedo_std": [unknown(albedo_std=2), unknown(albedo="map", albedo_std=0)],
+    "albedo_length": [unknown(albedo_length=0.1), unknown(albedo="map", albedo_length=0)],
+    "sky_std": [unknown(sky_std=0), unknown(sky_std=1)],
     "light_std": [unknown(light_std=0), unknown(light_std=60), {"scenes": lambda: lamps(), **unknown(light_std=1)}],
     "material_std": [
         *(unknown(material_std=std) for std in ({}, "limb", {"limb": 0})),

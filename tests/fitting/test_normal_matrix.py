@@ -129,10 +129,12 @@ def test_blocks_solve_with_a_matrix_over_a_grid(monkeypatch):
     assert len(iterations) < 13  # 318 without it
 
 
+FIELD = jaxhf.Unknown(albedo="map", albedo_std=0.3, albedo_length=0.2, exposures=True, light_std=1.0)
 DRAWS = {
     "by factors": {"prior": PRIORS["correlated, some held"]},
     "by modes": {"prior": PRIORS["independent, some held"]},
     "everything": {"prior": PRIORS["correlated"], "unknown": EVERYTHING},
+    "field of the albedo map": {"prior": PRIORS["correlated"], "unknown": FIELD},
     "map of the albedo": {"prior": PRIORS["correlated"], "unknown": jaxhf.Unknown(albedo="map", exposures=True)},
 }
 

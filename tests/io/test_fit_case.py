@@ -53,7 +53,6 @@ draws = 9
 max_steps = 7
 prior = {{ heights = "prior.npy", std = 0.5, length = 4 }}
 
-
 [fit.unknown]
 albedo = "map"
 albedo_std = 0.5

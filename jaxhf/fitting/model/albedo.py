@@ -38,14 +38,12 @@ def _transformed(rows: Any, columns: Any, values: Float[Array, "ty tx c"]) -> Fl
     return jnp.einsum("ki,ijc,lj->klc", rows, values, columns, precision=lax.Precision.HIGHEST)
 
 
-def make_albedo_field(
-    shape: tuple[int, ...], spacing: tuple[float, float], std: float, length: float, dtype: Any
-) -> AlbedoField:
+def make_albedo_field(shape: tuple[int, ...], spacing: tuple[float, ...], std: float, length: float, dtype: Any) -> AlbedoField:
     """The field of these texels or vertices, of spacing (y, x), whose logarithm has this deviation and the correlation
     exp(-distance / length).
 
-    That is Matérn's of smoothness 1/2, as patches with sharp borders have it: amplitudes go as (1 + (length · frequency)²)^(-3/4)
-    (Whittle, 1954). Heights are smoother.
+    That is Matérn's of smoothness 1/2, as patches with sharp borders have it; heights are smoother. The amplitudes of its modes
+    go as (1 + (length · frequency)²)^(-3/4).
     """
     steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, spacing, strict=True)]
     amplitude = (1 + length**2 * (steps[0][:, None] + steps[1][None, :])) ** -0.75

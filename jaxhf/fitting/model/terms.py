@@ -64,7 +64,7 @@ def make_terms(
     view_unit: View,
     albedo: AlbedoField | None,
 ) -> Terms:
-    """The priors of a fit from `start`, which is padded; `free` is that of `Basis`, `view_unit` and `albedo` those of `Problem`.
+    """The priors of a fit from `start`, which is padded; `free` is `Basis`'s, `view_unit` and `albedo` are `Problem`'s.
 
     Factors have their mean 1, offsets 0, and what else is not told the deviation 1.
     """
@@ -91,7 +91,7 @@ def make_terms(
         deviations = np.array([position] * 3 + [math.radians(rotation)] * 3, dtype)
         others.append(term(none, (view_unit.camera / deviations)[None]))
     if view_unit.sky is not None and unknown.sky_std is not None:
-        others.append(term(none, view_unit.sky / unknown.sky_std))
+        others.append(term(none, (view_unit.sky / unknown.sky_std)[None]))
     if view_unit.material is not None:  # whose unit is its deviation
         others.append(term(none, one))
     return Terms(surface, tuple(others))

@@ -54,11 +54,8 @@ def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[
         towards = light.towards + view.light[0] * first + view.light[1] * second
         lights = tuple(dataclasses.replace(light, towards=towards) if other is light else other for other in lights)
     if view.sky is not None:
-        brighter = jnp.exp(view.sky[0])
-        lights = tuple(
-            dataclasses.replace(light, radiance=brighter * light.radiance) if isinstance(light, Sky) else light
-            for light in lights
-        )
+        times = jnp.exp(view.sky[0])
+        lights = tuple(_brighter(light, times) if isinstance(light, Sky) else light for light in lights)
     if view.camera is not None:
         world = affine(jnp.asarray(camera.world_from_camera))
         # Cayley's transform, of half the angle's tangent: for the angle itself that has no singular derivative at zero, and
@@ -76,6 +73,10 @@ def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[
         matrix = jnp.asarray(camera.world_from_camera).at[:3].set(jnp.stack(columns, axis=1))
         camera = eqx.tree_at(lambda camera: camera.world_from_camera, camera, matrix)
     return lights, camera
+
+
+def _brighter(sky: Sky, times: Any) -> Sky:
+    return dataclasses.replace(sky, radiance=times * jnp.asarray(sky.radiance))
 
 
 def with_numbers(material: Any, view: View) -> Any:

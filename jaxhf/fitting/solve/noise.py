@@ -71,8 +71,8 @@ def _spread(left: Float[np.ndarray, " n"]) -> float:
 
 
 def explains_noise(problem: Problem) -> bool:
-    """Whether heights may explain so much of the noise that degrees of freedom count; not where an `AlbedoField`, which explains
-    most of it, is sought besides."""
+    """Whether heights may explain so much of the noise that degrees of freedom count; not beside an `AlbedoField`, which
+    explains most of it."""
     return problem.albedo is None and problem.field.heights.size > _LEAST_SHARE * problem.values
 
 
