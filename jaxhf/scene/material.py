@@ -205,7 +205,7 @@ class Hapke(Material):
 
 
 # By the names that files and commands have for them; the first field of each is a colour or a texture.
-SCATTERING: dict[str, type[Material]] = {
+SCATTERING: dict[str, Callable[..., Material]] = {
     "matte": Matte,
     "lommel-seeliger": LommelSeeliger,
     "lunar-lambert": LunarLambert,

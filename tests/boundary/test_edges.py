@@ -366,7 +366,7 @@ def flows_at(scene: jaxhf.Scene, s: float) -> tuple[jax.Array, jax.Array]:
         )
         sample, fold, beyond = pass_edge(world, camera, sample)
         segment = boundary_segment(world, camera, sample, fold)
-        parts = [radiance_jump(world, sample, fold, beyond, segment.valid, jnp.asarray(k, jnp.int32)) for k in (0, 1)]
+        parts = [radiance_jump(world, camera, sample, fold, beyond, segment.valid, jnp.asarray(k, jnp.int32)) for k in (0, 1)]
         return (parts[0] + parts[1])[0] * segment.across
 
     starts = jnp.tile(vertices, (6, 1))

@@ -76,8 +76,10 @@ def by_render(expansion: Expansion, unknown: jaxhf.Unknown, surface: jax.Array, 
         (k,) = group.indices
         scene = eqx.tree_at(lambda scene: scene.heightfields[0].heights, scene_of(k, crowded, unknown), surface)
         texture = jaxhf.ImageTexture(jnp.asarray(TEXELS, surface.dtype) * others.albedo)
-        moved_limb = 0.0 if others.view.material is None else others.view.material[0, 0] * problem.view_unit.material[0]
-        painted = paint(texture, unknown, 0.4 + moved_limb)
+        limb, limbs, unit = 0.4, others.view.material, problem.view_unit.material
+        if limbs is not None and unit is not None:
+            limb = limb + limbs[0, 0] * unit[0]
+        painted = paint(texture, unknown, limb)
         scene = eqx.tree_at(lambda scene: scene.objects[int(crowded)].material, scene, painted)
         own = dataclasses.replace(others.view, material=None), dataclasses.replace(problem.view_unit, material=None)
         view = jax.tree.map(lambda values, unit, k=k: values[k] * unit, *own)

@@ -207,8 +207,8 @@ def _moves(unknowns: Unknowns, problem: Problem, group: Group) -> View:
 
 def _common(unknowns: Unknowns, problem: Problem) -> View:
     """By what a material's numbers are moved in all pictures."""
-    material = unknowns.view.material
-    return KNOWN if material is None else View(material=material[0] * problem.view_unit.material, names=unknowns.view.names)
+    material, unit = unknowns.view.material, problem.view_unit.material
+    return KNOWN if material is None or unit is None else View(material=material[0] * unit, names=unknowns.view.names)
 
 
 def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:

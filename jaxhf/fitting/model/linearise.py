@@ -183,8 +183,8 @@ class _Seen(NamedTuple):
 
     def moved(self, view: View) -> tuple[World, Camera]:
         """The world and its camera with other such numbers."""
-        *seen, material = self.given
-        lights, camera = moved(*seen, view)
+        lights, camera, material = self.given
+        lights, camera = moved(lights, camera, view)
         return _with_material(dataclasses.replace(self.world, lights=lights), material, view), camera
 
     def view_for(self, count: int) -> View:

@@ -213,12 +213,16 @@ def _view_unit(scenes: Sequence[Scene], unknown: Unknown) -> View:
     material = jnp.asarray([(unknown.material_std or {})[name] for name in names], dtype) if names else None
     for k, scene in enumerate(scenes):
         kind = scene.objects[scene.first_heightfield].material
+        known = [field.name for field in dataclasses.fields(kind) if _is_number(getattr(kind, field.name))]
         for name in names:
-            if np.shape(getattr(kind, name, None)) != () or getattr(kind, name, None) is None:
-                known = [field.name for field in dataclasses.fields(kind) if np.shape(getattr(kind, field.name)) == ()]
+            if name not in known:
                 rule = f"must name numbers of the material of scenes[{k}], {type(kind).__name__}: {known}; it names {name!r}"
                 raise ArgumentError("Unknown", "material_std", rule)
     return View(light, camera, sky, material, names)
+
+
+def _is_number(leaf: Any) -> bool:
+    return isinstance(leaf, np.ndarray | jax.Array) and leaf.shape == ()
 
 
 def _albedo_field(field: Heightfield, unknowns: Unknowns, unknown: Unknown) -> AlbedoField | None:
