@@ -106,7 +106,11 @@ def _fields(whole: Heightfield, terrain: Float[np.ndarray, "my mx"], window: Win
     part = around[window.place].copy()
     around[window.y + 1 : window.y + window.ny - 1, window.x + 1 : window.x + window.nx - 1] = np.nan
     corner = whole.x0 + window.x * whole.dx, whole.y0 + window.y * whole.dy
-    return Heightfield(part, whole.dx, whole.dy, *corner), Heightfield(around, whole.dx, whole.dy, whole.x0, whole.y0)
+    seam = None if whole.seam is None else np.asarray(whole.seam)
+    return (
+        Heightfield(part, whole.dx, whole.dy, *corner, None if seam is None else seam[window.place]),
+        Heightfield(around, whole.dx, whole.dy, whole.x0, whole.y0, seam),
+    )
 
 
 def _with_surroundings(scene: Scene, part: Heightfield, around: Heightfield, window: Window) -> Scene:

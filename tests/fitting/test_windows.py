@@ -7,7 +7,7 @@ import pytest
 
 import jaxhf
 from jaxhf.fitting import windows as _windows
-from jaxhf.fitting.cropped import Window, cropped
+from jaxhf.fitting.cropped import Window, _fields, cropped
 from jaxhf.fitting.windows import divided, fit_windows
 from jaxhf.scene.procedural import fractal
 
@@ -82,6 +82,16 @@ def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
         np.testing.assert_allclose(np.asarray(shown)[counts], part.target[counts], rtol=0, atol=2e-5)
         assert 0.25 < (counts & (number == 0)).sum() / (number == 0).sum() < 1
         assert not (counts & (number == 1)).any()
+
+
+def test_a_window_at_a_seam_has_its_part_of_it():
+    """So that its heights are held there, as those of the whole terrain."""
+    region = jaxhf.Heightfield(np.zeros((20, 20), np.float32), 8 / (SIDE - 1), x0=2.7, y0=-2.3)
+    terrain, _ = jaxhf.nested(jaxhf.Heightfield(TRUTH, x0=3.0, y0=-2.0), region)
+    window = Window(0, 4, 12, 12)
+    part, around = _fields(terrain, np.asarray(terrain.heights), window)
+    np.testing.assert_array_equal(part.seam, np.asarray(terrain.seam)[window.place])
+    np.testing.assert_array_equal(around.seam, terrain.seam)
 
 
 @pytest.mark.slow

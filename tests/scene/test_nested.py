@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.ndimage
 
 import jaxhf
 from jaxhf.fitting.model.defaults import choose_edge_samples
@@ -115,6 +116,35 @@ def test_the_fine_terrain_sees_as_much_of_the_sky_as_on_one_grid():
     change = np.random.default_rng(1).normal(size=fine.heights.shape) * ~seam_of(fine)  # which lies on the other's edges
     forward = jax.jvp(total, (fine.heights,), (jnp.asarray(change, jnp.float32),))[1]
     np.testing.assert_allclose(jnp.vdot(jax.grad(total)(fine.heights), change), forward, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_a_fit_explains_shadows_from_beyond():
+    """To the noise, of pictures of one grid; without surroundings residuals there are many times as large."""
+    inner, outer, fine, _, whole = terrains()
+    random, noise, middle = np.random.default_rng(1), 0.01, FIRST + COUNT / 2
+    camera = jaxhf.Orthographic.look_at((middle, middle, 500), (middle, middle, 0), (0, 1, 0), COUNT - 4, width=36, height=36)
+    suns = [jaxhf.Directional.from_angles(azimuth, 10) for azimuth in (30, 150, 270)]
+
+    def seen(sun, *fields):
+        return np.asarray(jaxhf.render(scene(*fields, camera=camera, lights=[sun]), jaxhf.Settings(samples=16)))[..., 0]
+
+    exact = [seen(sun, whole) for sun in suns]
+    targets = [picture + noise * random.standard_normal(picture.shape) for picture in exact]
+    truth = np.asarray(fine.heights)[1:-1, 1:-1]
+    alone = dataclasses.replace(inner, heights=jnp.asarray(truth))
+    beyond = [np.abs(seen(sun, alone) - picture) > 0.03 for sun, picture in zip(suns, exact, strict=True)]
+    assert max(where.mean() for where in beyond) > 0.05
+    smooth = scipy.ndimage.gaussian_filter(truth, 3, mode="nearest")
+    std = float(np.sqrt(np.mean((smooth - truth) ** 2)))
+    fields = jaxhf.nested(dataclasses.replace(inner, heights=jnp.asarray(smooth)), outer)
+    scenes = [scene(*fields, camera=camera, lights=[sun]) for sun in suns]
+    found = jaxhf.fit(scenes, targets, prior=jaxhf.Prior(fields[0].heights, std, length=2.1), noise=noise)
+    held = seam_of(fields[0])
+    np.testing.assert_array_equal(np.asarray(found.heights)[held], np.asarray(fields[0].heights)[held])
+    left = np.concatenate([np.asarray(off)[where] for off, where in zip(found.residuals, beyond, strict=True)])
+    assert np.sqrt(np.mean(left**2)) < 1.5 * noise
+    assert np.sqrt(np.mean((np.asarray(found.heights)[1:-1, 1:-1] - truth) ** 2)) < 0.6 * std
 
 
 def places_on_seam(count, seed=0):
