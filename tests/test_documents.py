@@ -33,6 +33,7 @@ NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 SLOW = {"docs/gallery.md", "docs/tutorials/photographs.md"}  # minutes; what the latter finds has a test of its own
 DEEP = {  # over four seconds of a processor
     "README.md",
+    "docs/coming-from/asp.md",
     "docs/coming-from/gdal.md",
     "docs/coming-from/mitsuba.md",
     "docs/index.md",
