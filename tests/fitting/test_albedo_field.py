@@ -47,7 +47,8 @@ def weights() -> np.ndarray:
 
 
 def test_the_logarithm_has_the_deviation_and_correlation_that_are_said():
-    known = field()
+    length = 0.15
+    known = make_albedo_field((SIDE, SIDE), (CELL, CELL), STD, length, np.float32)
     basis = np.asarray(jax.vmap(lambda modes: jnp.log(known.factors(modes)))(jnp.eye(SIDE**2).reshape(-1, SIDE, SIDE, 1)))
     basis = basis.reshape(SIDE**2, SIDE, SIDE) / np.asarray(known.weight).reshape(-1, 1, 1)
     variance = np.sum(basis**2, axis=0)
@@ -55,7 +56,7 @@ def test_the_logarithm_has_the_deviation_and_correlation_that_are_said():
     middle = basis[:, SIDE // 2, SIDE // 2]
     for cells in (2, 4, 8):  # the grid ends three lengths from here, and is mirrored there
         found = middle @ basis[:, SIDE // 2, SIDE // 2 + cells] / variance[SIDE // 2, SIDE // 2]
-        assert found == pytest.approx(np.exp(-cells * CELL / LENGTH), abs=0.06)
+        assert found == pytest.approx(np.exp(-cells * CELL / length), abs=0.06)
     factors = jnp.asarray(painted(0))
     np.testing.assert_allclose(known.factors(known.modes(factors)), factors, rtol=1e-4)
 

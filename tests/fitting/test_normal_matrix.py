@@ -129,7 +129,7 @@ def test_blocks_solve_with_a_matrix_over_a_grid(monkeypatch):
     assert len(iterations) < 13  # 318 without it
 
 
-FIELD = jaxhf.Unknown(albedo="map", albedo_std=0.3, albedo_length=0.2, exposures=True, light_std=1.0)
+FIELD = jaxhf.Unknown(albedo="map", albedo_std=0.3, albedo_length=0.2, exposures=True)
 DRAWS = {
     "by factors": {"prior": PRIORS["correlated, some held"]},
     "by modes": {"prior": PRIORS["independent, some held"]},

@@ -1,11 +1,10 @@
 """What about inverts the normal matrix of a fit: factors of a sparse matrix near to it, or of its blocks."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
@@ -53,14 +52,7 @@ def near_inverse(matrix: NormalMatrix) -> Callable[[Flat], Flat]:
       matrix: one that has rows.
     """
     shape, count = matrix.shape, int(np.prod(matrix.shape))
-    many, field = matrix.size - count > MOST_OTHERS, matrix.expansion.problem.albedo
-    diagonal, left = None, 1.0
-    if many:
-        draws = [matrix.gathered(matrix.drawn(seed))[count:] for seed in range(_PROBES)]
-        diagonal = np.maximum(np.mean(np.square(draws), axis=0), matrix.others_weight**2)
-        if field is not None:
-            diagonal, left = _beside_field(matrix, draws)
-    weighted = scaled(matrix.rows, np.sqrt(left) * matrix.roots)
+    weighted = scaled(matrix.rows, matrix.roots)
     weighted = sp.csr_array((weighted.data, matrix.inside[weighted.indices], weighted.indptr), shape=(weighted.shape[0], count))
     weight = sp.diags_array(np.broadcast_to(matrix.weight, shape).ravel())
     precision = np.broadcast_to(matrix.spectrum**2, shape)
@@ -68,20 +60,14 @@ def near_inverse(matrix: NormalMatrix) -> Callable[[Flat], Flat]:
     free = np.broadcast_to(matrix.free, shape).ravel()
     near = sp.diags_array(free) @ near @ sp.diags_array(free) + sp.diags_array(1 - free)
     solve = _inverse(near.tocsr(), shape)
+    many = matrix.size - count > MOST_OTHERS
 
     def by_heights(x: Flat) -> Flat:
         return free * solve(free * x)
 
-    if diagonal is not None and field is not None:
-
-        def eliminated(x: Flat) -> Flat:
-            others = x[count:] / diagonal
-            heights = by_heights(x[:count] - matrix.product(np.concatenate([np.zeros(count), others]))[:count])
-            moved = matrix.product(np.concatenate([heights, np.zeros(others.size)]))[count:]
-            return np.concatenate([heights, others - moved / diagonal])
-
-        return eliminated
-    if diagonal is not None:
+    if many:
+        draws = [matrix.gathered(matrix.drawn(seed))[count:] for seed in range(_PROBES)]
+        diagonal = np.maximum(np.mean(np.square(draws), axis=0), matrix.others_weight**2)
         return lambda x: np.concatenate([by_heights(x[:count]), x[count:] / diagonal])
     columns = [
         matrix.product(row.astype(np.float64)) for row in (np.arange(matrix.size) == k for k in range(count, matrix.size))
@@ -96,18 +82,6 @@ def near_inverse(matrix: NormalMatrix) -> Callable[[Flat], Flat]:
         return np.concatenate([heights - moved @ others, others])
 
     return inverse
-
-
-def _beside_field(matrix: NormalMatrix, draws: Sequence[Flat]) -> tuple[Flat, float]:
-    """About the diagonal of the part of an `AlbedoField` and what else is sought besides heights, and the share of what the
-    pictures tell that is left for these when the field explains what it can; `draws`: of their gradients, whose mean squares
-    are noisy one by one, but which pictures make the same for all modes."""
-    squares = np.mean(np.square(draws), axis=0)
-    field = in_row(jax.tree.leaves(jax.tree.map(lambda leaf: np.full(leaf.shape, leaf.ndim == 3), matrix.sought)))
-    prior = matrix.others_weight**2
-    told = max(float(np.mean(squares[field > 0] - prior[field > 0])), 0.0)
-    diagonal = np.where(field > 0, told + prior, np.maximum(squares, prior))
-    return diagonal, float(np.mean(prior[field > 0] / diagonal[field > 0]))
 
 
 def _inverse(near: Sparse, shape: tuple[int, ...]) -> Callable[[Flat], Flat]:

@@ -70,7 +70,6 @@ class NormalMatrix:
             at = np.meshgrid(*at, indexing="ij")
             self.spectrum = scipy.ndimage.map_coordinates(self.spectrum, at, order=1, mode="nearest")
             self.inside, sought, besides = np.arange(self.off.size), (), []
-        self.sought = sought
         others, self.unflat = jax.flatten_util.ravel_pytree(sought)
         self.others_weight = in_row([np.broadcast_to(np.asarray(term.weight), values.shape) for term, values in besides])
         self.others_off = in_row([np.asarray(term.residual(values)) for term, values in besides])

@@ -139,9 +139,7 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
     else:
         units, curvature, others = balanced(here.of(widened(posed, told.widths / state.widths)).with_noise(told.noise))
         step_size = 1 / (FIRST_DAMPING * curvature)
-        if (
-            place is not None and posed.albedo is not None
-        ):  # what that can undo curves the loss less, and exponents more: λ goes on
+        if place is not None and posed.albedo is not None:  # what that can undo curves the loss less: λ goes on
             step_size = float(state.step_size)
     begin = state.unknowns.at_base()
     following = dataclasses.replace(

@@ -18,7 +18,6 @@ from .boundaries import Boundaries
 
 _TOLERANCE = 1e-5  # of a draw's linear problem; the draw is then right to a thousandth
 _NEAR_TOLERANCE = 1e-4  # the same, with an inverse that is near
-_FIELD_TOLERANCE = 1e-3  # the same beside an `AlbedoField`, whose products are in single precision: it is right to a hundredth
 
 
 class Deviations(NamedTuple):
@@ -60,8 +59,6 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
     """
     matrix = robust_matrix(expansion)
     boundaries, tolerance = (None, _TOLERANCE) if matrix.rows is None else (Boundaries(expansion, matrix.rows), _NEAR_TOLERANCE)
-    if expansion.problem.albedo is not None:
-        tolerance = _FIELD_TOLERANCE
     changes, begin = [], time.perf_counter()
     try:
         while len(changes) < count:
