@@ -83,10 +83,9 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     search: Any
     verbose: Callable[..., None]
 
-    def __init__(self, rejections: int, others: Any, problem: Problem):
+    def __init__(self, rejections: int, others: Any, exactly: tuple[float, int] = (_TOLERANCE, _ITERATIONS)):
         self.rtol = self.atol = 0.0  # when a fit ends, `run` decides
         self.norm = optx.rms_norm
-        exactly = (_TOLERANCE, _ITERATIONS) if problem.albedo is None else (_FIELD_TOLERANCE, _FIELD_ITERATIONS)
         self.descent = ConjugateGradients(*exactly, others)
         self.search = optx.ClassicalTrustRegion(
             high_cutoff=_GOOD,
@@ -137,7 +136,7 @@ def first_position(expansion: Expansion) -> Any:
 
     def first(expansion: Expansion) -> Any:
         others = expansion.unknowns.without_modes()
-        solver, about = LevenbergMarquardt(0, others, expansion.problem), (expansion.problem, expansion.linearised)
+        solver, about = LevenbergMarquardt(0, others), (expansion.problem, expansion.linearised)
         shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, about)
         return solver.init(residuals, expansion.unknowns, about, _OPTIONS, shape, None, _TAGS)
 
@@ -165,7 +164,8 @@ def advance(
       expansion: at `position.y_eval`.
       rejections: how many steps before were rejected in a row.
     """
-    solver = LevenbergMarquardt(rejections, others, expansion.problem)
+    exactly = (_TOLERANCE, _ITERATIONS) if expansion.problem.albedo is None else (_FIELD_TOLERANCE, _FIELD_ITERATIONS)
+    solver = LevenbergMarquardt(rejections, others, exactly)
     of_j, rest = _of_j(position)
     kept = on_every_device((solver, unknowns, rest, expansion), expansion.problem.mesh)
     return _advance(kept, divided(of_j, expansion.problem.mesh))
