@@ -97,7 +97,7 @@ def rounded_clamp(cosine: Scalar) -> Scalar:
     return jnp.where(cosine < GRAZING, (low + GRAZING) * (low + GRAZING) / (4 * GRAZING), cosine)
 
 
-def root(x: Scalar) -> Scalar:
+def root(x: Float[jax.Array, "*shape"]) -> Float[jax.Array, "*shape"]:
     """The square root of a number that is not negative, with derivative 0 at 0."""
     positive = x > 0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)

@@ -100,7 +100,7 @@ class Perspective(Record):
         return cls(xp.concatenate([columns, pose[3:]]), fov, width=width, height=height)
 
     @classmethod
-    def from_points(cls, points: Any, pixels: Any, *, width: int, height: int, max_error: float = 1.0) -> "Perspective":
+    def from_points(cls, points: Any, pixels: Any, *, width: int, height: int, max_error: float | int = 1.0) -> "Perspective":
         """The camera that sees known points at known pixels: a pinhole's resection, by least squares in double precision.
 
         It takes all that a pinhole may be, in 11 numbers: place, direction, focal length, principal point, pixels that are not
@@ -123,7 +123,7 @@ class Perspective(Record):
 
     @classmethod
     def from_rpc(
-        cls, rpcs: Any, terrain: Any, *, width: int, height: int, geoid: float = 0.0, max_error: float = 0.05
+        cls, rpcs: Any, terrain: Any, *, width: int, height: int, geoid: float | int = 0.0, max_error: float | int = 0.05
     ) -> "Perspective":
         """The pinhole that sees a terrain where the RPC model of a satellite's picture does (NIMA, STDI-0002, 2000, RPC00B).
 
@@ -235,7 +235,7 @@ class Orthographic(Record):
         return cls(look_at_pose(eye, target, up), extent, width=width, height=height)
 
     @classmethod
-    def from_points(cls, points: Any, pixels: Any, *, width: int, height: int, max_error: float = 1.0) -> "Orthographic":
+    def from_points(cls, points: Any, pixels: Any, *, width: int, height: int, max_error: float | int = 1.0) -> "Orthographic":
         """The camera that sees at least four known points at known pixels by parallel rays, which may be oblique.
 
         Arguments and errors are those of `Perspective.from_points`. For pictures from so far away that errors of pixels hide

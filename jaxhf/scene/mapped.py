@@ -20,7 +20,7 @@ _THIN = 0.01  # of a box: the least height in which a camera is fitted, so that 
 
 
 def resected_rpc(
-    rpcs: Any, terrain: Any, width: int, height: int, geoid: float, max_error: float
+    rpcs: Any, terrain: Any, width: int, height: int, geoid: float | int, max_error: float | int
 ) -> tuple[Float[np.ndarray, "4 4"], float]:
     """The matrix and the angle of view of the pinhole nearest to an RPC model, see `Perspective.from_rpc`."""
     owner = "from_rpc"

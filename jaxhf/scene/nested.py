@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError, require_kind
 from ..core.rules import Whole, require
@@ -84,7 +84,7 @@ class _Along(NamedTuple):
         """Where these stand among the coarse ones, and one more before and after them: the ring."""
         return self.before + np.arange(-1, self.cells * self.times + 2) / self.times
 
-    def inwards(self) -> Float[np.ndarray, " n"]:
+    def inwards(self) -> Int[np.ndarray, " n"]:
         """By how many cells those are inside the seam; -1 on the ring."""
         numbers = np.arange(-1, self.cells * self.times + 2)
         return np.minimum(numbers, numbers[::-1])

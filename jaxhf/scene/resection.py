@@ -17,7 +17,9 @@ _UNDECIDED = 1e-9  # of the largest singular value: smaller ones are roundings
 _PARALLEL = 1e-10  # of the mean depth: smaller differences of depth are roundings
 
 
-def resected(points: Any, pixels: Any, width: int, height: int, max_error: float) -> tuple[Float[np.ndarray, "4 4"], float]:
+def resected(
+    points: Any, pixels: Any, width: int, height: int, max_error: float | int
+) -> tuple[Float[np.ndarray, "4 4"], float]:
     """The matrix and the angle of view of the pinhole that sees points at these pixels, see `Perspective.from_points`.
 
     The direct linear transform of normalised coordinates is the start of the least squares of distances in the picture
@@ -49,7 +51,7 @@ def resected(points: Any, pixels: Any, width: int, height: int, max_error: float
 
 
 def resected_in_parallel(
-    points: Any, pixels: Any, width: int, height: int, max_error: float
+    points: Any, pixels: Any, width: int, height: int, max_error: float | int
 ) -> tuple[Float[np.ndarray, "4 4"], float]:
     """The matrix and the extent of the camera whose parallel rays see points at these pixels, by linear least squares.
 
@@ -108,7 +110,7 @@ def _deviations(name: str, given: np.ndarray, rule: str) -> np.ndarray:
     return turn.T * sizes / np.sqrt(len(given))
 
 
-def _require_close(seen: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"], max_error: float) -> float:
+def _require_close(seen: Float[np.ndarray, "n 2"], pixels: Float[np.ndarray, "n 2"], max_error: float | int) -> float:
     """The root mean square of distances in the picture."""
     require(_OWNER, "max_error", max_error, POSITIVE)
     off = np.linalg.norm(seen - pixels, axis=1)

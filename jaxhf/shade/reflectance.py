@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from ..core.types import Flag, Vector
+from ..core.types import Flag, Scalar, Vector
 from ..core.vector import dot, greater, quotient, select
 from ..preparation.world import World
 from ..scene.material import Material, Matte, map_textures
@@ -62,7 +62,7 @@ def brdf_under_sky(world: World, wo: Vector, hit: Hit) -> Vector:
     dtype = hit.ns.dtype
     n = hit.ns * hit.side.astype(dtype)
 
-    def look(seen: tuple[Vector, Vector], node: tuple[jax.Array, jax.Array]) -> tuple[tuple[Vector, Vector], None]:
+    def look(seen: tuple[Vector, Scalar], node: tuple[Vector, Scalar]) -> tuple[tuple[Vector, Scalar], None]:
         (total, whole), (wi, weight) = seen, node
         cosine = dot(wi, n)
         weight = weight * greater(cosine, jnp.zeros_like(cosine))

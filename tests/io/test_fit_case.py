@@ -343,7 +343,9 @@ def test_a_prior_goes_with_the_terrain_into_its_surroundings(folder, name):
     plane = (y + 3.0 * x).astype(np.float32)
     jaxhf.save_heights(folder / "fine.npz", jaxhf.Terrain(random.random((35, 40), np.float32), 1.0, 1.0, 70.0, 60.0))
     jaxhf.save_heights(folder / "coarse.npz", jaxhf.Terrain(random.random((20, 20), np.float32), 8.0, 8.0))
-    jaxhf.save_heights(folder / "prior.npz", jaxhf.Terrain(np.pad(plane, 5, "reflect", reflect_type="odd"), 1, 1, 65, 55))
+    jaxhf.save_heights(
+        folder / "prior.npz", jaxhf.Terrain(np.pad(plane, 5, "reflect", reflect_type="odd"), 1.0, 1.0, 65.0, 55.0)
+    )
     np.save(folder / "prior.npy", plane)
     np.save(folder / "half.npy", plane[::2, ::3])
     terrain = 'file = "fine.npz"\n[[objects]]\nshape = "heightfield"\nfile = "coarse.npz"\naround = true'

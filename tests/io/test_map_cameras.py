@@ -213,12 +213,12 @@ def test_a_maps_north_is_told_from_the_true_one(tmp_path, crs, x, y):
     expected = np.degrees(np.arctan(np.tan(longitude - np.radians(9)) * np.sin(latitude)))
     np.testing.assert_allclose(terrain.convergence, expected, rtol=1e-3)
     assert abs(expected) > 1.5
-    degrees = jaxhf.Terrain(np.zeros((3, 3)), 1e-3, 1e-3, 8, 46, CoordinateSystem(True, WGS84), Georeference(WGS84_DEGREES))
+    degrees = jaxhf.Terrain(np.zeros((3, 3)), 1e-3, 1e-3, 8.0, 46.0, CoordinateSystem(True, WGS84), Georeference(WGS84_DEGREES))
     assert abs(degrees.in_metres().convergence) < 1e-9
     assert np.isnan(jaxhf.Terrain(np.zeros((3, 3))).convergence)
 
 
-def test_what_no_perspective_sees_is_refused(tmp_path):
+def test_what_no_perspective_sees_is_refused(tmp_path, as_users_call_it):
     terrain = jaxhf.load_heights(file_of(tmp_path / "a.tif", COAST, 5000, 50))
     bare, holes = dataclasses.replace(terrain, georeference=None), terrain.heights * np.nan
     for rpcs, ground, more, message in (

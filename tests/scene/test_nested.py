@@ -33,7 +33,7 @@ def on_triangles(heights, x, y):
 def terrains():
     """The fine terrain and the coarse one as they are given, and as they are nested; and one grid of the same surface."""
     count = (2 * AROUND + CELLS) * TIMES + 1
-    truth = procedural.fractal((count, count), seed=3, exponent=1.8, range=(0, 0.2 * count)).astype(np.float32)
+    truth = procedural.fractal((count, count), seed=3, exponent=1.8, range=(0.0, 0.2 * count)).astype(np.float32)
     coarse, here = truth[::TIMES, ::TIMES], slice(FIRST, FIRST + COUNT + 1)
     inner = jaxhf.Heightfield(truth[here, here], 1.0, x0=float(FIRST), y0=float(FIRST))
     outer = jaxhf.Heightfield(coarse, float(TIMES))
@@ -280,7 +280,8 @@ def test_three_terrains_nest():
 
 
 def field(count, spacing, x0=0.0, y0=0.0, heights=None):
-    return jaxhf.Heightfield(np.zeros((count, count)) if heights is None else heights, spacing, x0=x0, y0=y0)
+    heights = np.zeros((count, count)) if heights is None else heights
+    return jaxhf.Heightfield(heights, float(spacing), x0=float(x0), y0=float(y0))
 
 
 HOLED = np.zeros((20, 20))
@@ -302,7 +303,9 @@ HOLED[5, 7] = np.nan
         (lambda: jaxhf.nested(field(41, 1, 40, 40), field(20, 8, heights=HOLED)), "one has one at x 49, y 40"),
         (lambda: jaxhf.nested(*terrains()[2:4]), "must not be nested already"),
         (
-            lambda: jax.jit(lambda z: jaxhf.nested(jaxhf.Heightfield(z, 1.0, x0=40, y0=40), field(20, 8)))(np.zeros((40, 40))),
+            lambda: jax.jit(lambda z: jaxhf.nested(jaxhf.Heightfield(z, 1.0, x0=40.0, y0=40.0), field(20, 8)))(
+                np.zeros((40, 40))
+            ),
             "must have heights that are known, theirs are traced by JAX",
         ),
         (lambda: jaxhf.Heightfield(np.zeros((3, 4)), seam=np.zeros((3, 4))), r"seam must have shape \(3, 4, 2\)"),

@@ -216,7 +216,7 @@ def test_noise_that_hides_the_perspective_is_told_from_a_mirror():
     assert 0 < refused < 20
 
 
-def test_other_arguments_are_refused():
+def test_other_arguments_are_refused(as_users_call_it):
     for arguments, message in (
         ({**SIZE, "max_error": 0}, "from_points: max_error must be positive and finite, it is 0"),
         ({**SIZE, "width": 0}, "from_points: width must be a whole number of pixels from 1 on, it is 0"),

@@ -29,6 +29,7 @@ def directions(count: int, seed: int) -> np.ndarray:
 def test_closed_forms(name):
     """And reciprocity: light and eye may change places."""
     material, law = LAWS[name]
+    material = jax.tree.map(jnp.asarray, material)
     wi, wo = directions(200, 1), directions(200, 2)
     of = jax.jit(jax.vmap(lambda wi, wo: jnp.broadcast_to(material.brdf(wi, wo, jnp.asarray(UP)), (3,))))
     found = np.asarray(of(wi, wo))
@@ -170,6 +171,7 @@ ASP = {
 @pytest.mark.x64  # formulas to rounding
 def test_models_of_the_ames_stereo_pipeline(name):
     material, model, scale, differ = ASP[name]
+    material = jax.tree.map(jnp.asarray, material)
     wi, wo = directions(300, 1), directions(300, 2)
     g = np.arccos((wi * wo).sum(axis=1))
     wi, wo, g = (values[g < np.radians(104)] for values in (wi, wo, g))  # beyond, ASP's limb is negative and jaxhf's 0

@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int
 from ...core.types import Flag, Scalar
 from ...xla.devices import divided, on_every_device
 from ..model.expansion import Expansion, residuals
-from ..model.problem import Problem
 from ..model.surface import Unknowns
 
 FIRST_DAMPING = 1e-2  # as a share of the loss's curvature along a mode
