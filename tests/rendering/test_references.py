@@ -22,6 +22,7 @@ from jaxhf.rendering.cast import cast_camera
 
 FOLDER = Path(__file__).parents[1] / "references"
 CYLINDER, MATTE, MIRROR = 1, 2, 3
+DEEP, SLOW = pytest.mark.deep, pytest.mark.slow
 TERRAINS = ["rays-hills", pytest.param("rays-valley", marks=pytest.mark.deep)]
 LARGER = [pytest.param(name, marks=pytest.mark.deep) for name in ("landsea-0", "landsea-1", "texture")]
 LARGER += [pytest.param("landsea-big", marks=pytest.mark.slow)]
@@ -135,8 +136,7 @@ def test_light_agrees_with_mitsuba(name, which):
     assert off <= 2e-5
 
 
-@pytest.mark.deep  # a program for each
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=DEEP if name in ("McEwen", "Hapke") else SLOW) for name in LAWS])
 def test_laws_of_reflectance_agree_with_mitsuba(name):
     """On a terrain with shadows, with a BSDF of ours in Mitsuba; compared where light and normals are, see above."""
     ref = kept("rays-hills")

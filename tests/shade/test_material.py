@@ -79,7 +79,7 @@ def test_derivatives_are_finite(name):
 
 
 TWO = {name: LAWS[name] for name in ("McEwen", "Hapke")}
-EACH = pytest.mark.parametrize("laws", [TWO, pytest.param(LAWS, marks=pytest.mark.deep)], ids=["two", "all"])
+EACH = pytest.mark.parametrize("laws", [TWO, pytest.param(LAWS, marks=pytest.mark.slow)], ids=["two", "all"])
 
 
 def side_by_side(light, laws):
