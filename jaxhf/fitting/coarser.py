@@ -23,7 +23,8 @@ _MOST_SAMPLES = 2**21  # of all pictures, with which steps take about as long as
 def factors(scenes: Sequence[Scene], samples: int) -> list[int]:
     """How many times coarser the levels of a fit are, from coarse to fine: 1 last."""
     field, pixels = scenes[0].heightfields[0], sum(scene.camera.width * scene.camera.height for scene in scenes)
-    plain = all(len(scene.objects) == len(scene.heightfields) for scene in scenes)  # a skirt has the terrain's shape
+    # A skirt has the terrain's shape; a seam is finer than coarse heights, and would be moved by their steps.
+    plain = field.seam is None and all(len(scene.objects) == len(scene.heightfields) for scene in scenes)
     found = [1]
     while plain and pixels * samples > found[0] ** 2 * _MOST_SAMPLES and min(field.heights.shape) > 16 * found[0] * _FACTOR:
         found.insert(0, found[0] * _FACTOR)

@@ -23,7 +23,7 @@ from .given import Checkpoint, Prior
 from .history import Draws, Step
 from .model.defaults import EDGE_SAMPLES, choose_edge_samples, choose_samples
 from .model.pictures import checked_pictures
-from .model.surface import make_heights
+from .model.surface import make_heights, with_seam
 from .solve.state import digest
 from .trust.judge import Fit
 
@@ -128,7 +128,8 @@ def fit_windows(
     mean, std = (make_heights("Prior", name, getattr(prior, name), field) for name in ("heights", "std"))
     known = Prior(mean, std, prior.length)
     begin = make_heights("fit", "start", field.heights if start is None else start, field)
-    terrain = Mosaic(np.where(std > 0, begin, mean), std.copy(), np.zeros(shape, bool), ())
+    begin = with_seam(field, begin)
+    terrain = Mosaic(with_seam(field, np.where(std > 0, begin, mean)), std.copy(), np.zeros(shape, bool), ())
     order = divided(shape, window, overlap)
     options = {**options, "settings": _settings(scenes, options.get("settings") or Settings(), len(order))}
     path = None if checkpoint is None else Path(checkpoint.path)

@@ -154,7 +154,7 @@ def _with_one_axis(field: Heightfield) -> Heightfield:
     """A heightfield, or a batch with one axis, whose x0 and y0 are 0."""
 
     def at_origin(heights: jax.Array) -> Heightfield:
-        return Heightfield(heights, field.dx, field.dy)
+        return Heightfield(heights, field.dx, field.dy, seam=field.seam)
 
     heights = jnp.asarray(field.heights)
     return at_origin(heights) if heights.ndim == 2 else jax.vmap(at_origin)(heights.reshape(-1, *heights.shape[-2:]))

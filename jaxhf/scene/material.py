@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from ..core.types import COLOUR, FINITE, AnyArray, Number, Scalar, ScalarLeaf, Vector, float_leaf, rgb_leaf
-from ..core.vector import angle, dot, greater, lesser, root, rounded_clamp
+from ..core.vector import GRAZING, angle, dot, greater, lesser, root, rounded_clamp
 from .record import Record
 from .texture import ImageTexture
 
@@ -123,13 +123,15 @@ class Minnaert(_Scaled):
 
     Attributes:
       albedo: as that of `LommelSeeliger`.
-      k: 1 is Lambert's law, 0.5 a dark surface.
+      k: 1 is Lambert's law, 0.5 a dark surface. The law has no bound where it is seen along the surface: within 0.6 degrees of
+        that it counts as 0.6 degrees off.
     """
 
     k: ScalarLeaf = eqx.field(converter=float_leaf, default=0.5, metadata={"rule": FINITE})
 
     def brdf(self, wi: Vector, wo: Vector, n: Vector) -> Vector:
         mu0, mu = _cosines(wi, wo, n)
+        mu = greater(mu, jnp.full_like(mu, GRAZING))
         return self.albedo / jnp.pi * jnp.exp((self.k - 1) * jnp.log(mu0 * mu))
 
 

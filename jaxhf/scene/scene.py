@@ -30,6 +30,18 @@ def _listed(values: Any) -> tuple[Any, ...]:
     return tuple(values)
 
 
+def _with_arrays(material: Any) -> Any:
+    """A material whose fields are arrays where they were given as numbers; ArgumentError where one can be no leaf."""
+    for field in dataclasses.fields(material) if isinstance(material, Material) else ():
+        value, static = getattr(material, field.name), field.metadata.get("static")
+        if isinstance(value, str) and not static:
+            rule = f"must be numbers or an ImageTexture, unless it is an eqx.field(static=True); it is {value!r}"
+            raise ArgumentError(type(material).__name__, field.name, rule)
+        if isinstance(value, float | int | np.generic) and not static:
+            material = eqx.tree_at(lambda material, name=field.name: getattr(material, name), material, float_leaf(value))
+    return material
+
+
 class Object(Record):
     """A shape with its material and its transform.
 
@@ -45,7 +57,7 @@ class Object(Record):
 
     def __init__(self, shape: Shape, material: Material | Mirror | None = None, world_from_object: Any = None):
         self.shape = shape
-        self.material = Matte(0.7) if material is None else material
+        self.material = Matte(0.7) if material is None else _with_arrays(material)
         self.world_from_object = None if world_from_object is None else float_leaf(world_from_object)
 
     def _require_consistent(self):

@@ -75,7 +75,10 @@ def _sent_on(world: World, wi: Vector, hit: Hit, wo: Vector | None) -> Scalar | 
     side; with `wo` times the BRDF."""
     smooth = world.settings.shading == "smooth"
     cosine = rounded_clamp(dot(wi, hit.ns) * hit.side.astype(wi.dtype)) if smooth else jnp.abs(dot(wi, hit.ns))
-    return cosine if wo is None else cosine * brdf(world, unit(wi), wo, hit)
+    if wo is None:
+        return cosine
+    along = jnp.where(largest_component(wi) > 0, unit(wi), hit.ns)  # no part of a sun's disc may be seen
+    return cosine * brdf(world, along, wo, hit)
 
 
 def in_shadow(world: World, hit: Hit) -> Bool[jax.Array, " lights"]:

@@ -233,14 +233,16 @@ def test_coarser_pictures_are_means_of_the_pixels_that_count():
 
 
 def test_many_samples_ask_for_coarser_levels():
-    def asked(side: int, count: int) -> list[int]:
+    def asked(side: int, count: int, seam: bool = False) -> list[int]:
         camera = jaxhf.Orthographic.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), up=(0, 1, 0), width=side, height=side)
-        return factors([scenes(np.zeros((count, count)))[0].with_camera(camera)] * 3, 4)
+        field = jaxhf.Heightfield(np.zeros((count, count)), seam=np.zeros((count, count, 2)) if seam else None)
+        return factors([jaxhf.Scene([jaxhf.Object(field)], camera)] * 3, 4)
 
     assert asked(256, 256) == [1]
     assert asked(512, 512) == [4, 1]
     assert asked(2048, 2048) == [16, 4, 1]
     assert asked(2048, 64) == [1]  # heights are few
+    assert asked(512, 512, seam=True) == [1]  # coarse heights have none, and would move it
 
 
 BLACK = [np.zeros((SIZE, SIZE))] * 3

@@ -8,6 +8,7 @@ import pytest
 import jaxhf
 from jaxhf.fitting import windows as _windows
 from jaxhf.fitting.cropped import Window, _fields, cropped
+from jaxhf.fitting.model.surface import with_seam
 from jaxhf.fitting.windows import divided, fit_windows
 from jaxhf.scene.procedural import fractal
 
@@ -92,6 +93,10 @@ def test_a_window_at_a_seam_has_its_part_of_it():
     part, around = _fields(terrain, np.asarray(terrain.heights), window)
     np.testing.assert_array_equal(part.seam, np.asarray(terrain.seam)[window.place])
     np.testing.assert_array_equal(around.seam, terrain.seam)
+    held = np.isfinite(np.asarray(terrain.seam)).all(-1)
+    begin = with_seam(terrain, np.asarray(terrain.heights) + 0.3)  # as `fit_windows` begins from a start
+    np.testing.assert_array_equal(begin[held], np.asarray(terrain.heights)[held])
+    assert (begin != np.asarray(terrain.heights))[~held].all()
 
 
 @pytest.mark.slow

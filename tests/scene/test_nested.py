@@ -311,6 +311,6 @@ HOLED[5, 7] = np.nan
         (lambda: jaxhf.Heightfield(np.zeros((3, 4)), seam=np.zeros((3, 4))), r"seam must have shape \(3, 4, 2\)"),
     ],
 )
-def test_what_does_not_nest_is_refused(call, says):
+def test_what_does_not_nest_is_refused(call, says, as_users_call_it):
     with pytest.raises(jaxhf.ArgumentError, match=says):
         call()

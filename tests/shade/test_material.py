@@ -1,5 +1,8 @@
 """Laws of reflectance against their closed forms, on planes, under a sky, at the edge of a shadow and on Mitsuba's terrain."""
 
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +11,7 @@ from reflectance import LAWS, brdf, hapke
 from scipy import integrate
 
 import jaxhf
+from jaxhf.fitting.model.pictures import with_albedo
 
 UP = np.array([0.0, 0.0, 1.0])
 PLANE = 0.3 * np.arange(3.0) - 0.2 * np.arange(3.0)[:, None]
@@ -103,6 +107,54 @@ def test_planes_under_the_sun(laws):
         expected = np.array([1.0, 2.0, 3.0]) * (wi @ PLANE_NORMAL) * brdf(law, wi, wo, PLANE_NORMAL)
         assert (shown == k).sum() > 50
         np.testing.assert_allclose(image[shown == k], np.broadcast_to(expected, (np.sum(shown == k), 3)), rtol=5e-6)
+
+
+class Sheen(jaxhf.Material):
+    """As a user writes one: fields are numbers, and one is no leaf."""
+
+    albedo: Any
+    sheen: Any = 0.5
+    kind: str = eqx.field(static=True, default="grass")
+
+    def brdf(self, wi, wo, n):
+        return self.albedo / jnp.pi * (1 + self.sheen * jnp.clip(1 - jnp.dot(n, wo), 0, 1) ** 3)
+
+
+class Named(Sheen):
+    """With a text that is a leaf."""
+
+    name: Any = "b"
+
+
+class Twice(jaxhf.Matte):
+    def brdf(self, wi, wo, n):
+        return 2 * self.albedo / jnp.pi
+
+
+def test_materials_of_users():
+    """One that is prepared, differentiated and painted; one that is `Matte` but for its law."""
+    ground, sun = jaxhf.Heightfield(np.zeros((3, 3)), dx=1.0), jaxhf.Directional((0, 0, 1), 1.0)
+    camera = jaxhf.Orthographic.look_at((1, -3, 4), (1, 1, 0), extent=0.5, width=4, height=4)
+    scene = jaxhf.Scene([jaxhf.Object(ground, Sheen(0.4))], camera, [sun])
+    expected = 0.4 / np.pi * (1 + 0.5 * (1 - np.sqrt(0.5)) ** 3)
+    np.testing.assert_allclose(jaxhf.render(jaxhf.prepare(scene)), expected, rtol=1e-5)
+    slopes = jax.grad(lambda scene: jnp.sum(jaxhf.render(scene)))(jax.tree.map(jnp.asarray, scene)).objects[0].material
+    np.testing.assert_allclose(slopes.albedo, 48 * expected / 0.4, rtol=1e-5)
+    twice, once = (jaxhf.render(jaxhf.Scene([jaxhf.Object(ground, kind(0.3))], camera, [sun])) for kind in (Twice, jaxhf.Matte))
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-6)
+    doubled = with_albedo(scene, jnp.full((1, 1, 1), 2.0)).objects[0].material
+    assert isinstance(doubled, Sheen)
+    np.testing.assert_allclose(doubled.albedo, 0.8, rtol=1e-6)
+    with pytest.raises(jaxhf.ArgumentError, match=r"^Named: name must be numbers or an ImageTexture, unless .*'a'"):
+        jaxhf.Object(ground, Named(0.5, name="a"))
+
+
+def test_no_law_is_without_bound_along_the_surface():
+    """Minnaert's goes as 1 / sqrt(mu) there; an interpolated normal may even face away."""
+    law, up = jax.tree.map(jnp.asarray, jaxhf.Minnaert(0.3)), jnp.asarray(UP, jnp.float32)
+    for off in (0.02, 0.0, -0.009, -0.02):
+        wo = jnp.array([np.sqrt(1 - off**2), 0, off], jnp.float32)
+        assert np.max(law.brdf(up, wo, up)) <= 0.3 / np.pi * 10.01
 
 
 def under_sky(law, wo, n):

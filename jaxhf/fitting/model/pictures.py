@@ -139,14 +139,14 @@ def with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
     k = scene.first_heightfield
     material = scene.objects[k].material
     old = albedo_of(material)
-    texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.asarray(old).reshape(1, 1, 3))
+    texture = old if isinstance(old, ImageTexture) else ImageTexture(jnp.broadcast_to(jnp.asarray(old), (1, 1, 3)))
     shape = (*(max(pair) for pair in zip(texture.texels.shape[:2], factor.shape[:2], strict=True)), 3)
     new = jnp.broadcast_to(texture.texels, shape) * jnp.broadcast_to(factor, shape)
     albedo = new.reshape(3) if shape[:2] == (1, 1) and texture is not old else dataclasses.replace(texture, texels=new)
-    return eqx.tree_at(lambda scene: scene.objects[k].material, scene, dataclasses.replace(material, albedo=albedo))
+    return eqx.tree_at(lambda scene: scene.objects[k].material.albedo, scene, albedo)
 
 
-def albedo_of(material: Material | Mirror) -> Float[AnyArray, "3"] | ImageTexture | None:
+def albedo_of(material: Material | Mirror) -> Float[AnyArray, "..."] | ImageTexture | None:
     """The albedo to which what a material scatters is proportional; None where it has none."""
     return getattr(material, "albedo", None)
 
@@ -187,6 +187,10 @@ def _require_alike(k: int, scene: Scene, first: Scene) -> None:
             raise ArgumentError(
                 "fit", f"scenes[{k}]", f": {name} must be that of the first scene's heightfield, {theirs}; it is {mine}"
             )
+    if field.seam is not other.seam and not (
+        field.seam is not None and other.seam is not None and np.array_equal(field.seam, other.seam, equal_nan=True)
+    ):
+        raise ArgumentError("fit", f"scenes[{k}]", ": the seam must be that of the first scene's heightfield, it is another")
 
 
 def _checked_picture(

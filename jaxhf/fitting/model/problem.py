@@ -23,7 +23,7 @@ from ..given import Given, Unknown
 from .albedo import AlbedoField, make_albedo_field
 from .defaults import choose_edge_samples, choose_samples
 from .pictures import Group, albedo_of, make_groups
-from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units
+from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units, with_seam
 from .terms import Terms, make_terms
 from .view import View, sun
 
@@ -150,8 +150,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
         held = np.broadcast_to(np.asarray(numbers(given.prior.std)) == 0, heights.shape)
         heights = np.where(held, make_heights("Prior", "heights", given.prior.heights, field), heights)
     if field.seam is not None:
-        seam = np.isfinite(np.asarray(field.seam)).all(-1)
-        held, heights = held | seam, np.where(seam, np.asarray(first.heights), heights)
+        held, heights = held | np.isfinite(np.asarray(field.seam)).all(-1), with_seam(field, heights)
     if held.any():
         free = pad((~held).astype(np.float64), padding(field, length))
     base = pad(heights, padding(field, length))
@@ -217,6 +216,7 @@ def _view_unit(scenes: Sequence[Scene], unknown: Unknown) -> View:
         for name in names:
             if name not in known:
                 rule = f"must name numbers of the material of scenes[{k}], {type(kind).__name__}: {known}; it names {name!r}"
+                rule += ", which is None: give it a number" if getattr(kind, name, known) is None else ""
                 raise ArgumentError("Unknown", "material_std", rule)
     return View(light, camera, sky, material, names)
 

@@ -193,6 +193,13 @@ def make_heights(owner: str, name: str, value: Any, field: Heightfield) -> Float
     return heights if heights.shape == shape else resample(heights, shape)
 
 
+def with_seam(field: Heightfield, heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny nx"]:
+    """Heights with those of the field where its surface goes on in another one, which a fit holds."""
+    if field.seam is None:
+        return heights
+    return np.where(np.isfinite(np.asarray(field.seam)).all(-1), np.asarray(field.heights), heights)
+
+
 def resample(heights: Float[np.ndarray, "my mx"], shape: tuple[int, ...]) -> Float[np.ndarray, "ny nx"]:
     """The bilinear surface through a grid over the same footprint, at the vertices of another grid."""
     for count in shape:  # rows and then columns, which each turn makes rows
