@@ -185,19 +185,22 @@ def changes(name: str) -> dict[str, tuple[jaxhf.Scene, np.ndarray, np.ndarray]]:
     return found
 
 
-DOUBLE = pytest.param(np.float64, 1e-6, 1e-10, marks=[pytest.mark.deep, pytest.mark.x64])
+SINGLE, DOUBLE = (np.float32, 5e-5, 1e-4), (np.float64, 1e-6, 1e-10)
+DEEP, SLOW, X64 = pytest.mark.deep, pytest.mark.slow, pytest.mark.x64
+PRECISIONS = [
+    pytest.param("plain", *SINGLE, id="plain, single"),
+    pytest.param("plain", *DOUBLE, marks=[DEEP, X64], id="plain, double"),
+    pytest.param("parallel", *SINGLE, marks=DEEP, id="parallel, single"),
+    pytest.param("parallel", *DOUBLE, marks=[DEEP, X64], id="parallel, double"),
+    pytest.param("reflected", *SINGLE, marks=SLOW, id="reflected, single"),
+    pytest.param("reflected", *DOUBLE, marks=[DEEP, SLOW, X64], id="reflected, double"),
+    pytest.param(
+        "laws", *SINGLE, marks=SLOW, id="laws, single"
+    ),  # in double precision differences in the camera are off by more
+]
 
 
-@pytest.mark.parametrize(("dtype", "rtol", "between"), [(np.float32, 5e-5, 1e-4), DOUBLE])
-@pytest.mark.parametrize(
-    "name",
-    [
-        "plain",
-        pytest.param("parallel", marks=pytest.mark.deep),
-        pytest.param("laws", marks=pytest.mark.slow),
-        pytest.param("reflected", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("name", "dtype", "rtol", "between"), PRECISIONS)
 def test_every_leaf_pixel_by_pixel(name, dtype, rtol, between):
     """Against central differences, in forward and in reverse mode.
 
