@@ -67,14 +67,14 @@ def test_imports_follow_the_flow():
 MAPS_OVER_RAYS = {
     "rendering/tiles", "rendering/samples", "rendering/render", "rendering/cast", "rendering/chunks", "boundary/term",
     "fitting/model/linearise", "fitting/model/products", "mujoco/scan", "mujoco/sensors", "preparation/sky", "xla/insides",
-    "xla/kernel",
+    "xla/kernel", "xla/program_calls",
 }  # fmt: skip
 RULES = {"xla/masked", "trace/search"}  # of what `vmap` makes of a call
 PLACES = {  # what stands in these modules alone
     "custom_vmap": RULES,
     "jax.vmap": MAPS_OVER_RAYS | RULES,
     "lax.map(": MAPS_OVER_RAYS | {"xla/devices", "preparation/horizon", "fitting/model/rows", "mujoco/hfield"},
-    "jax.jit": {"xla/compilation", "xla/insides", "xla/kernel", "xla/masked"},
+    "jax.jit": {"xla/compilation", "xla/insides", "xla/kept", "xla/kernel", "xla/masked", "xla/program_calls"},
     "shard_map(": {"xla/devices"},
     "default_backend(": {"xla/devices", "xla/kept", "study/plan"},  # in the last to tell measurements apart
 }

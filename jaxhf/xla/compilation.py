@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import gc
+import inspect
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -46,13 +47,13 @@ def _garbage_left() -> Iterator[None]:
 
 
 @functools.cache
-def compiler_options(newer: bool = False) -> dict[str, Any] | None:
+def compiler_options(newer: bool | None = False) -> dict[str, Any] | None:
     """What `jax.jit` takes as `compiler_options`, so that a program of jaxhf's compiles and runs in less time.
 
     `newer` is for programs without rays, see `compiled`. Options that this version of XLA does not know are left out; None
     where no other is left, and in plain mode.
     """
-    if insides() is None:
+    if insides() is None or newer is None:
         return None
     options = {"xla_cpu_use_fusion_emitters": True} if newer else _OPTIONS
     return {name: value for name, value in options.items() if _is_known({name: value}) and _is_right(name)} or None
@@ -76,7 +77,7 @@ def _is_right(name: str) -> bool:
 
 
 def compiled(
-    fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, newer: bool = False, **options: Any
+    fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, newer: bool | None = False, **options: Any
 ) -> Callable[..., Any]:
     """`jit(fun, **options)`, with `compiler_options` where it is called as it is, not as part of another program.
 
@@ -86,8 +87,8 @@ def compiled(
       fun: to be compiled.
       jit: `jax.jit`, or `equinox.filter_jit`.
       newer: with XLA's newer emitters, and its kernels dealt out to threads: passes over tiles of a grid run 3 to 4 times as
-        fast.
-      options: of `jit`.
+        fast. None: as XLA compiles by itself.
+      options: of `jit`: `static_argnames`, or "all-except-first" as `donate`.
     """
 
     inside = jit(fun, **options)
@@ -98,14 +99,19 @@ def compiled(
 
     @functools.cache
     def kept() -> Kept:
-        given = compiler_options(newer)
-        return Kept(fun, lambda flat: jit(flat, compiler_options=given), options.get("static_argnames", ()))
+        static = options.get("static_argnames", ()) if jit is jax.jit else None
+        donated = list(inspect.signature(fun).parameters)[1:] if "donate" in options else ()
+        return Kept(fun, compiler_options(newer), static, donated)
 
     @functools.wraps(fun)
     def call(*args: Any, **kwargs: Any) -> Any:
         with _garbage_left():
-            if insides() is None or is_traced():
+            module = insides()
+            if module is None:
                 return inside(*args, **kwargs)
-            return (kept() if jit is jax.jit and Kept.serves(fun) else alone())(*args, **kwargs)
+            traced, serves = is_traced(), Kept.serves(fun)
+            if traced and (not serves or module.is_staged()):
+                return inside(*args, **kwargs)
+            return (kept() if serves else alone())(*args, **kwargs)
 
     return call

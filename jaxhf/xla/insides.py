@@ -13,12 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax._src.config import trace_context
 from jax.experimental.compilation_cache import compilation_cache as compilation_cache
 from jax.experimental.serialize_executable import deserialize_and_load as deserialize_and_load, serialize as serialize
 from jax.extend.core import ClosedJaxpr, Primitive, get_opaque_trace_state, jaxpr_as_fun
 from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import func
 from jax.interpreters import ad, batching, mlir
+
+from .program_calls import call_program as call_program, is_staged as is_staged
 
 TRIED = (0, 12)
 """The newest version of JAX whose insides are known to take what is below."""
@@ -48,6 +51,9 @@ class _Call(Primitive):
         there), and asked for a rule of another kind."""
         return False
 
+
+configuration = trace_context
+"""All of JAX's configuration, also by context managers, that a trace depends on: hashable."""
 
 kernel, in_turn, in_memory = _Call("kernel"), _Call("in_turn"), Primitive("in_memory")
 

@@ -125,7 +125,7 @@ def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
     return [*parts, *(term.residual(values) for term, values in terms.others(unknowns))]
 
 
-@eqx.filter_jit
+@functools.partial(compiled, jit=eqx.filter_jit, newer=None)
 def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
     """The heights with their padding, by one program."""
     return basis.surface(unknowns.coefficients)
@@ -144,7 +144,7 @@ def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None
     return on_every_device(tuple(map(of, problem.groups)), problem.mesh)
 
 
-@eqx.filter_jit
+@functools.partial(compiled, jit=eqx.filter_jit, newer=None)
 def _pictures(unknowns: Unknowns, problem: Problem, linearised: tuple[Linearised | None, ...]) -> Rows:
     return _simulate(unknowns, problem, linearised, problem.basis.heights(unknowns.coefficients))
 
@@ -161,13 +161,13 @@ def _by_surface(expansion: Expansion) -> tuple[Callable[[Float[Array, "my mx"], 
     return pictures, (problem.basis.surface(unknowns.coefficients), others)
 
 
-@eqx.filter_jit
+@functools.partial(compiled, jit=eqx.filter_jit, newer=None)
 def _push(expansion: Expansion, change: Surface) -> Rows:
     pictures, here = _by_surface(expansion)
     return jax.jvp(pictures, here, change)[1]
 
 
-@eqx.filter_jit
+@functools.partial(compiled, jit=eqx.filter_jit, newer=None)
 def _pull(expansion: Expansion, rows: Rows) -> Surface:
     pictures, here = _by_surface(expansion)
     return jax.vjp(pictures, *here)[1](rows)

@@ -1,5 +1,6 @@
 """Steps after Levenberg (1944) and Marquardt (1963) by optimistix, whose linear problems conjugate gradients solve."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from ...core.types import Flag, Scalar
+from ...xla.compilation import compiled
 from ...xla.devices import divided, on_every_device
 from ..model.expansion import Expansion, residuals
 from ..model.surface import Unknowns
@@ -167,7 +169,10 @@ def advance(
     solver = LevenbergMarquardt(rejections, others, exactly)
     of_j, rest = _of_j(position)
     kept = on_every_device((solver, unknowns, rest, expansion), expansion.problem.mesh)
-    return _advance(kept, divided(of_j, expansion.problem.mesh))
+    new, arrays, outcome = _advance(kept, divided(of_j, expansion.problem.mesh))
+    # What else the state holds, functions among it, stays as it is, and could not be kept with a compiled program.
+    following, (leaves, structure) = iter(arrays), jax.tree.flatten(position)
+    return new, jax.tree.unflatten(structure, [next(following) if eqx.is_array(leaf) else leaf for leaf in leaves]), outcome
 
 
 def _of_j(position: Any) -> tuple[Any, Any]:
@@ -178,8 +183,8 @@ def _of_j(position: Any) -> tuple[Any, Any]:
     return eqx.partition(position, which)
 
 
-@eqx.filter_jit(donate="all-except-first")
-def _advance(kept: tuple[LevenbergMarquardt, Unknowns, Any, Expansion], of_j: Any) -> tuple[Unknowns, Any, Outcome]:
+@functools.partial(compiled, jit=eqx.filter_jit, newer=None, donate="all-except-first")
+def _advance(kept: tuple[LevenbergMarquardt, Unknowns, Any, Expansion], of_j: Any) -> tuple[Unknowns, list[Array], Outcome]:
     solver, unknowns, rest, expansion = kept
     problem, position = expansion.problem, eqx.combine(of_j, rest)
     with jax.numpy_dtype_promotion("standard"):
@@ -195,4 +200,5 @@ def _advance(kept: tuple[LevenbergMarquardt, Unknowns, Any, Expansion], of_j: An
     )
     of_j, rest = _of_j(state)
     new, rest, outcome = on_every_device((new, rest, outcome), problem.mesh)
-    return new, eqx.combine(divided(of_j, problem.mesh), rest), outcome
+    arrays = jax.tree.leaves(eqx.filter(eqx.combine(divided(of_j, problem.mesh), rest), eqx.is_array))
+    return new, arrays, outcome

@@ -1,0 +1,131 @@
+"""The folder in which compiled programs are kept: where it is, whose, and how much may be in it."""
+
+import contextlib
+import hashlib
+import itertools
+import os
+import platform
+import re
+import sys
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+
+from .plain import is_asked_for
+
+_MOST = 500_000_000  # bytes; a picture's programs take 0.3 million, a gradient's 0.6
+
+# Of the whole process, as JAX's own cache is; empty until `keep_in` is called, and until the first use.
+_chosen: list[Path | None] = []
+_by_default: list[Path | None] = []
+
+
+def keep_in(folder: Path | None) -> None:
+    """From now on programs are kept in this folder, which exists; None: nowhere."""
+    _chosen[:] = [folder]
+
+
+def current() -> Path | None:
+    """Where programs are kept: as `keep_in` said, or else in the folder of `opened`.
+
+    Nowhere where the user has told JAX itself to keep programs, or to keep none, nor in plain mode. Where they cannot be kept
+    one warning says so.
+    """
+    if _chosen:
+        return _chosen[0]
+    config = jax.config
+    if is_asked_for() or config.jax_compilation_cache_dir or not config.jax_enable_compilation_cache:  # pyright: ignore
+        return None
+    if not _by_default:
+        try:
+            _by_default.append(opened())
+        except (OSError, RuntimeError) as error:  # the latter where there is no home folder
+            _by_default.append(None)
+            warnings.warn(f"compiled programs are not kept: {error}", stacklevel=2)
+    return _by_default[0]
+
+
+def opened() -> Path | None:
+    """That of these versions and this processor, by `JAXHF_CACHE` or in the platform's cache folder; None: keep nothing.
+
+    It is made where it is missing, and closed to other users, as a program can do whatever its user can.
+
+    Raises:
+      OSError: it cannot be made or written to, or belongs to another user.
+      RuntimeError: there is no home folder.
+    """
+    named = os.environ.get("JAXHF_CACHE")
+    if named in ("", "0", "off"):
+        return None
+    versions = "-".join(f"{package}-{version(package)}" for package in ("jaxhf", "jax", "jaxlib"))
+    folder = (Path(named) if named else _platform_folder() / "jaxhf") / f"{versions}-{_processor()}"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _require_own(folder, folder.stat())
+    if not os.access(folder, os.W_OK):
+        raise PermissionError(f"{folder} is read-only")
+    if os.name == "posix":
+        folder.chmod(0o700)
+    _remove_oldest(folder.parent, _MOST)
+    return folder
+
+
+def read(path: Path) -> bytes:
+    """A file of the folder; PermissionError where another user has put it there."""
+    with path.open("rb") as file:
+        _require_own(path, os.fstat(file.fileno()))
+        stored = file.read()
+    path.touch()  # what was used longest ago is removed first
+    return stored
+
+
+def write(path: Path, stored: bytes) -> None:
+    """All of it or nothing, also where another process writes the same."""
+    part = path.with_suffix(f".{os.getpid()}")
+    try:
+        part.write_bytes(stored)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _require_own(path: Path, said: os.stat_result) -> None:
+    if hasattr(os, "getuid") and said.st_uid != os.getuid():
+        raise PermissionError(f"{path} belongs to another user")
+
+
+def _platform_folder() -> Path:
+    home = Path.home()
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
+    if sys.platform == "darwin":
+        return home / "Library" / "Caches"
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
+
+
+def _processor() -> str:
+    """A hash of the processor's model and instructions: a program compiled for others may not run."""
+    said = Path("/proc/cpuinfo")
+    lines = [platform.machine()]
+    if not said.exists():
+        lines.append(platform.processor())
+    else:
+        with said.open() as cores:
+            first = itertools.takewhile(str.strip, cores)
+            lines += [line for line in first if re.match(r"vendor|model|cpu family|flags|Features|CPU [a-z]", line)]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()[:16]
+
+
+def _remove_oldest(root: Path, most: int) -> None:
+    """Removes the programs used longest ago, of all versions, until the rest has at most so many bytes."""
+    found = []
+    for path in root.glob("jaxhf-*-jax-*/*"):
+        with contextlib.suppress(FileNotFoundError):  # removed by another process
+            found.append((path, path.stat()))
+    total = sum(said.st_size for _, said in found)
+    for path, said in sorted(found, key=lambda one: max(one[1].st_atime, one[1].st_mtime)):
+        if total <= most:
+            break
+        path.unlink(missing_ok=True)
+        total -= said.st_size

@@ -1,0 +1,175 @@
+"""Compiled programs within JAX's transformations: derivatives of a program are programs of their own.
+
+What `jax.grad` and the like do outside of any `jax.jit` then needs no trace where these programs are found in the folder. Under
+`vmap` a program is traced. Only `insides` imports this module.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir
+
+Program = Any
+"""A `kept.Program`; here so that modules do not go round in a circle."""
+
+_Moving = tuple[bool, ...]
+"""Which values have a tangent."""
+
+_call, _linear = Primitive("program"), Primitive("linear_program")
+_call.multiple_results = _linear.multiple_results = True
+
+
+def call_program(program: Program, leaves: list[Any]) -> list[Any]:
+    """`program(*leaves)`, where JAX differentiates or batches, but stages nothing."""
+    return _call.bind(*leaves, program=program)
+
+
+def is_staged() -> bool:
+    """Whether what is computed here becomes part of a program, as within `jax.jit`; not by `grad` and `vmap` alone."""
+    return isinstance(jnp.zeros(()), Tracer)
+
+
+def _chosen(which: _Moving, values: Any) -> list[Any]:
+    return [value for chosen, value in zip(which, values, strict=True) if chosen]
+
+
+def _differentiated(primals: Any, tangents: Any, *, program: Program) -> tuple[list[Any], list[Any]]:
+    moving = tuple(not isinstance(slope, ad.Zero) and slope.dtype != jax.dtypes.float0 for slope in tangents)
+    moves = _chosen(moving, tangents)
+    if any(isinstance(slope, Tracer) for slope in moves):
+        linearised = _linearised(program, moving)
+        results = _call.bind(*primals, program=linearised)
+        moved, places, program.note = linearised.note
+        values, own = results[: len(moved)], iter(results[len(moved) :])
+        stored = [next(own) if place is None else primals[place] for place in places]
+        forms = tuple(map(jax.typeof, _chosen(moved, values)))
+        types = tuple(map(jax.typeof, primals))
+        slopes = _linear.bind(*stored, *moves, program=program, moving=moving, types=types, forms=forms)
+    else:  # forward mode stores nothing
+        pushed = _pushed(program, moving)
+        results = _call.bind(*primals, *moves, program=pushed)
+        moved, program.note = pushed.note
+        values, slopes = results[: len(moved)], results[len(moved) :]
+    rest = iter(slopes)
+    return values, [
+        next(rest) if moves else ad.Zero(jax.typeof(value).to_tangent_aval())
+        for moves, value in zip(moved, values, strict=True)
+    ]
+
+
+def _of_moving(program: Program, moving: _Moving, leaves: Any) -> Callable[..., list[Any]]:
+    """The program as a function of those of its arguments that move."""
+
+    def fun(*own: Any) -> list[Any]:
+        following = iter(own)
+        return program.traced(*(next(following) if moves else leaf for moves, leaf in zip(moving, leaves, strict=True)))
+
+    return fun
+
+
+def _that_move(jaxpr: Any, moves: Any) -> _Moving:
+    """Which results of a jaxpr depend on these of its variables."""
+    seen = set(moves)
+    for equation in jaxpr.eqns:
+        if any(value in seen for value in equation.invars if not hasattr(value, "val")):
+            seen.update(equation.outvars)
+    return tuple(not hasattr(value, "val") and value in seen for value in jaxpr.outvars)
+
+
+def _pushed(program: Program, moving: _Moving) -> Program:
+    """Values, and the tangents of those that move; its note says which, and has that of the program."""
+
+    def pushed(*leaves: Any) -> tuple[list[Any], Any]:
+        def both(*leaves: Any) -> tuple[list[Any], list[Any]]:
+            primals, moves = leaves[: len(moving)], leaves[len(moving) :]
+            return jax.jvp(_of_moving(program, moving, primals), _chosen(moving, primals), list(moves))
+
+        jaxpr = jax.make_jaxpr(both)(*leaves)
+        results, count = jaxpr_as_fun(jaxpr)(*leaves), len(jaxpr.out_avals) // 2
+        moved = _that_move(jaxpr.jaxpr, jaxpr.jaxpr.invars[len(moving) :])[count:]
+        return [*results[:count], *_chosen(moved, results[count:])], (moved, program.note)
+
+    return program.derived(f"{moving} pushed", pushed)
+
+
+def _linearised(program: Program, moving: _Moving) -> Program:
+    """Values, and what the linear function stores besides the arguments; its note says which values move and what is stored, an
+    argument by its place, and has the program's note."""
+
+    def linearised(*leaves: Any) -> tuple[list[Any], Any]:
+        values, linear = jax.linearize(_of_moving(program, moving, leaves), *_chosen(moving, leaves))
+        stored, structure = jax.tree.flatten(linear)
+        places = [next((k for k, leaf in enumerate(leaves) if leaf is value), None) for value in stored]
+        jaxpr = jax.make_jaxpr(linear)(*_chosen(moving, leaves)).jaxpr
+        moved = _that_move(jaxpr, jaxpr.invars)
+        program.linear[moving] = structure, moved
+        own = [value for value, place in zip(stored, places, strict=True) if place is None]
+        return [*values, *own], (moved, places, program.note)
+
+    return program.derived(f"{moving} linearised", linearised)
+
+
+def _linear_function(program: Program, moving: _Moving, types: Any) -> tuple[Any, _Moving]:
+    """The linear function's structure, into which what it stores is put, and which of its results are not zero."""
+    if moving not in program.linear:  # the linearised program was found in the folder
+        jax.eval_shape(lambda *leaves: _linearised(program, moving).fun(*leaves)[0], *types)
+    return program.linear[moving]
+
+
+def _pushing(program: Program, moving: _Moving, types: Any) -> Callable[..., list[Any]]:
+    """The linear function of what it stores and of the tangents."""
+    structure, moved = _linear_function(program, moving, types)
+
+    def slopes(*leaves: Any) -> list[Any]:
+        linear = jax.tree.unflatten(structure, leaves[: structure.num_leaves])
+        return _chosen(moved, linear(*leaves[structure.num_leaves :]))
+
+    return slopes
+
+
+def _linear_program(program: Program, moving: _Moving, types: Any, **_: Any) -> Program:
+    return program.derived(f"{moving} linear", lambda *leaves: (_pushing(program, moving, types)(*leaves), None))
+
+
+def _transposed(cotangents: Any, *leaves: Any, program: Program, moving: _Moving, types: Any, **_: Any) -> list[Any]:
+    def pulled(*leaves: Any) -> tuple[list[Any], None]:
+        count = _linear_function(program, moving, types)[0].num_leaves
+        stored, given = leaves[:count], leaves[count:]
+        slopes = functools.partial(_pushing(program, moving, types), *stored)
+        return list(jax.linear_transpose(slopes, *_chosen(moving, types))(list(given))), None
+
+    stored = [leaf for leaf in leaves if not ad.is_undefined_primal(leaf)]
+    given = map(ad.instantiate_zeros, cotangents)
+    results = _call.bind(*stored, *given, program=program.derived(f"{moving} transposed", pulled))
+    return [None] * len(stored) + results
+
+
+def _batched(leaves: Any, axes: Any, *, program: Program) -> tuple[list[Any], list[int]]:
+    results = jax.vmap(jax.jit(program.traced), in_axes=tuple(axes))(*leaves)
+    return results, [0] * len(results)
+
+
+_call.def_impl(lambda *leaves, program: program(*leaves))
+_call.def_abstract_eval(lambda *types, program: list(map(jax.typeof, jax.eval_shape(program.traced, *types))))
+ad.primitive_jvps[_call] = _differentiated
+batching.primitive_batchers[_call] = _batched
+mlir.register_lowering(_call, mlir.lower_fun(lambda *leaves, program: program.traced(*leaves), multiple_results=True))
+
+
+def _as_call(rule: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda first, second, **given: rule(first, second, program=_linear_program(**given))
+
+
+_linear.def_impl(lambda *leaves, **given: _linear_program(**given)(*leaves))
+_linear.def_abstract_eval(lambda *_, forms, **__: list(forms))
+ad.primitive_jvps[_linear] = _as_call(_differentiated)
+ad.primitive_transposes[_linear] = _transposed
+batching.primitive_batchers[_linear] = _as_call(_batched)
+mlir.register_lowering(
+    _linear, mlir.lower_fun(lambda *leaves, **given: _linear_program(**given).traced(*leaves), multiple_results=True)
+)
