@@ -2,13 +2,21 @@
 
 Each program is made in a process of its own, without a cache. The scene is one terrain of `--heights` a side under one
 directional light, with shadows and smooth normals, 512 x 512 pixels (for the fit 128 x 128).
+
+With --second: what a first process takes, with an empty folder of programs, and what the second one does, which finds them
+there. CPU seconds of all threads, and seconds of the clock; from start to end, with the import of JAX and the work itself.
 """
 
 import json
+import os
+import re
+import resource
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import benchmark
@@ -22,6 +30,23 @@ PROGRAMS = {
     "linearise": "a fit's picture with its derivative, with points on edges",
     "step": "a step of a fit, from that",
 }
+FIT = """
+import numpy as np
+import jaxhf
+from jaxhf.scene.procedural import fractal
+
+heights = fractal([32, 32], seed=3, exponent=2.4, range=(0.0, 3.0)).astype(np.float32)
+camera = jaxhf.Orthographic.look_at((15.5, 15.5, 500), (15.5, 15.5, 0), up=(0, 1, 0), extent=31.0, width=32, height=32)
+
+def scene(heights, azimuth):
+    field = jaxhf.Heightfield(heights, dx=1.0)
+    return jaxhf.Scene([jaxhf.Object(field)], camera, [jaxhf.Directional.from_angles(azimuth, 35)])
+
+pictures = [jaxhf.render(scene(heights, azimuth))[..., 0] for azimuth in (100, 220, 340)]
+jaxhf.fit([scene(0 * heights, azimuth) for azimuth in (100, 220, 340)], pictures)
+"""
+README = re.search(r"```python\n(.*?)```", (Path(__file__).parents[1] / "README.md").read_text(), re.DOTALL)
+TERRAIN = "import jaxhf; jaxhf.save_heights('terrain.tif', jaxhf.jacksboro())"
 STAGES = ("trace", "lower", "compile")
 
 
@@ -145,16 +170,45 @@ def measure(name: str, size: int) -> dict[str, float]:
     return cost | {"equations": sum(1 for _ in equations(traced.jaxpr.jaxpr)), "lines": text.count("\n")}
 
 
+def second(run: benchmark.Run) -> None:
+    assert README is not None
+    view = ["-m", "jaxhf", "view", "terrain.tif", "-o", "picture.png"]
+    processes = {"README's Python block": ["-c", README[1]], "a fit of 32 x 32 heights": ["-c", FIT], "`jaxhf view`": view}
+    for name, words in processes.items():
+        with tempfile.TemporaryDirectory() as folder:
+            environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
+            environment["JAXHF_CACHE"] = str(Path(folder) / "programs")
+
+            def spent(words: list[str], folder: str = folder, environment: dict[str, str] = environment) -> tuple[float, float]:
+                before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+                subprocess.run(
+                    [sys.executable, *words], cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                )  # fmt: skip
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, time.perf_counter() - begin
+
+            spent(["-c", TERRAIN])
+            (first, begun), (again, ended) = spent(words), spent(words)
+            times = {"first, CPU s": first, "second, CPU s": again, "first, s": begun, "second, s": ended}
+            run.row(name, times)
+    run.end()
+
+
 def main() -> None:
     run = benchmark.Run(__doc__)
     parser = run.parser
     parser.add_argument("--heights", type=int, default=256, help="a side (256)")
     parser.add_argument("--repeats", type=int, default=3, help="processes for each program, of which the median is told (3)")
     parser.add_argument("programs", nargs="*", help=f"out of {', '.join(PROGRAMS)} (all)")
+    parser.add_argument("--second", action="store_true", help="first and second processes instead; POSIX alone")
     parser.add_argument("--child", help=benchmark.HIDDEN)
     options = run.parse()
     if options.child:
         print(json.dumps(measure(options.child, options.heights)))
+        return
+    if options.second:
+        second(run)
         return
     for name in options.programs or PROGRAMS:
         command = [sys.executable, __file__, "--child", name, "--heights", str(options.heights)]

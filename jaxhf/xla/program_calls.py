@@ -41,6 +41,9 @@ def _chosen(which: _Moving, values: Any) -> list[Any]:
 def _differentiated(primals: Any, tangents: Any, *, program: Program) -> tuple[list[Any], list[Any]]:
     moving = tuple(not isinstance(slope, ad.Zero) and slope.dtype != jax.dtypes.float0 for slope in tangents)
     moves = _chosen(moving, tangents)
+    if not moves:
+        values = _call.bind(*primals, program=program)
+        return values, _zeros(values)
     if any(isinstance(slope, Tracer) for slope in moves):
         linearised = _linearised(program, moving)
         results = _call.bind(*primals, program=linearised)
@@ -55,11 +58,12 @@ def _differentiated(primals: Any, tangents: Any, *, program: Program) -> tuple[l
         results = _call.bind(*primals, *moves, program=pushed)
         moved, program.note = pushed.note
         values, slopes = results[: len(moved)], results[len(moved) :]
-    rest = iter(slopes)
-    return values, [
-        next(rest) if moves else ad.Zero(jax.typeof(value).to_tangent_aval())
-        for moves, value in zip(moved, values, strict=True)
-    ]
+    rest, zeros = iter(slopes), _zeros(values)
+    return values, [next(rest) if moves else zero for moves, zero in zip(moved, zeros, strict=True)]
+
+
+def _zeros(values: list[Any]) -> list[Any]:
+    return [ad.Zero(jax.typeof(value).to_tangent_aval()) for value in values]
 
 
 def _of_moving(program: Program, moving: _Moving, leaves: Any) -> Callable[..., list[Any]]:
