@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax._src.config import trace_context
+from jax._src.util import cache
 from jax.experimental.compilation_cache import compilation_cache as compilation_cache
 from jax.experimental.serialize_executable import deserialize_and_load as deserialize_and_load, serialize as serialize
 from jax.extend.core import ClosedJaxpr, Primitive, get_opaque_trace_state, jaxpr_as_fun
@@ -202,6 +203,12 @@ def _lower_in_memory(context: Any, array: Any) -> Any:
 
 mlir.register_lowering(in_memory, lambda context, array: [array])
 mlir.register_lowering(in_memory, _lower_in_memory, platform="cpu")
+
+
+@cache(max_size=None, trace_context_in_key=False)
+def generation() -> object:
+    """The same until `jax.clear_caches()` is called, then another one."""
+    return object()
 
 
 def untraced(fun: Callable[[], Any]) -> Any:

@@ -58,6 +58,7 @@ class Kept:
         self.fun, self.options, self.static, self.donated = fun, options, static, donated
         self.signature = inspect.signature(fun)
         self.ready: dict[Any, Program] = {}
+        self.generation: object = None
 
     @staticmethod
     def serves(fun: Callable[..., Any]) -> bool:
@@ -65,7 +66,7 @@ class Kept:
         more than to run them. A function within another may hold values of it."""
         config = jax.config
         watched = config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs  # pyright: ignore
-        if watched or "<" in getattr(fun, "__qualname__", "<") or not jax.sharding.get_abstract_mesh().empty:
+        if watched or not inspect.isfunction(fun) or "<" in fun.__qualname__ or not jax.sharding.get_abstract_mesh().empty:
             return False
         return jax.default_backend() == "cpu" and jax.process_count() == 1
 
@@ -79,6 +80,8 @@ class Kept:
             leaves = [leaf for k, leaf in enumerate(leaves) if k not in others]
         module = insides()
         assert module is not None
+        if self.generation is not (generation := module.generation()):
+            self.ready, self.generation = {}, generation
         form = static, tuple(others.items()), tree, tuple(map(jax.typeof, leaves)), module.configuration()
         if form not in self.ready:
             self.ready[form] = self._program(static, others, tree, form[3])

@@ -64,6 +64,22 @@ def test_another_source_or_configuration_is_traced_again(folder, monkeypatch):
     assert traced == [2, 2, 2]
 
 
+def test_cleared_caches_hold_no_program(folder):
+    """As they do not know how their programs were compiled."""
+    keeps = compiled(scaled, static_argnames=("power",))
+
+    def call_again():
+        keeps(Pair(jnp.ones(2), jnp.ones(2)), 2.0, power=2)
+
+    call_again()
+    next(folder.iterdir()).unlink()
+    call_again()
+    assert traced == [2]
+    jax.clear_caches()
+    call_again()
+    assert traced == [2, 2]
+
+
 def test_what_jax_has_kept_is_not_kept_again(folder, monkeypatch):
     """XLA stores a loaded program without its kernels: it loads, and fails where it runs."""
     before = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
