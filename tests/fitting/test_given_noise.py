@@ -38,7 +38,7 @@ def test_a_detectors_noise_is_that_of_weights_made_by_hand():
     assert found.stats["chi2"] == same.stats["chi2"]
     assert 0.9 < found.stats["chi2"] < 1.1
     # By the recipe of weights alone, with a noise of 1: to a tenth of what a fit leaves undone.
-    recipe = [(1.0 if m is None else m) / np.sqrt(READ**2 + GAIN * np.maximum(t, 0)) for t, m in zip(targets, masks, strict=True)]
+    recipe = [weight / one for weight, one in zip(weights, noise, strict=True)]
     other = jaxhf.fit(scenes(), targets, noise=1.0, weights=recipe, prior=KNOWN, settings=SETTINGS)
     np.testing.assert_allclose(found.heights, other.heights, atol=1e-3 * np.ptp(TRUTH))
 
@@ -49,10 +49,9 @@ def test_dark_pixels_count_more_than_bright_ones():
     exact = pictures(albedo=painted)
     dark = [image < np.median(image) for image in exact]
     targets = [np.where(where, 1.01, 0.99) * image for image, where in zip(exact, dark, strict=True)]
-    found = jaxhf.fit(
-        scenes(TRUTH, painted), targets, prior=jaxhf.Prior(TRUTH, 1e-5), unknown=jaxhf.Unknown(albedo="constant"), settings=SETTINGS,
-        noise=jaxhf.Noise(0.0002, 0.0001),
-    )  # fmt: skip
+    known, unknown = jaxhf.Prior(TRUTH, 1e-5), jaxhf.Unknown(albedo="constant")
+    noise = jaxhf.Noise(0.0002, 0.0001)
+    found = jaxhf.fit(scenes(TRUTH, painted), targets, prior=known, unknown=unknown, noise=noise, settings=SETTINGS)
     told = [1 / (0.0002**2 + 0.0001 * target) for target in targets]
     above = sum(np.sum(w * image * target) for w, image, target in zip(told, exact, targets, strict=True))
     below = sum(np.sum(w * image**2) for w, image in zip(told, exact, strict=True))
