@@ -103,7 +103,8 @@ def within_map(orbit: Orbit) -> tuple[jaxhf.Heightfield, jaxhf.Heightfield]:
     places = np.arange(orbit.begin - MARGIN, orbit.begin + SIDE + MARGIN + 1)
     between = RectBivariateSpline(orbit.posts, orbit.posts, orbit.heights)(places, places)
     fine = jaxhf.Heightfield(between.astype(np.float32), 1.0, 1.0, float(places[0]), float(places[0]))
-    return jaxhf.nested(fine, jaxhf.Heightfield(orbit.heights.astype(np.float32), step, step, first, first))
+    fine, around = jaxhf.nested(fine, jaxhf.Heightfield(orbit.heights.astype(np.float32), step, step, first, first))
+    return fine, around
 
 
 def deviations(fine: jaxhf.Heightfield, orbit: Orbit, std: float) -> np.ndarray:
@@ -117,7 +118,8 @@ def deviations(fine: jaxhf.Heightfield, orbit: Orbit, std: float) -> np.ndarray:
 def mask(counts: np.ndarray) -> np.ndarray:
     """Where there is neither a shadow nor a cloud, by a picture alone."""
     dark, cloud = counts < DARK * np.median(counts), counts >= FULL
-    return ~(ndimage.binary_dilation(dark, np.ones((3, 3))) | ndimage.binary_dilation(cloud, iterations=SOFT))
+    beside = ndimage.binary_dilation(dark, np.ones((3, 3))), ndimage.binary_dilation(cloud, iterations=SOFT)
+    return ~np.logical_or(*beside)
 
 
 def rms(values: np.ndarray) -> float:
