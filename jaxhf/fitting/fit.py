@@ -58,8 +58,8 @@ def fit(
         with one channel is compared with the mean over a picture's channels.
       prior: heights that are known beforehand, and how well; None: nothing.
       unknown: what is to be found besides the heights; None: nothing.
-      noise: standard deviation of a target's values at weight 1, radiance; one number or one for each picture. None: each
-        picture's is estimated from what the fit leaves of it, see `Fit.noise`.
+      noise: standard deviation of a target's values at weight 1, radiance, or a `Noise`, by which it grows with the value; one
+        or one for each picture. None: each picture's is estimated from what the fit leaves of it, see `Fit.noise`.
       weights: for each picture None or a map (h, w) or (h, w, c), from 0 (masked: the target may be nan there)
         on; it divides the noise.
       start: heights to begin with: a number (flat), a grid over the same footprint, of any size, or None: those of the
@@ -102,8 +102,8 @@ def fit(
 
 
 def _found(scenes: tuple[Scene, ...], targets: tuple[Any, ...], given: Given) -> Fit:
-    targets, weights = checked_pictures(scenes, targets, given.weights)
-    given = dataclasses.replace(given, weights=weights)
+    targets, weights, noise = checked_pictures(scenes, targets, given.weights, given.noise)
+    given = dataclasses.replace(given, weights=weights, noise=noise)
     problem, unknowns = make_problem(scenes, targets, given)
     levels = factors(scenes, problem.settings.samples or 1)
     coarse = [make_problem(*coarser(scenes, targets, given, factor)) for factor in levels[:-1]]

@@ -20,6 +20,7 @@ from .history import Draws, Step
 
 Albedo = Literal["constant", "map"]
 _MOST_ANGLE = 45  # degrees
+NOISE_RULE = "must be positive or a jaxhf.Noise, one or one for each scene"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,6 +51,36 @@ class Prior:
             given = f"{std:g}" if std.ndim == 0 else f"{std.min():g} to {std.max():g}"
             raise ArgumentError("Prior", "std", f"must be finite, from 0 on, not all 0; it is {given}")
         _require_positive("Prior", "length", self.length)
+
+
+@dataclasses.dataclass(frozen=True)
+class Noise:
+    """The noise of a detector: read noise, and that of the photons, which grows with what arrives.
+
+    The standard deviation of a value v at weight 1 is sqrt(read² + gain · max(v, 0)): Janesick, Photon Transfer, 2007.
+    v is the measured value, so means that count by it are about `gain` too low, which is one photon.
+
+    Attributes:
+      read: standard deviation of a value without light, radiance as the targets have it.
+      gain: the value of one photon (electron), by which the variance grows with the value.
+      saturation: from which value on there is no measurement, so that it gets the weight 0; None: from none.
+      nodata: a value that is no measurement, either; it may be nan. None: there is none.
+    """
+
+    read: float | int
+    gain: float | int = 0.0
+    saturation: float | int | None = None
+    nodata: float | int | None = None
+
+    def __post_init__(self):
+        if not _is_positive(self.read):
+            raise ArgumentError("Noise", "read", f"must be positive and finite, it is {self.read!r}")
+        if not (_is_positive(self.gain) or np.array_equal(self.gain, 0)):
+            raise ArgumentError("Noise", "gain", f"must be from 0 on and finite, it is {self.gain!r}")
+        _require_positive("Noise", "saturation", self.saturation)
+        nodata = _real(self.nodata)
+        if self.nodata is not None and (nodata is None or nodata.shape != ()):
+            raise ArgumentError("Noise", "nodata", f"must be a number, it is {self.nodata!r}")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -176,9 +207,9 @@ class Given:
         if self.draws == 1:
             raise ArgumentError("fit", "draws", "must be 0 or from 2 on, it is 1: no deviation comes of one")
         noise = _real(self.noise)
-        if self.noise is not None and (noise is None or noise.ndim > 1):
+        if not (self.noise is None or has_detector(self.noise)) and (noise is None or noise.ndim > 1):
             given = repr(self.noise) if noise is None else f"an array of shape {noise.shape}; what varies is for weights to say"
-            raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {given}")
+            raise ArgumentError("fit", "noise", f"{NOISE_RULE}, it is {given}")
         if self.noise is None and self.unknown.albedo_length is not None:
             raise ArgumentError("fit", "noise", "must be given where albedo_length is: such an albedo leaves too little of it")
         if not (callable(self.progress) or isinstance(self.progress, bool)):
@@ -192,6 +223,19 @@ def _real(value: Any) -> np.ndarray | None:
     except (TypeError, ValueError):  # lists of several lengths
         return None
     return found if found.dtype.kind in "iuf" else None
+
+
+def has_detector(noise: Any) -> bool:
+    """Whether a `Noise` is among what is given."""
+    return any(isinstance(one, Noise) for one in (noise if isinstance(noise, list | tuple) else [noise]))
+
+
+def noise_of_each(noise: Any, count: int) -> list[Any]:
+    """A number or a `Noise` for each of so many pictures, where there is one among what is given."""
+    found = list(noise) if isinstance(noise, list | tuple) else [noise] * count
+    if len(found) != count or not all(isinstance(one, Noise) or _is_positive(one) for one in found):
+        raise ArgumentError("fit", "noise", f"{NOISE_RULE}, it is {noise!r}")
+    return found
 
 
 def _is_positive(value: Any) -> bool:

@@ -115,7 +115,7 @@ def fit_windows(
       ValueError: as by `fit`, and a checkpoint of another terrain.
     """
     scenes, targets = tuple(scenes), tuple(targets)
-    targets, weights = checked_pictures(scenes, targets, weights)
+    targets, weights, noise = checked_pictures(scenes, targets, weights, noise)
     field = scenes[0].heightfields[0]
     shape = field.heights.shape
     if not isinstance(prior, Prior):

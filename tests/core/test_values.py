@@ -61,7 +61,7 @@ MADE = {
     "horizon": (lambda z: jaxhf.horizon(z, 2, dx=1.0), HEIGHTS),
     "hillshade": (lambda z: jaxhf.hillshade(z, 1.0), HEIGHTS),
     "start of a fit": (lambda z: make_heights("fit", "start", z, FIELD), HEIGHTS.astype(np.float64)),
-    "targets and weights of a fit": (lambda image, weight: checked_pictures([SCENE], [image], [weight]),
+    "targets and weights of a fit": (lambda image, weight: checked_pictures([SCENE], [image], [weight], None),
                                      HEIGHTS.astype(np.float64), HEIGHTS.astype(np.float64)),
 }  # fmt: skip
 

@@ -106,6 +106,16 @@ def test_every_key_arrives(folder):
     assert isinstance(second.lights[0], jaxhf.Sky)
 
 
+def test_a_detectors_noise_is_a_table(folder):
+    """Of all pictures, and of one that says another."""
+    text = PICTURE + PICTURE + "noise = { read = 1, nodata = 9 }\n" + PICTURE + "noise = 0.5\n"
+    found = case(folder, SCENE + text + "[fit.noise]\nread = 0.1\ngain = 0\nsaturation = 2\n")
+    first = {"read": 0.1, "gain": 0, "saturation": 2}
+    assert found.noise == (first, {"read": 1, "nodata": 9}, 0.5)
+    assert {"read", "gain", "saturation", "nodata"} == {field.name for field in dataclasses.fields(jaxhf.Noise)}
+    assert jaxhf.Noise(**first).saturation == 2
+
+
 @pytest.mark.parametrize(("dtype", "top"), [(np.uint8, 255), (np.uint16, 65535)])
 def test_weights_in_a_png_are_no_colours(folder, dtype, top):
     """Their share of the top, not what sRGB makes of it; a mask is what is not black."""
@@ -294,7 +304,10 @@ BAD = [
     (of_picture('mask = "mask.png"\nweights = "grey.npy"'), 17, "pictures[0] must have mask or weights, it has both"),
     (of_picture('mask = "prior.npy"'), 16, "pictures[0].mask must have the size of the image, 4 x 3 pixels; it is 3 x 3"),
     (SIZED, 17, "pictures[0].image must have the proportions of its camera, 50 x 30 pixels; it is 4 x 3 pixels"),
-    (of_picture("noise = 0"), 16, "pictures[0].noise must be positive, it is 0"),
+    (of_picture("noise = 0"), 16, "pictures[0].noise must be positive or a table, it is 0"),
+    (of_picture("noise = { read = 0 }"), 16, "pictures[0].noise.read must be positive, it is 0"),
+    (of_fit("[fit.noise]\nread = 1\ngain = -1"), 20, "fit.noise.gain must be from 0 on, it is -1"),
+    (of_fit("noise = { gain = 1 }"), 18, "fit.noise must have 'read', it is missing"),
     (of_fit('prior = { heights = 0, std = "colour.npy" }'), 18, "colour.npy: heights must have shape (ny, nx)"),
     (of_fit("prior = { heights = 0 }"), 18, "fit.prior must have 'std', it is missing"),
     (of_fit("prior_std = 1"), 18, "unknown key 'prior_std' in fit; did you mean 'prior'"),

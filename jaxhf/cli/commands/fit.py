@@ -13,7 +13,7 @@ import numpy as np
 from ...core.errors import ArgumentError, UserError, counted
 from ...core.extras import import_extra
 from ...fitting.fit import fit
-from ...fitting.given import Checkpoint, Prior, Unknown
+from ...fitting.given import Checkpoint, Noise, Prior, Unknown
 from ...fitting.history import Draws, Pace, Step
 from ...fitting.trust.judge import Fit
 from ...fitting.windows import Mosaic, fit_windows
@@ -82,10 +82,11 @@ def _fit(case: Case, checkpoint: Path, options: argparse.Namespace) -> Fit | Mos
     windows = options.window is not None
     progress = _Progress(", then deviations" if case.options.get("draws") and not windows else "")
     try:
+        noise = case.noise and [Noise(**one) if isinstance(one, dict) else one for one in case.noise]
         given: dict[str, Any] = {
             "prior": Prior(**case.prior) if case.prior else None,
             "unknown": Unknown(**case.unknown) if case.unknown else None,
-            "noise": case.noise, "weights": case.weights, "settings": case.settings,
+            "noise": noise, "weights": case.weights, "settings": case.settings,
             "checkpoint": Checkpoint(checkpoint, resume=options.resume), **case.options,
         }  # fmt: skip
         with told(progress.line):

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ...core.errors import ArgumentError
 from ...core.precision import numbers
@@ -20,6 +20,7 @@ from ...preparation.world import resolve_settings
 from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
+from ..given import Noise, has_detector, noise_of_each
 from .view import KNOWN, View, with_numbers
 
 
@@ -75,14 +76,23 @@ def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Seq
 
 
 def checked_pictures(
-    scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None
-) -> tuple[tuple[np.ndarray, ...], list[Float[np.ndarray, "h w c"]]]:
+    scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None, noise: Any
+) -> tuple[tuple[np.ndarray, ...], list[Float[np.ndarray, "h w c"]], Any]:
     """Checks scenes, targets and weights; returns the targets with nan where they have no weight, as no statistic counts these,
-    and the weight of each of their values."""
+    the weight of each of their values, and the noise at weight 1 in numbers.
+
+    That of a `Noise` is the root mean square of its values' deviations; weights say by how much each differs from that.
+    """
     require_scenes(scenes, targets, weights)
-    pairs = [_checked_picture(k, *pair, weights) for k, pair in enumerate(zip(scenes, targets, strict=True))]
+    if not has_detector(noise):
+        pairs = [_checked_picture(k, *pair, weights) for k, pair in enumerate(zip(scenes, targets, strict=True))]
+    else:
+        detectors = noise_of_each(noise, len(scenes))
+        known = enumerate(zip(scenes, targets, detectors, strict=True))
+        triples = [_by_detector(one, *_checked_picture(k, scene, target, weights, one)) for k, (scene, target, one) in known]
+        pairs, noise = [(values, weight) for values, weight, _ in triples], np.array([number for *_, number in triples])
     kept = [np.where(weight > 0, values, np.nan) for values, weight in pairs]
-    return tuple(map(np.reshape, kept, map(np.shape, targets))), [weight for _, weight in pairs]
+    return tuple(map(np.reshape, kept, map(np.shape, targets))), [weight for _, weight in pairs], noise
 
 
 def make_groups(
@@ -194,9 +204,9 @@ def _require_alike(k: int, scene: Scene, first: Scene) -> None:
 
 
 def _checked_picture(
-    k: int, scene: Scene, target: Any, weights: Sequence[Any] | None
+    k: int, scene: Scene, target: Any, weights: Sequence[Any] | None, noise: Any = None
 ) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w c"]]:
-    """Target and weight of one picture."""
+    """Target and weight of one picture; 0 where a `Noise` says that it is no measurement."""
     size = (scene.camera.height, scene.camera.width)
     if isinstance(target, str | os.PathLike):
         raise ArgumentError("fit", f"targets[{k}]", f"must be an image, it is a name: jaxhf.load_image({os.fspath(target)!r})")
@@ -221,6 +231,12 @@ def _checked_picture(
             "fit", f"weights[{k}]", f"must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}"
         )
     weight = np.broadcast_to(weight.reshape(*size, -1), target.shape)
+    if isinstance(noise, Noise):
+        weight = np.where(_is_measured(noise, target, given), weight, 0)
+        if not weight.any():
+            limits = f"saturation, {noise.saturation!r}, and other than nodata, {noise.nodata!r}"
+            rule = f"must have values with a weight that are below its Noise's {limits}; it has none"
+            raise ArgumentError("fit", f"targets[{k}]", rule)
     bad = ~np.isfinite(target) & (weight > 0)
     if bad.any():
         y, x, c = np.argwhere(bad)[0]
@@ -229,6 +245,29 @@ def _checked_picture(
         )
         raise ArgumentError("fit", f"targets[{k}]", rule)
     return target, weight
+
+
+def _is_measured(noise: Noise, target: Float[np.ndarray, "h w c"], dtype: np.dtype) -> Bool[np.ndarray, "h w c"]:
+    """Which values are neither saturated nor without data; those that divide them are rounded as the target was, to `dtype`."""
+    found = np.ones(target.shape, bool)
+    if noise.saturation is not None:
+        found &= ~(target >= np.asarray(noise.saturation, dtype).astype(np.float64))
+    if noise.nodata is not None:
+        nodata = np.asarray(noise.nodata, dtype).astype(np.float64)
+        found &= ~np.isnan(target) if np.isnan(nodata) else target != nodata
+    return found
+
+
+def _by_detector(
+    noise: Noise | float, target: Float[np.ndarray, "h w c"], weight: Float[np.ndarray, "h w c"]
+) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w c"], float]:
+    """Target and weight of one picture, and its noise at weight 1."""
+    if not isinstance(noise, Noise):
+        return target, weight, float(noise)
+    counts = weight > 0
+    variance = noise.read**2 + noise.gain * np.maximum(np.where(counts, target, 0), 0)
+    mean = np.mean(variance[counts])
+    return target, weight * np.sqrt(mean / variance), float(np.sqrt(mean))
 
 
 def _picture(

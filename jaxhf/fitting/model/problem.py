@@ -19,7 +19,7 @@ from ...scene.light import Sky
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 from ...xla.devices import chosen_mesh
-from ..given import Given, Unknown
+from ..given import NOISE_RULE, Given, Unknown
 from .albedo import AlbedoField, make_albedo_field
 from .defaults import choose_edge_samples, choose_samples
 from .pictures import Group, albedo_of, make_groups
@@ -264,7 +264,7 @@ def _noise(given: Any, brightness: Float[np.ndarray, " pictures"]) -> Float[np.n
         return _FIRST_NOISE * brightness
     noise = np.asarray(numbers(given), np.float64)
     if noise.shape not in ((), brightness.shape) or not (np.isfinite(noise) & (noise > 0)).all():
-        raise ArgumentError("fit", "noise", f"must be positive, one number or one for each scene, it is {given!r}")
+        raise ArgumentError("fit", "noise", f"{NOISE_RULE}, it is {given!r}")
     return np.broadcast_to(noise, brightness.shape).copy()
 
 

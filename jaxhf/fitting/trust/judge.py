@@ -50,7 +50,8 @@ class Fit:
       seen: whether a change of the height would change any picture, shape (ny, nx).
       albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c); None where it was known.
       exposures, offsets: of each picture; None where they were known.
-      noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated.
+      noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated. Of a
+        `Noise` it is the root mean square over the values that count.
       scenes: as they were given, with all that was found: heights, albedo, lights and cameras.
       settings: those that were given, with all that was chosen: `render` with them makes `images` of `scenes`, but for the
         pixels that a boundary crosses, which have more samples in a fit.

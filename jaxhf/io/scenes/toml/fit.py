@@ -24,7 +24,7 @@ from .checks import Part
 from .priors import Provenance, known_heights
 from .scene import open_toml, read_camera, read_image, read_lights, read_samples, read_world
 from .tables import SCENE, Key, Keys, optional
-from .values import flag, number, numbers, or_word, positive, table, tables, whole, word
+from .values import flag, not_negative, number, numbers, or_table, or_word, positive, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
 _CASE: Keys = {
@@ -38,7 +38,7 @@ _CASE: Keys = {
 _PICTURE: Keys = {
     "image": Key(word, needed=True),
     **optional("transfer", "mask", "weights", kind=word),
-    **optional("noise", kind=positive),
+    **optional("noise", kind=or_table(positive)),
     **optional("camera", kind=table),
     **optional("lights", kind=tables),
 }
@@ -46,9 +46,15 @@ _ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argu
 # Those of `fit`, `Prior` and `Unknown`, whose defaults they have and who check their values.
 _FIT: Keys = {
     **optional("start", kind=or_word(number)),
-    **optional("noise", kind=positive),
+    **optional("noise", kind=or_table(positive)),
     **optional("draws", "max_steps", kind=whole),
     **optional("prior", "unknown", kind=table),
+}
+_NOISE: Keys = {
+    "read": Key(positive, needed=True),
+    **optional("gain", kind=not_negative),
+    **optional("saturation", kind=positive),
+    **optional("nodata", kind=number),
 }
 _PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number), needed=True)), **optional("length", kind=number)}
 _UNKNOWN: Keys = {
@@ -69,7 +75,8 @@ class Case:
     """What a file asks `fit` for.
 
     Attributes:
-      scenes, targets, weights, noise, settings: as `fit` takes them; a grey picture has shape (h, w).
+      scenes, targets, weights, settings: as `fit` takes them; a grey picture has shape (h, w).
+      noise: of each picture a number, or the arguments of its `Noise`; None: it is not known.
       options: `start`, `draws` and `max_steps` of `fit`, those that the file gives.
       prior, unknown: the same of `Prior` and `Unknown`; empty: there is no such table.
       names: the pictures' files, as written.
@@ -80,7 +87,7 @@ class Case:
     scenes: tuple[Scene, ...]
     targets: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray | None, ...]
-    noise: tuple[float, ...] | None
+    noise: tuple[float | dict[str, float], ...] | None
     settings: Settings
     options: dict[str, Any]
     prior: dict[str, Any]
@@ -132,7 +139,9 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     chosen = part.at("fit")
     options, unknown = chosen.read(_FIT), chosen.at("unknown").read(_UNKNOWN)
     prior = chosen.at("prior").read(_PRIOR) if "prior" in options else {}
-    noise, *_ = (options.pop(name, None) for name in ("noise", "prior", "unknown"))
+    noise = _noise(chosen, options)
+    for name in ("noise", "prior", "unknown"):
+        options.pop(name, None)
     for place, given in ((chosen, options), (chosen.at("prior"), prior)):
         for name, value in given.items():
             if isinstance(value, str):
@@ -148,13 +157,21 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     )  # fmt: skip
 
 
-def _picture(part: Part, base: _Base, noise: float | None) -> tuple[Scene, np.ndarray, np.ndarray | None, float | None, str]:
+def _noise(part: Part, given: dict[str, Any]) -> float | dict[str, float] | None:
+    """That of a table: a number, or arguments of `Noise`."""
+    noise = given.get("noise")
+    return part.at("noise").read(_NOISE) if isinstance(noise, dict) else noise
+
+
+def _picture(
+    part: Part, base: _Base, noise: float | dict[str, float] | None
+) -> tuple[Scene, np.ndarray, np.ndarray | None, float | dict[str, float] | None, str]:
     """A picture's scene, radiance, weights, noise and name; `noise` is that of pictures that state none."""
     given = part.read(_PICTURE)
     target = read_image(part)
     lights = read_lights(part, base.field.stored) if "lights" in given else base.lights
     scene = part.made(Scene, base.objects, _camera(part, base, target.shape[:2]), lights, base.samples)
-    return scene, target, _weights(part, target), given.get("noise", noise), given["image"]
+    return scene, target, _weights(part, target), _noise(part, given) if "noise" in given else noise, given["image"]
 
 
 def _base(part: Part, values: dict[str, Any], dtype: np.dtype) -> _Base:

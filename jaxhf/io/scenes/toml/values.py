@@ -69,6 +69,7 @@ def number(value: Any) -> float:
 
 
 positive = _kind(lambda value: number(value) > 0, "positive")
+not_negative = _kind(lambda value: number(value) >= 0, "from 0 on")
 angle_above_horizon = _kind(lambda value: -90 <= number(value) <= 90, "from -90 to 90 degrees")
 
 
@@ -80,6 +81,18 @@ def or_word(kind: Kind, tail: str = " or a string") -> Kind:
             return value if isinstance(value, str) else kind(value)
         except ValueError as error:
             raise ValueError(f"{error}{tail}") from None
+
+    return either
+
+
+def or_table(kind: Kind) -> Kind:
+    """A table, or what `kind` takes."""
+
+    def either(value: Any) -> Any:
+        try:
+            return value if isinstance(value, dict) else kind(value)
+        except ValueError as error:
+            raise ValueError(f"{error} or a table") from None
 
     return either
 
