@@ -20,6 +20,7 @@ _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
 _NO_WEIGHT = 1e-3  # of a value that is far off
 _LEAST_SHARE = 0.1  # of heights in values: of fewer heights noise would be told by 5 % too small at most
 _LEAST_FREE = 0.1  # of a picture's noise: where heights explain more, what is left does not tell the noise
+_SAID = 1.0  # modes by which what a prior is said to be off counts in each octave
 OCTAVES = 6  # into which the prior's modes are divided, at most
 _ROUNDS = 8  # at most; three or four are usual
 _NOISE_CHANGE, _WIDTH_CHANGE = 1.02, 1.1  # by less in a round: it has converged
@@ -93,8 +94,11 @@ class Restricted:
         self._labels, self._numbers = labels[self._values], _pictures(expansion.problem)[self._values]
         self._rows, self._weights = in_row(expansion.left())[self._values], _weights(expansion.problem)[self._values]
 
-    def noise(self, sought: bool) -> Estimate:
-        """The noise of each picture; where it is not `sought`, only how the heights vary."""
+    def noise(self, sought: bool, before: Float[np.ndarray, " octaves"]) -> Estimate:
+        """The noise of each picture; where it is not `sought`, only how the heights vary.
+
+        `before`: how many times as wide as its owner said the prior is already.
+        """
         problem, labels, bands = self._expansion.problem, self._labels, octaves(self._matrix.shape)
         widths = np.ones(OCTAVES)
         noise, far, change, draws = problem.noise.copy(), np.zeros(labels.size, bool), None, [None] * _draws(labels)
@@ -106,7 +110,7 @@ class Restricted:
             left = factors * (self._rows + matrix.seen(change) / matrix.roots)
             modes = matrix.modes_before() + matrix.modes_of(change)
             draws = [_simulated(matrix, seed, 1.0, None if draw is None else draw.change) for seed, draw in enumerate(draws)]
-            growth, before = np.ones(widths.size), noise
+            growth, noise_before = np.ones(widths.size), noise
             if sought:
                 noise, deviations = noise.copy(), _deviations(here)[self._values]
                 for k, which in _each_picture(labels):
@@ -118,9 +122,9 @@ class Restricted:
             if problem.known:
                 told = np.mean([draw.told for draw in draws], axis=0)
                 squares, count = (np.tensordot(bands, part) for part in (modes**2, told))
-                growth = np.sqrt((squares + 1) / (np.maximum(count, 0) + 1))
+                growth = np.sqrt((squares + _SAID / (before * widths) ** 2) / (np.maximum(count, 0) + _SAID))
                 widths = widths * growth
-            changes = [np.abs(np.log(part)).max() for part in (noise / before, growth)]
+            changes = [np.abs(np.log(part)).max() for part in (noise / noise_before, growth)]
             if changes[0] < math.log(_NOISE_CHANGE) and changes[1] < math.log(_WIDTH_CHANGE):
                 break
         return Estimate(noise, widths)

@@ -214,7 +214,7 @@ def _estimated(here: Expansion, state: State, order: Sequence[Stage], repeats: b
     sought = given.noise is None and explains_noise(posed)
     found = before._replace(noise=by_residuals)
     if stage == order[-2] and (is_open or (sought and repeats)):  # all modes of the finest heights
-        found = Restricted(here if sought else here.with_noise(by_residuals)).noise(sought)
+        found = Restricted(here if sought else here.with_noise(by_residuals)).noise(sought, state.widths)
         widths = np.clip(state.widths * found.widths, 1 / _MOST_WIDTH, _MOST_WIDTH)
         found = found._replace(widths=widths if is_open else state.widths)
     changes = np.abs(np.log(np.concatenate(found) / np.concatenate(before)))

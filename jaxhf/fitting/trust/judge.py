@@ -95,7 +95,7 @@ def judged(
 ) -> Fit:
     """What was found; `problems` are those of `run`. `report` is called after each draw."""
     fitted = varies_all(ended.state, problems) and bool(np.isfinite(ended.state.loss))
-    expansion, free = _restricted(ended.expansion, fitted, given)
+    expansion, free = _restricted(ended, fitted, given)
     problem = expansion.problem
     left = _left(expansion)
     in_noise = [picture.residual for picture in left]
@@ -163,13 +163,14 @@ def judged(
     )
 
 
-def _restricted(expansion: Expansion, fitted: bool, given: Given) -> tuple[Expansion, Freedom | None]:
+def _restricted(ended: Ended, fitted: bool, given: Given) -> tuple[Expansion, Freedom | None]:
     """The expansion with the noise of restricted maximum likelihood, and what of it the heights explain; None where they are
     few, or were not all `fitted`."""
+    expansion = ended.expansion
     if not (fitted and explains_noise(expansion.problem)):
         return expansion, None
     restricted = Restricted(expansion)
-    estimate = restricted.noise(given.noise is None)
+    estimate = restricted.noise(given.noise is None, ended.state.widths)
     if given.noise is None:
         expansion = expansion.with_noise(estimate.noise)
     return expansion, restricted.freedom(estimate)
