@@ -12,7 +12,7 @@ import jaxhf
 from jaxhf.fitting.model.linearise import LinearisedEdges, changing_pixels
 from jaxhf.fitting.model.problem import make_problem
 from jaxhf.fitting.solve import noise as _noise, run as _run
-from jaxhf.fitting.solve.noise import Restricted
+from jaxhf.fitting.solve.noise import OCTAVES, Restricted
 from jaxhf.fitting.trust.facts import misfit_of_length
 
 SUNS = ((315, 20), (60, 30), (180, 40))
@@ -133,13 +133,24 @@ def test_a_part_of_the_pictures_tells_their_noise(monkeypatch):
     exact = np.asarray(jaxhf.render(scene, jaxhf.Settings(samples=16)))[..., 0]
     target = exact + NOISE * rng.standard_normal(exact.shape)
     here = expanded([scene], [target], settings=SETTINGS, prior=jaxhf.Prior(heights, 0.05, 4.0), noise=2 * NOISE)
-    whole = Restricted(here).noise(True)
+    whole = Restricted(here).noise(True, np.ones(OCTAVES))
     np.testing.assert_allclose(whole.noise, NOISE, rtol=0.1)
     for name, value in (("_MOST_SIDE", 32), ("_BLOCK", 24), ("_LEAST_TOLD", 100)):
         monkeypatch.setattr(_noise, name, value)
     part = Restricted(here)
     assert 400 < part._values.size < 24 * 24
-    np.testing.assert_allclose(part.noise(True).noise, NOISE, rtol=0.15)  # of some 300 degrees of freedom: to 4 %
+    found = part.noise(True, np.ones(OCTAVES)).noise
+    np.testing.assert_allclose(found, NOISE, rtol=0.15)  # of some 300 degrees of freedom: to 4 %
+
+
+def test_octaves_that_no_picture_tells_come_back_to_the_priors_std():
+    """From where an estimate before had taken them; else those of which pictures tell little run away."""
+    heights, _ = terrain(1, 0.6)
+    (scene,) = scenes(heights, 1)
+    target = np.asarray(jaxhf.render(scene, jaxhf.Settings(samples=16)))[..., 0]
+    here = expanded([scene], [target], settings=SETTINGS, prior=jaxhf.Prior(heights, 0.05), noise=1e3)
+    found = Restricted(here).noise(False, np.full(OCTAVES, 5.0))
+    np.testing.assert_allclose(found.widths, 0.2, rtol=0.02)
 
 
 def fitted_to_a_map(length: float | None) -> float:
