@@ -205,7 +205,7 @@ mlir.register_lowering(in_memory, lambda context, array: [array])
 mlir.register_lowering(in_memory, _lower_in_memory, platform="cpu")
 
 
-@cache(max_size=None, trace_context_in_key=False)
+@cache(trace_context_in_key=False)
 def generation() -> object:
     """The same until `jax.clear_caches()` is called, then another one."""
     return object()
