@@ -42,7 +42,7 @@ def problem(count: int = 17) -> tuple[list[jaxhf.Scene], list[np.ndarray]]:
 def soon_judged() -> Iterator[None]:
     """The noise is estimated on the way, and not once more at the end, which takes longer than all steps."""
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(_judge, "_restricted", lambda expansion, *_: (expansion, None))
+        patched.setattr(_judge, "_restricted", lambda ended, *_: (ended.expansion, None))
         yield
 
 

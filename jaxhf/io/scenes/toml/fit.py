@@ -87,7 +87,7 @@ class Case:
     scenes: tuple[Scene, ...]
     targets: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray | None, ...]
-    noise: tuple[float | dict[str, float], ...] | None
+    noise: tuple[float | dict[str, float | int], ...] | None
     settings: Settings
     options: dict[str, Any]
     prior: dict[str, Any]
@@ -157,15 +157,15 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     )  # fmt: skip
 
 
-def _noise(part: Part, given: dict[str, Any]) -> float | dict[str, float] | None:
+def _noise(part: Part, given: dict[str, Any]) -> float | dict[str, float | int] | None:
     """That of a table: a number, or arguments of `Noise`."""
     noise = given.get("noise")
     return part.at("noise").read(_NOISE) if isinstance(noise, dict) else noise
 
 
 def _picture(
-    part: Part, base: _Base, noise: float | dict[str, float] | None
-) -> tuple[Scene, np.ndarray, np.ndarray | None, float | dict[str, float] | None, str]:
+    part: Part, base: _Base, noise: float | dict[str, float | int] | None
+) -> tuple[Scene, np.ndarray, np.ndarray | None, float | dict[str, float | int] | None, str]:
     """A picture's scene, radiance, weights, noise and name; `noise` is that of pictures that state none."""
     given = part.read(_PICTURE)
     target = read_image(part)
