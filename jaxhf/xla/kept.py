@@ -82,7 +82,7 @@ class Kept:
         assert module is not None
         if self.generation is not (generation := module.generation()):
             self.ready, self.generation = {}, generation
-        form = static, tuple(others.items()), tree, tuple(map(jax.typeof, leaves)), module.configuration()
+        form = static, tuple(others.items()), tree, tuple(map(_type, leaves)), module.configuration()
         if form not in self.ready:
             self.ready[form] = self._program(static, others, tree, form[3])
         program = self.ready[form]
@@ -105,6 +105,12 @@ class Kept:
         places = jax.tree.unflatten(tree, _among(dict.fromkeys(others), range(len(types))))
         donated = tuple(jax.tree.leaves([places[name] for name in self.donated if name in places]))
         return Program(name, known, flat, self.options, donated)
+
+
+def _type(leaf: Any) -> tuple[Any, ...]:
+    """What a trace sees of an array; JAX's own type also has a mesh, which differs between the results of programs."""
+    form = jax.typeof(leaf)
+    return form.shape, form.dtype, form.weak_type
 
 
 def _among(others: dict[int, Any], values: Any) -> list[Any]:
