@@ -6,7 +6,9 @@ import itertools
 import os
 import platform
 import re
+import stat
 import sys
+import tempfile
 import warnings
 from importlib.metadata import version
 from pathlib import Path
@@ -16,6 +18,9 @@ import jax
 from .plain import is_asked_for
 
 _MOST = 500_000_000  # bytes; a picture's programs take 0.3 million, a gradient's 0.6
+
+_FOLDER = re.compile(r"jaxhf-.*-jax-.*-jaxlib-.*-[0-9a-f]{16}")
+_PROGRAM = re.compile(r"jaxhf\..*-[0-9a-f]{32}(\..*)?|.*-(cache|atime)")  # ours and unfinished ones, and JAX's
 
 # Of the whole process, as JAX's own cache is; empty until `keep_in` is called, and until the first use.
 _chosen: list[Path | None] = []
@@ -30,8 +35,8 @@ def keep_in(folder: Path | None) -> None:
 def current() -> Path | None:
     """Where programs are kept: as `keep_in` said, or else in the folder of `opened`.
 
-    Nowhere where the user has told JAX itself to keep programs, or to keep none, nor in plain mode. Where they cannot be kept
-    one warning says so.
+    Nowhere where the user has told JAX itself to keep programs, or to keep none, nor in plain mode. Where the folder that
+    JAXHF_CACHE names cannot be used one warning says so.
     """
     if _chosen:
         return _chosen[0]
@@ -43,7 +48,8 @@ def current() -> Path | None:
             _by_default.append(opened())
         except (OSError, RuntimeError) as error:  # the latter where there is no home folder
             _by_default.append(None)
-            warnings.warn(f"compiled programs are not kept: {error}", stacklevel=2)
+            if os.environ.get("JAXHF_CACHE"):
+                warnings.warn(f"compiled programs are not kept: {error}", stacklevel=2)
     return _by_default[0]
 
 
@@ -62,7 +68,9 @@ def opened() -> Path | None:
     versions = "-".join(f"{package}-{version(package)}" for package in ("jaxhf", "jax", "jaxlib"))
     folder = (Path(named) if named else _platform_folder() / "jaxhf") / f"{versions}-{_processor()}"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    _require_own(folder, folder.stat())
+    _require_own(folder, folder.lstat())
+    if folder.is_symlink():
+        raise PermissionError(f"{folder} is a link")
     if not os.access(folder, os.W_OK):
         raise PermissionError(f"{folder} is read-only")
     if os.name == "posix":
@@ -76,18 +84,20 @@ def read(path: Path) -> bytes:
     with path.open("rb") as file:
         _require_own(path, os.fstat(file.fileno()))
         stored = file.read()
-    path.touch()  # what was used longest ago is removed first
+    with contextlib.suppress(OSError):
+        os.utime(path)  # what was used longest ago is removed first
     return stored
 
 
 def write(path: Path, stored: bytes) -> None:
-    """All of it or nothing, also where another process writes the same."""
-    part = path.with_suffix(f".{os.getpid()}")
+    """All of it or nothing, also where another thread or process writes the same."""
+    number, part = tempfile.mkstemp(dir=path.parent, prefix=f"{path.name}.")
     try:
-        part.write_bytes(stored)
-        part.replace(path)
+        with open(number, "wb") as file:
+            file.write(stored)
+        os.replace(part, path)
     finally:
-        part.unlink(missing_ok=True)
+        Path(part).unlink(missing_ok=True)
 
 
 def _require_own(path: Path, said: os.stat_result) -> None:
@@ -120,12 +130,16 @@ def _processor() -> str:
 def _remove_oldest(root: Path, most: int) -> None:
     """Removes the programs used longest ago, of all versions, until the rest has at most so many bytes."""
     found = []
-    for path in root.glob("jaxhf-*-jax-*/*"):
-        with contextlib.suppress(FileNotFoundError):  # removed by another process
-            found.append((path, path.stat()))
+    for folder in root.iterdir():
+        if not _FOLDER.fullmatch(folder.name) or folder.is_symlink() or not folder.is_dir():
+            continue
+        with contextlib.suppress(OSError):  # removed by another process, or another user's
+            programs = [(path, path.lstat()) for path in folder.iterdir() if _PROGRAM.fullmatch(path.name)]
+            found += [(path, said) for path, said in programs if stat.S_ISREG(said.st_mode)]
     total = sum(said.st_size for _, said in found)
     for path, said in sorted(found, key=lambda one: max(one[1].st_atime, one[1].st_mtime)):
         if total <= most:
             break
-        path.unlink(missing_ok=True)
-        total -= said.st_size
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+            total -= said.st_size

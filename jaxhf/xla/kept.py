@@ -8,21 +8,23 @@ import hashlib
 import inspect
 import os
 import pickle
+import sys
+import threading
 import time
 import warnings
 import zlib
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import cache, cached_property
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import FunctionType, MethodType, ModuleType
 from typing import Any
 
 import equinox as eqx
 import jax
 from jax.core import Tracer
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, SingleDeviceSharding
 
 from . import folder
 from .plain import insides
@@ -30,6 +32,9 @@ from .plain import insides
 LOADED = "/jaxhf/program_loaded"
 """JAX's monitoring is told under this name how long it took to load a program, in seconds."""
 
+_PACKAGE, _IMPORTED = Path(__file__).parents[1], time.time()
+_LOCK = threading.RLock()
+_PLACES = (NamedSharding, SingleDeviceSharding)
 _OURS = {"jaxhf", "jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping", "numpy", "collections", "builtins"}
 
 
@@ -82,10 +87,12 @@ class Kept:
         assert module is not None
         if self.generation is not (generation := module.generation()):
             self.ready, self.generation = {}, generation
-        form = static, tuple(others.items()), tree, tuple(map(_type, leaves)), module.configuration()
-        if form not in self.ready:
-            self.ready[form] = self._program(static, others, tree, form[3])
-        program = self.ready[form]
+        kinds = tuple(type(value) for _, value in static), tuple(map(type, others.values()))  # 2 equals 2.0
+        types = tuple(map(_type, leaves))
+        form = static, tuple(others.items()), kinds, tree, types, module.configuration()
+        program = self.ready.get(form)
+        if program is None:
+            program = self.ready.setdefault(form, self._program(static, others, tree, types))
         traced = any(isinstance(leaf, Tracer) for leaf in leaves)
         results = module.call_program(program, leaves) if traced else program(*leaves)
         structure, others = program.outcome
@@ -101,10 +108,10 @@ class Kept:
 
         name = f"{self.fun.__module__}.{self.fun.__qualname__}"
         said = {k: _named(value) for k, value in others.items()}
-        known = repr((name, static, said, tree, types)) if _says_all((static, said, tree)) else None
         places = jax.tree.unflatten(tree, _among(dict.fromkeys(others), range(len(types))))
         donated = tuple(jax.tree.leaves([places[name] for name in self.donated if name in places]))
-        return Program(name, known, flat, self.options, donated)
+        known = repr((name, static, said, tree, _classes(tree), types, self.options, donated))
+        return Program(name, known if _says_all((static, said, tree)) else None, flat, self.options, donated)
 
 
 def _type(leaf: Any) -> tuple[Any, ...]:
@@ -156,9 +163,16 @@ class Program:
 
     def __call__(self, *leaves: Any) -> list[Any]:
         place = tuple(leaf.sharding if isinstance(leaf, jax.Array) and leaf.committed else None for leaf in leaves)
-        if place not in self.placed:
-            self.placed[place] = self._compiled(place, leaves)
-        return self.placed[place](*leaves)
+        program = self.placed.get(place)
+        if program is None:
+            with _LOCK:  # round JAX's cache, see below
+                program = self.placed.setdefault(place, self._compiled(place, leaves))
+        return program(*leaves)
+
+    @cached_property
+    def staged(self) -> Callable[..., list[Any]]:
+        """By JAX's own `jit`, for what a compiled program cannot do."""
+        return jax.jit(self.traced)
 
     def traced(self, *leaves: Any) -> list[Any]:
         """The same as a part of what is being traced."""
@@ -176,11 +190,15 @@ class Program:
         """From the folder, or compiled and put there."""
         module = insides()
         assert module is not None
-        path = None if self.known is None else self._path(place)
+        path, key = self._path(place)
         if path is not None:
             begin = time.perf_counter()
             try:
-                stored, in_tree, out_tree, note, ids = pickle.loads(zlib.decompress(folder.read(path)))  # with zlib's checksum
+                its_key, stored, in_tree, out_tree, note, ids = pickle.loads(
+                    zlib.decompress(folder.read(path))
+                )  # with zlib's checksum
+                if its_key != key:
+                    raise ValueError("it is another program")
                 devices = {device.id: device for device in jax.devices()}
                 program = module.deserialize_and_load(stored, in_tree, out_tree, execution_devices=[devices[k] for k in ids])
                 self.note = note
@@ -202,19 +220,21 @@ class Program:
             program = lowered.compile()
         try:
             ids = [device.id for device in program.runtime_executable().local_devices()]  # pyright: ignore
-            folder.write(path, zlib.compress(pickle.dumps((*module.serialize(program), self.note, ids))))
+            folder.write(path, zlib.compress(pickle.dumps((key, *module.serialize(program), self.note, ids))))
         except Exception as error:  # no space, or a backend whose programs cannot be stored
             self._warn("writing", error)
         return program
 
-    def _path(self, place: tuple[Any, ...]) -> Path | None:
-        kept_in = folder.current()
-        if kept_in is None:
-            return None
-        ids = [at and sorted(device.id for device in at.device_set) for at in place]
+    def _path(self, place: tuple[Any, ...]) -> tuple[Path | None, str]:
+        """Its file, and a hash of all that it is found by; None: it cannot be kept."""
+        kept_in = None if self.known is None else folder.current()
+        source = None if kept_in is None else _source()
+        if kept_in is None or source is None or not all(at is None or isinstance(at, _PLACES) for at in place):
+            return None, ""
         config = [(name, getattr(jax.config, name, value)) for name, value in sorted(jax.config.values.items())]
-        known = repr((self.known, place, ids, config, os.environ.get("XLA_FLAGS"), jax.devices()))
-        return kept_in / f"{self.name}-{hashlib.sha256(known.encode() + _source()).hexdigest()[:32]}"
+        known = repr((self.known, list(map(_devices, place)), config, os.environ.get("XLA_FLAGS"), jax.devices()))
+        key = hashlib.sha256(known.encode() + source).hexdigest()
+        return kept_in / f"{self.name}-{key[:32]}", key
 
     def _warn(self, doing: str, error: Exception) -> None:
         """In JAX's words for its own cache."""
@@ -224,8 +244,23 @@ class Program:
 
 def _named(value: Any) -> Any:
     """A module's function by its name, else the value."""
-    is_named = isinstance(value, FunctionType) and "<" not in value.__qualname__ and _is_code_of_ours(value.__module__)
-    return f"{value.__module__}.{value.__qualname__}" if is_named else value
+    if not isinstance(value, FunctionType) or not _is_code_of_ours(value.__module__):
+        return value
+    is_there = getattr(sys.modules.get(value.__module__), value.__qualname__, None) is value  # and nobody has replaced it
+    return f"{value.__module__}.{value.__qualname__}" if is_there else value
+
+
+def _devices(at: Any) -> Any:
+    """A place with the numbers of its devices in their order, which its `repr` does not name."""
+    devices = at.mesh.devices.flat if isinstance(at, NamedSharding) else at.device_set if at else ()  # pyright: ignore
+    return at, [device.id for device in devices]
+
+
+def _classes(tree: Any) -> list[str]:
+    """The classes of a structure with their modules, which its `repr` does not name."""
+    node = tree.node_data()
+    own = [] if node is None else [f"{node[0].__module__}.{node[0].__qualname__}"]
+    return own + [name for child in tree.children() for name in _classes(child)]
 
 
 def _says_all(given: Any) -> bool:
@@ -239,6 +274,8 @@ def _says_all(given: Any) -> bool:
 
 
 def _is_ours(value: Any) -> bool:
+    if isinstance(value, MethodType):
+        return False
     if isinstance(value, Mesh):
         return list(value.devices.ravel()) == jax.devices()[: value.devices.size]
     if isinstance(value, jax.tree_util.PyTreeDef):
@@ -271,11 +308,20 @@ def _without_jax_cache(module: ModuleType) -> Iterator[None]:
         module.compilation_cache.reset_cache()
 
 
+def _source() -> bytes | None:
+    """A hash of all that traces: this package, and those that its modules and steps are made of; None where nothing tells, or
+    where files have changed since they were imported."""
+    try:
+        files = sorted(_PACKAGE.rglob("*.py"))
+        is_as_imported = files and max(path.stat().st_mtime for path in files) < _IMPORTED
+        return _hashed(tuple(files)) if is_as_imported else None
+    except (OSError, PackageNotFoundError):
+        return None
+
+
 @cache
-def _source() -> bytes:
-    """A hash of all that traces: this package, and those that its modules and steps are made of."""
-    package = Path(__file__).parents[1]
+def _hashed(files: tuple[Path, ...]) -> bytes:
     said = hashlib.sha256(repr([version(name) for name in ("equinox", "optimistix", "lineax")]).encode())
-    for path in sorted(package.rglob("*.py")):
-        said.update(f"{path.relative_to(package)}".encode() + path.read_bytes())
+    for path in files:
+        said.update(f"{path.relative_to(_PACKAGE)}".encode() + path.read_bytes())
     return said.digest()

@@ -147,14 +147,16 @@ def _transposed(cotangents: Any, *leaves: Any, program: Program, moving: _Moving
         slopes = functools.partial(_pushing(program, moving, types), *stored)
         return list(jax.linear_transpose(slopes, *_chosen(moving, types))(list(given))), None
 
-    stored = [leaf for leaf in leaves if not ad.is_undefined_primal(leaf)]
+    count = len(leaves) - sum(moving)
+    stored, moves = leaves[:count], leaves[count:]  # of these some may be known
     given = map(ad.instantiate_zeros, cotangents)
     results = _call.bind(*stored, *given, program=program.derived(f"{moving} transposed", pulled))
-    return [None] * len(stored) + results
+    own = [value if ad.is_undefined_primal(move) else None for move, value in zip(moves, results, strict=True)]
+    return [None] * count + own
 
 
 def _batched(leaves: Any, axes: Any, *, program: Program) -> tuple[list[Any], list[int]]:
-    results = jax.vmap(jax.jit(program.traced), in_axes=tuple(axes))(*leaves)
+    results = jax.vmap(program.staged, in_axes=tuple(axes))(*leaves)
     return results, [0] * len(results)
 
 

@@ -3,6 +3,7 @@
 import os
 import stat
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import pytest
@@ -26,15 +27,19 @@ def test_the_platform_and_the_processor_choose_a_folder(monkeypatch, tmp_path):
 
 def test_what_was_used_longest_ago_is_removed_first(tmp_path):
     for days, name in enumerate(("a", "b", "c")):
-        path = tmp_path / f"jaxhf-{name}-jax-1" / "program"
+        path = tmp_path / f"jaxhf-{name}-jax-1-jaxlib-1-{16 * '0'}" / f"jaxhf.program-{32 * '0'}"
         path.parent.mkdir()
         path.write_bytes(bytes(100))
         os.utime(path, (days * 86400, days * 86400))
     (tmp_path / "user's").write_bytes(bytes(1000))
+    (tmp_path / "a user's").mkdir()
+    (tmp_path / "a user's" / "thesis").touch()
+    (tmp_path / f"jaxhf-c-jax-1-jaxlib-1-{16 * '0'}" / "notes").touch()
+    (tmp_path / f"jaxhf-l-jax-1-jaxlib-1-{16 * '0'}").symlink_to(tmp_path / "a user's", target_is_directory=True)
     folder._remove_oldest(tmp_path, 250)
-    assert {path.parent.name[6] for path in tmp_path.glob("jaxhf-*/*")} == {"b", "c"}
+    assert {path.parent.name[6] for path in tmp_path.glob("jaxhf-*/jaxhf.*")} == {"b", "c"}
     folder._remove_oldest(tmp_path, 0)
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["user's"]
+    assert {path.name for path in tmp_path.rglob("*") if path.is_file()} == {"user's", "thesis", "notes"}
 
 
 @pytest.fixture
@@ -72,6 +77,17 @@ def test_jax_keeps_programs_itself_where_it_has_a_folder(as_a_user, tmp_path):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     assert folder.current() is None
     assert not as_a_user.exists()
+
+
+def test_many_may_write_the_same_file_and_others(tmp_path):
+    def write(k):
+        folder.write(tmp_path / f"jaxhf.module.program-{k % 4}", 100_000 * bytes([k % 4]))
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(write, range(200)))
+    assert sorted(path.name[-1] for path in tmp_path.iterdir()) == ["0", "1", "2", "3"]
+    for path in tmp_path.iterdir():
+        assert set(folder.read(path)) == {int(path.name[-1])}
 
 
 def test_where_nothing_can_be_kept_one_warning_says_so(as_a_user):

@@ -148,6 +148,20 @@ def of_pair(pair, factor):
     return Pair(factor * jnp.sin(pair.a), pair.b, name="returned"), jnp.arange(3)
 
 
+def test_a_file_of_another_program_is_replaced(folder):
+    """As where somebody has renamed it: it is whole, and would compute something else."""
+
+    def both():
+        call(np.arange(3.0))
+        call(np.arange(3.0), power=3)
+
+    both()
+    one, other = folder.iterdir()
+    one.write_bytes(other.read_bytes())
+    with pytest.warns(UserWarning, match="another program"):
+        both()
+
+
 def derivatives(a):
     """In a process that knows of the folder alone: by reverse and by forward mode, of first and of second order."""
     keeps = compiled(of_pair)
@@ -168,6 +182,36 @@ def derivatives(a):
         jax.vmap(slope)(jnp.stack([a, a]))[1],
         jax.jit(jax.linearize(loss, a)[1])(direction),
     )
+
+
+def test_a_batch_compiles_once():
+    keeps, a = compiled(of_pair), jnp.ones((4, 3))
+
+    def batched():
+        jax.vmap(lambda a: keeps(Pair(a, jnp.ones(2)), np.float32(3))[0].a)(a).block_until_ready()
+
+    batched()
+    before = len(traced)
+    batched()
+    assert len(traced) == before
+
+
+def test_a_tangent_may_be_a_number():
+    """Which is known where the linear function is transposed."""
+    keeps = compiled(of_pair)
+
+    def loss(a, factor):
+        return jnp.sum(keeps(Pair(a, jnp.ones(2)), factor)[0].a)
+
+    def pushed(direction):
+        return jax.jvp(loss, (jnp.ones(3), jnp.float32(2)), (direction, jnp.float32(0.5)))[1] - 1.5 * np.sin(1)
+
+    def of_direction(direction):
+        return jax.linearize(loss, jnp.ones(3), jnp.float32(2))[1](direction, jnp.float32(0))
+
+    (transposed,) = jax.linear_transpose(of_direction, jnp.ones(3))(jnp.float32(1))
+    np.testing.assert_allclose(transposed, 2 * np.cos(1) * np.ones(3), rtol=1e-6)
+    np.testing.assert_allclose(pushed(jnp.zeros(3)), 0, atol=1e-6)
 
 
 def test_derivatives_are_kept(folder):

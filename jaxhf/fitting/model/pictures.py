@@ -253,7 +253,8 @@ def _is_measured(noise: Noise, target: Float[np.ndarray, "h w c"], dtype: np.dty
     if noise.saturation is not None:
         found &= ~(target >= np.asarray(noise.saturation, dtype).astype(np.float64))
     if noise.nodata is not None:
-        nodata = np.asarray(noise.nodata, dtype).astype(np.float64)
+        with np.errstate(over="ignore"):  # it is infinite then, and equals no value
+            nodata = np.asarray(noise.nodata, dtype).astype(np.float64)
         found &= ~np.isnan(target) if np.isnan(nodata) else target != nodata
     return found
 
@@ -265,7 +266,7 @@ def _by_detector(
     if not isinstance(noise, Noise):
         return target, weight, float(noise)
     counts = weight > 0
-    variance = noise.read**2 + noise.gain * np.maximum(np.where(counts, target, 0), 0)
+    variance = float(noise.read) ** 2 + float(noise.gain) * np.maximum(np.where(counts, target, 0), 0)
     mean = np.mean(variance[counts])
     return target, weight * np.sqrt(mean / variance), float(np.sqrt(mean))
 
