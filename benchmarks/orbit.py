@@ -131,7 +131,6 @@ def main() -> None:
     run.parser.add_argument("--held-out", action="store_true", help="another terrain, albedo, cloud and noise, drawn now")
     run.parser.add_argument("--seed", type=int, help="of these, to repeat a run")
     run.parser.add_argument("--law", type=float, default=LAW, help="the noise over the detector's [%(default)g]")
-    run.parser.add_argument("--save", metavar="FILE", help="an .npz for errors, deviations and residuals")
     run.parser.add_argument("--verbose", action="store_true", help="each step")
     options = run.parse()
     seed = 3
@@ -182,9 +181,6 @@ def judge(run: benchmark.Run, name: str, orbit: Orbit, options: argparse.Namespa
     run.claim(off / left >= RATIO, f"{name}: {off / left:.2f} times nearer than the map, at least {RATIO:g}")
     for k, (share, (least, most)) in enumerate(zip(inside, INSIDE, strict=True), 1):
         run.claim(least <= share <= most, f"{name}: {share:.1f} % within {k} deviations, {least} to {most}")
-    if options.save:
-        parts = {"error": error, "std": std, "truth": truth[seen], "map": start[seen], "albedo": np.asarray(found.albedo)}
-        np.savez(options.save, targets=np.stack(targets), residuals=np.stack(found.residuals), **parts)
 
 
 if __name__ == "__main__":

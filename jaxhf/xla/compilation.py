@@ -31,7 +31,12 @@ _OPTIONS = {
 def is_traced() -> bool:
     """Whether JAX is tracing or transforming what calls this; plain mode does not know of `grad` and `vmap` alone."""
     module = insides()
-    return isinstance(jnp.zeros(()), Tracer) if module is None else module.is_traced()
+    return is_staged() if module is None else module.is_traced()
+
+
+def is_staged() -> bool:
+    """Whether what is computed here becomes part of a program, as within `jax.jit`; not by `grad` and `vmap` alone."""
+    return isinstance(jnp.zeros(()), Tracer)
 
 
 @contextlib.contextmanager
@@ -47,13 +52,13 @@ def _garbage_left() -> Iterator[None]:
 
 
 @functools.cache
-def compiler_options(newer: bool | None = False) -> dict[str, Any] | None:
+def compiler_options(newer: bool = False) -> dict[str, Any] | None:
     """What `jax.jit` takes as `compiler_options`, so that a program of jaxhf's compiles and runs in less time.
 
     `newer` is for programs without rays, see `compiled`. Options that this version of XLA does not know are left out; None
     where no other is left, and in plain mode.
     """
-    if insides() is None or newer is None:
+    if insides() is None:
         return None
     options = {"xla_cpu_use_fusion_emitters": True} if newer else _OPTIONS
     return {name: value for name, value in options.items() if _is_known({name: value}) and _is_right(name)} or None
@@ -94,23 +99,24 @@ def compiled(
     inside = jit(fun, **options)
 
     @functools.cache
+    def given() -> dict[str, Any] | None:
+        return None if newer is None else compiler_options(newer)
+
+    @functools.cache
     def alone() -> Callable[..., Any]:
-        return jit(fun, compiler_options=compiler_options(newer), **options)
+        return jit(fun, compiler_options=given(), **options)
 
     @functools.cache
     def kept() -> Kept:
         static = options.get("static_argnames", ()) if jit is jax.jit else None
         donated = list(inspect.signature(fun).parameters)[1:] if "donate" in options else ()
-        return Kept(fun, compiler_options(newer), static, donated)
+        return Kept(fun, given(), static, donated)
 
     @functools.wraps(fun)
     def call(*args: Any, **kwargs: Any) -> Any:
         with _garbage_left():
-            module = insides()
-            if module is None:
-                return inside(*args, **kwargs)
-            traced, serves = is_traced(), Kept.serves(fun)
-            if traced and (not serves or module.is_staged()):
+            serves = insides() is not None and Kept.serves(fun)
+            if insides() is None or (is_traced() and (not serves or is_staged())):
                 return inside(*args, **kwargs)
             return (kept() if serves else alone())(*args, **kwargs)
 

@@ -22,7 +22,8 @@ from jax.extend.mlir import ir
 from jax.extend.mlir.dialects import func
 from jax.interpreters import ad, batching, mlir
 
-from .program_calls import call_program as call_program, is_staged as is_staged
+from .linearised import all_stored, chosen, linearised, merged
+from .program_calls import call_program as call_program
 
 TRIED = (0, 12)
 """The newest version of JAX whose insides are known to take what is below."""
@@ -82,7 +83,7 @@ def _batched_together(
 def _batched_in_turn(leaves: Any, axes: Any, **params: Any) -> tuple[list[Any], list[int]]:
     many = [axis is not None for axis in axes]
     moved = [jnp.moveaxis(leaf, axis, 0) for leaf, axis in zip(leaves, axes, strict=True) if axis is not None]
-    results = lax.map(lambda own: in_turn.bind(*_merged(many, own, leaves), **params), moved)
+    results = lax.map(lambda own: in_turn.bind(*merged(many, own, leaves), **params), moved)
     return results, [0] * len(results)
 
 
@@ -100,25 +101,15 @@ def _differentiated(
     fun = derivative_of or jaxpr_as_fun(jaxpr)
     forms: list[Any] = []
 
-    def linearised(*leaves: Any) -> tuple[list[Any], list[Any]]:
-        moved = (leaf for leaf, moves in zip(leaves, moving, strict=True) if moves)
-        values, linear = jax.linearize(lambda *moved: jax.tree.leaves(fun(*_merged(moving, moved, leaves))), *moved)
-        stored, structure = jax.tree.flatten(linear)
-        places = [next((k for k, leaf in enumerate(leaves) if leaf is value), None) for value in stored]
-        forms.append((structure, places))
-        return values, [value for value, place in zip(stored, places, strict=True) if place is None]
+    def value_and_stored(*leaves: Any) -> tuple[list[Any], list[Any]]:
+        values, linear, own, places = linearised(fun, moving, leaves)
+        forms.append((jax.tree.structure(linear), places))
+        return values, own
 
-    values, own = bound(primitive, linearised, primals)
+    values, own = bound(primitive, value_and_stored, primals)
     structure, places = forms[-1]
-    stored = iter(own)
-    linear = jax.tree.unflatten(structure, [next(stored) if place is None else primals[place] for place in places])
-    return values, linear(*(tangent for tangent, moves in zip(tangents, moving, strict=True) if moves))
-
-
-def _merged(chosen: list[bool], own: Any, others: Any) -> list[Any]:
-    """Where chosen, the next of `own`, elsewhere the one of `others` in that place."""
-    following = iter(own)
-    return [next(following) if take else other for take, other in zip(chosen, others, strict=True)]
+    linear = jax.tree.unflatten(structure, all_stored(own, places, primals))
+    return values, linear(*chosen(moving, tangents))
 
 
 def _called(*leaves: Any, jaxpr: ClosedJaxpr, **_: Any) -> list[Any]:

@@ -194,11 +194,10 @@ class Program:
         if path is not None:
             begin = time.perf_counter()
             try:
-                its_key, stored, in_tree, out_tree, note, ids = pickle.loads(
-                    zlib.decompress(folder.read(path))
-                )  # with zlib's checksum
+                its_key, *parts = pickle.loads(zlib.decompress(folder.read(path)))  # with zlib's checksum
                 if its_key != key:
                     raise ValueError("it is another program")
+                stored, in_tree, out_tree, note, ids = parts
                 devices = {device.id: device for device in jax.devices()}
                 program = module.deserialize_and_load(stored, in_tree, out_tree, execution_devices=[devices[k] for k in ids])
                 self.note = note

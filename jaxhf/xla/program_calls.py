@@ -9,10 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jax.core import Tracer
-from jax.extend.core import Primitive, jaxpr_as_fun
+from jax.extend.core import Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
+
+from .linearised import all_stored, chosen, linearised, merged
 
 Program = Any
 """A `kept.Program`; here so that modules do not go round in a circle."""
@@ -29,28 +30,18 @@ def call_program(program: Program, leaves: list[Any]) -> list[Any]:
     return _call.bind(*leaves, program=program)
 
 
-def is_staged() -> bool:
-    """Whether what is computed here becomes part of a program, as within `jax.jit`; not by `grad` and `vmap` alone."""
-    return isinstance(jnp.zeros(()), Tracer)
-
-
-def _chosen(which: _Moving, values: Any) -> list[Any]:
-    return [value for chosen, value in zip(which, values, strict=True) if chosen]
-
-
 def _differentiated(primals: Any, tangents: Any, *, program: Program) -> tuple[list[Any], list[Any]]:
     moving = tuple(not isinstance(slope, ad.Zero) and slope.dtype != jax.dtypes.float0 for slope in tangents)
-    moves = _chosen(moving, tangents)
+    moves = chosen(moving, tangents)
     if not moves:
         values = _call.bind(*primals, program=program)
         return values, _zeros(values)
     if any(isinstance(slope, Tracer) for slope in moves):
-        linearised = _linearised(program, moving)
-        results = _call.bind(*primals, program=linearised)
-        moved, places, program.note = linearised.note
-        values, own = results[: len(moved)], iter(results[len(moved) :])
-        stored = [next(own) if place is None else primals[place] for place in places]
-        forms = tuple(map(jax.typeof, _chosen(moved, values)))
+        storing = _storing(program, moving)
+        results = _call.bind(*primals, program=storing)
+        moved, places, program.note = storing.note
+        values, stored = results[: len(moved)], all_stored(results[len(moved) :], places, primals)
+        forms = tuple(map(jax.typeof, chosen(moved, values)))
         types = tuple(map(jax.typeof, primals))
         slopes = _linear.bind(*stored, *moves, program=program, moving=moving, types=types, forms=forms)
     else:  # forward mode stores nothing
@@ -58,31 +49,24 @@ def _differentiated(primals: Any, tangents: Any, *, program: Program) -> tuple[l
         results = _call.bind(*primals, *moves, program=pushed)
         moved, program.note = pushed.note
         values, slopes = results[: len(moved)], results[len(moved) :]
-    rest, zeros = iter(slopes), _zeros(values)
-    return values, [next(rest) if moves else zero for moves, zero in zip(moved, zeros, strict=True)]
+    return values, merged(moved, slopes, _zeros(values))
 
 
 def _zeros(values: list[Any]) -> list[Any]:
     return [ad.Zero(jax.typeof(value).to_tangent_aval()) for value in values]
 
 
-def _of_moving(program: Program, moving: _Moving, leaves: Any) -> Callable[..., list[Any]]:
-    """The program as a function of those of its arguments that move."""
-
-    def fun(*own: Any) -> list[Any]:
-        following = iter(own)
-        return program.traced(*(next(following) if moves else leaf for moves, leaf in zip(moving, leaves, strict=True)))
-
-    return fun
-
-
 def _that_move(jaxpr: Any, moves: Any) -> _Moving:
     """Which results of a jaxpr depend on these of its variables."""
     seen = set(moves)
+
+    def depends(value: Any) -> bool:
+        return not isinstance(value, Literal) and value in seen
+
     for equation in jaxpr.eqns:
-        if any(value in seen for value in equation.invars if not hasattr(value, "val")):
+        if any(map(depends, equation.invars)):
             seen.update(equation.outvars)
-    return tuple(not hasattr(value, "val") and value in seen for value in jaxpr.outvars)
+    return tuple(map(depends, jaxpr.outvars))
 
 
 def _pushed(program: Program, moving: _Moving) -> Program:
@@ -91,37 +75,34 @@ def _pushed(program: Program, moving: _Moving) -> Program:
     def pushed(*leaves: Any) -> tuple[list[Any], Any]:
         def both(*leaves: Any) -> tuple[list[Any], list[Any]]:
             primals, moves = leaves[: len(moving)], leaves[len(moving) :]
-            return jax.jvp(_of_moving(program, moving, primals), _chosen(moving, primals), list(moves))
+            return jax.jvp(lambda *own: program.traced(*merged(moving, own, primals)), chosen(moving, primals), list(moves))
 
         jaxpr = jax.make_jaxpr(both)(*leaves)
         results, count = jaxpr_as_fun(jaxpr)(*leaves), len(jaxpr.out_avals) // 2
         moved = _that_move(jaxpr.jaxpr, jaxpr.jaxpr.invars[len(moving) :])[count:]
-        return [*results[:count], *_chosen(moved, results[count:])], (moved, program.note)
+        return [*results[:count], *chosen(moved, results[count:])], (moved, program.note)
 
     return program.derived(f"{moving} pushed", pushed)
 
 
-def _linearised(program: Program, moving: _Moving) -> Program:
+def _storing(program: Program, moving: _Moving) -> Program:
     """Values, and what the linear function stores besides the arguments; its note says which values move and what is stored, an
     argument by its place, and has the program's note."""
 
-    def linearised(*leaves: Any) -> tuple[list[Any], Any]:
-        values, linear = jax.linearize(_of_moving(program, moving, leaves), *_chosen(moving, leaves))
-        stored, structure = jax.tree.flatten(linear)
-        places = [next((k for k, leaf in enumerate(leaves) if leaf is value), None) for value in stored]
-        jaxpr = jax.make_jaxpr(linear)(*_chosen(moving, leaves)).jaxpr
+    def storing(*leaves: Any) -> tuple[list[Any], Any]:
+        values, linear, own, places = linearised(program.traced, moving, leaves)
+        jaxpr = jax.make_jaxpr(linear)(*chosen(moving, leaves)).jaxpr
         moved = _that_move(jaxpr, jaxpr.invars)
-        program.linear[moving] = structure, moved
-        own = [value for value, place in zip(stored, places, strict=True) if place is None]
+        program.linear[moving] = jax.tree.structure(linear), moved
         return [*values, *own], (moved, places, program.note)
 
-    return program.derived(f"{moving} linearised", linearised)
+    return program.derived(f"{moving} linearised", storing)
 
 
 def _linear_function(program: Program, moving: _Moving, types: Any) -> tuple[Any, _Moving]:
     """The linear function's structure, into which what it stores is put, and which of its results are not zero."""
     if moving not in program.linear:  # the linearised program was found in the folder
-        jax.eval_shape(lambda *leaves: _linearised(program, moving).fun(*leaves)[0], *types)
+        jax.eval_shape(lambda *leaves: _storing(program, moving).fun(*leaves)[0], *types)
     return program.linear[moving]
 
 
@@ -131,7 +112,7 @@ def _pushing(program: Program, moving: _Moving, types: Any) -> Callable[..., lis
 
     def slopes(*leaves: Any) -> list[Any]:
         linear = jax.tree.unflatten(structure, leaves[: structure.num_leaves])
-        return _chosen(moved, linear(*leaves[structure.num_leaves :]))
+        return chosen(moved, linear(*leaves[structure.num_leaves :]))
 
     return slopes
 
@@ -145,7 +126,7 @@ def _transposed(cotangents: Any, *leaves: Any, program: Program, moving: _Moving
         count = _linear_function(program, moving, types)[0].num_leaves
         stored, given = leaves[:count], leaves[count:]
         slopes = functools.partial(_pushing(program, moving, types), *stored)
-        return list(jax.linear_transpose(slopes, *_chosen(moving, types))(list(given))), None
+        return list(jax.linear_transpose(slopes, *chosen(moving, types))(list(given))), None
 
     count = len(leaves) - sum(moving)
     stored, moves = leaves[:count], leaves[count:]  # of these some may be known

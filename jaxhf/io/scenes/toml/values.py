@@ -75,24 +75,20 @@ angle_above_horizon = _kind(lambda value: -90 <= number(value) <= 90, "from -90 
 
 def or_word(kind: Kind, tail: str = " or a string") -> Kind:
     """A string, or what `kind` takes; `tail` goes behind what that must be."""
-
-    def either(value: Any) -> Any:
-        try:
-            return value if isinstance(value, str) else kind(value)
-        except ValueError as error:
-            raise ValueError(f"{error}{tail}") from None
-
-    return either
+    return _or(str, kind, tail)
 
 
 def or_table(kind: Kind) -> Kind:
     """A table, or what `kind` takes."""
+    return _or(dict, kind, " or a table")
 
+
+def _or(other: type, kind: Kind, tail: str) -> Kind:
     def either(value: Any) -> Any:
         try:
-            return value if isinstance(value, dict) else kind(value)
+            return value if isinstance(value, other) else kind(value)
         except ValueError as error:
-            raise ValueError(f"{error} or a table") from None
+            raise ValueError(f"{error}{tail}") from None
 
     return either
 
