@@ -4,7 +4,8 @@ Each program is made in a process of its own, without a cache. The scene is one 
 directional light, with shadows and smooth normals, 512 x 512 pixels (for the fit 128 x 128).
 
 With --second: what a first process takes, with an empty folder of programs, and what the second one does, which finds them
-there. CPU seconds of all threads, and seconds of the clock; from start to end, with the import of JAX and the work itself.
+there; then `jaxhf view` of the same terrain at another size. CPU seconds of all threads, and seconds of the clock; from start
+to end, with the import of JAX and the work itself.
 """
 
 import json
@@ -122,14 +123,14 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
     if name == "frame":
         from jaxhf.preparation.localise import localise
         from jaxhf.preparation.world import make_world, resolve_settings
-        from jaxhf.rendering import render
+        from jaxhf.rendering.picture import trace_picture
         from jaxhf.xla.devices import local_mesh, on_every_device
 
         scene, mesh = make_scene(heights, 512), local_mesh(1)
         resolved, local = resolve_settings(jaxhf.Settings(), scene), on_every_device(localise(scene), mesh)
 
         def frame(scene: Any) -> Any:
-            return render._trace(make_world(scene, resolved), scene.camera, (), mesh, None)
+            return trace_picture(make_world(scene, resolved), scene.camera, (), mesh, None)
 
         return jax.jit(frame), (local,)
     settings = {
@@ -182,12 +183,17 @@ def second(run: benchmark.Run) -> None:
     readme = re.search(r"```python\n(.*?)```", (Path(__file__).parents[1] / "README.md").read_text(), re.DOTALL)
     assert readme is not None
     view = ["-m", "jaxhf", "view", "terrain.tif", "-o", "picture.png"]
+    others = {"`jaxhf view`": ("with --size 700x500", [*view, "--size", "700x500"])}
     processes = {"README's Python block": ["-c", readme[1]], "a fit of 32 x 32 heights": ["-c", FIT], "`jaxhf view`": view}
     with tempfile.TemporaryDirectory() as folder:
         spent(["-c", TERRAIN], folder, "0")
         for k, (name, words) in enumerate(processes.items()):
             (first, begun), (again, ended) = (spent(words, folder, f"programs{k}") for _ in range(2))
             run.row(name, {"first, CPU s": first, "second, CPU s": again, "first, s": begun, "second, s": ended})
+            if name in others:
+                what, words = others[name]
+                spends, seconds = spent(words, folder, f"programs{k}")
+                run.row(f"{name} {what}, after them", {"CPU s": spends, "s": seconds})
     run.end()
 
 

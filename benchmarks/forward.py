@@ -26,7 +26,7 @@ from jaxhf.core.vector import dot, unit
 from jaxhf.preparation.ceiling import clears
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import first_hit, make_world, resolve_settings
-from jaxhf.rendering.tiles import Tiling
+from jaxhf.rendering.tiles import Tiling, pixels_from
 from jaxhf.scene.procedural import fractal
 
 CAMERAS = {  # eye, target, field of view: a fifth of the picture covered, all of it covered
@@ -91,7 +91,11 @@ def shadow_rays(heights: np.ndarray, camera: str) -> tuple[float, float]:
     @jax.jit
     def judge(seen: jaxhf.Scene) -> tuple[jax.Array, jax.Array]:
         world, wi = make_world(seen, settings), unit(jnp.asarray(LIGHTS[camera], heights.dtype))
-        tiling, (_, grid, _), ceiling = Tiling(seen.camera, settings), world.grids[0], world.ceilings[0][0]
+        tiling, (_, grid, _), ceiling = (
+            Tiling(seen.camera.width, seen.camera.height, settings),
+            world.grids[0],
+            world.ceilings[0][0],
+        )
         assert ceiling is not None
 
         def one(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -99,10 +103,10 @@ def shadow_rays(heights: np.ndarray, camera: str) -> tuple[float, float]:
             wanted = (hit.object == 0) & (dot(wi, hit.n) * hit.side > 0)
             return wanted, wanted & ~clears(ceiling, grid, 0, hit)
 
-        def tile(number: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return jax.vmap(one)(*(place.astype(heights.dtype) for place in tiling.pixels(number)))
+        def tile(corner: jax.Array) -> tuple[jax.Array, jax.Array]:
+            return jax.vmap(one)(*(place.astype(heights.dtype) for place in pixels_from(corner, tiling.side)))
 
-        return jax.lax.map(tile, np.arange(tiling.count, dtype=np.int32))
+        return jax.lax.map(tile, tiling.corners())
 
     wanted, walks = map(np.asarray, judge(localise(seen)))
     return walks.sum() / wanted.sum(), walks.any(1).sum() / wanted.any(1).sum()

@@ -12,7 +12,7 @@ from forward import report, scene, terrain
 import jaxhf
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import make_world, resolve_settings
-from jaxhf.rendering import render as rendering
+from jaxhf.rendering.picture import trace_picture
 from jaxhf.xla.devices import local_mesh
 from jaxhf.xla.materialise import materialise
 
@@ -35,7 +35,7 @@ def compiled(base: jaxhf.Scene, settings: jaxhf.Settings, form: Callable) -> tup
     jax.clear_caches()
     local = localise(base)
     settings = resolve_settings(settings, base)
-    frame = jax.jit(lambda local: rendering._trace(make_world(local, settings), local.camera, (), local_mesh(), None))
+    frame = jax.jit(lambda local: trace_picture(make_world(local, settings), local.camera, (), local_mesh(), None))
     program = frame.lower(local).compile(compiler_options=jaxhf.compiler_options())
     bodies = re.findall(r"^%?fused_computation\S* .*?\{\n(.*?)^\}", program.as_text() or "", re.M | re.S)
     return lambda: jax.block_until_ready(program(local)), sum(body.count("\n") for body in bodies)

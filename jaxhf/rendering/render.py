@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import PurePath
 from typing import Any, overload
@@ -15,9 +14,6 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..boundary.guiding import has_edges
-from ..boundary.term import Boundaries, draw_boundaries, moved_light
-from ..core.autodiff import with_tangent
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
 from ..preparation.localise import anchor, localise, localise_camera, localise_lights, precision
@@ -28,12 +24,16 @@ from ..scene.light import Light
 from ..scene.scene import Scene
 from ..trace.grid import Grid, make_grid
 from ..xla.compilation import compiled, is_traced
-from ..xla.devices import chosen_mesh, map_over, on_every_device, prepared_mesh, takes_numbers, where_called
-from ..xla.kernel import in_turn, one_kernel
+from ..xla.devices import (
+    chosen_mesh,
+    on_every_device,
+    prepared_mesh,
+    takes_numbers,
+    where_called,
+)
 from ..xla.materialise import unfolded
 from .aovs import known_aovs
-from .samples import PictureSamples
-from .tiles import Tiling, light_along, trace_tiles
+from .picture import picture, trace_in_parts, trace_picture
 
 
 class _Given:
@@ -81,7 +81,8 @@ class Prepared(eqx.Module):
         return self._world.settings
 
     def with_camera(self, camera: Camera) -> "Prepared":
-        """The same, seen by another camera; nothing is compiled again if its picture has the same size."""
+        """The same, seen by another camera; nothing is compiled again if its picture is as large, or both have more than 256²
+        pixels."""
         (self._given.scene or self._form).with_camera(camera)  # which checks it
         return dataclasses.replace(self, camera=camera)
 
@@ -203,10 +204,9 @@ def render(
         camera = localise_camera(scene.camera, scene._given.scene, np.array(scene._origin), precision(scene._form))
         camera = on_every_device(camera, here)
     if progress is None:
-        drawn = on_every_device(key, here) if world.settings.edge_samples else None  # else the settings draw nothing
-        outputs = _trace(world, camera, aovs, here, drawn)
+        outputs = picture(world, camera, aovs, here, key)
     else:
-        outputs = _trace_in_parts(world, camera, aovs, here, progress)
+        outputs = trace_in_parts(world, camera, aovs, here, progress)
     image = outputs.pop("image")
     return (image, {name: outputs[name] for name in aovs}) if aovs else image
 
@@ -242,43 +242,9 @@ def render_each(scenes: Scene, change: Callable[[Scene], Scene], settings: Setti
     def one(scene: Scene) -> jax.Array:
         scene = change(scene)
         resolved = resolve_settings(settings, scene)
-        return _trace(prepared_world(on_every_device(scene, mesh), resolved), scene.camera, (), mesh, None)["image"]
+        return trace_picture(prepared_world(on_every_device(scene, mesh), resolved), scene.camera, (), mesh, None)["image"]
 
     return lax.map(one, scenes)
-
-
-@functools.partial(compiled, static_argnames=("aovs", "mesh"))
-def _trace(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> dict[str, jax.Array]:
-    def picture(world: World, camera: Camera, _: jax.Array | None = None) -> dict[str, jax.Array]:
-        tiling = Tiling(camera, world.settings)
-        tiles = trace_tiles(mesh, world, camera, aovs, jnp.arange(tiling.count, dtype=jnp.int32))
-        return jax.tree.map(tiling.assemble, tiles)
-
-    def across_boundaries(world: World, camera: Camera, key: jax.Array | None) -> dict[str, jax.Array]:
-        others = picture(world, camera) if aovs else {}
-        drawn = draw_boundaries(world, camera, key, mesh)
-        return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
-
-    return in_turn(picture, world, camera, key, derivative_of=across_boundaries if has_edges(world) else None)
-
-
-def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, mesh: Mesh) -> Float[jax.Array, "h w 3"]:
-    """The picture, with the derivative in which boundaries have a part.
-
-    One loop traces all samples, also those of pixels in which boundaries were seen: with a loop of their own for these the
-    program compiled for 7 s longer.
-    """
-    samples = PictureSamples(camera, world.settings, drawn.resampled)
-
-    def radiance(seen: tuple[World, Camera], points: tuple[jax.Array, ...]) -> jax.Array:
-        return one_kernel(lambda *args: light_along(*args)[0], *seen, *points)
-
-    light = map_over(mesh, radiance, (world, camera), samples.positions())
-    image = samples.in_pixels(light)
-    finer = samples.of_resampled(light).mean(1)
-    light = moved_light(world, camera, drawn, mesh)
-    change = image.reshape(-1, 3).at[drawn.resampled].set(finer, unique_indices=True).at[drawn.pixel].add(light)
-    return with_tangent(lax.stop_gradient(image), change.reshape(image.shape))
 
 
 @functools.partial(compiled, newer=True, static_argnames=("dx", "dy", "settings"))
@@ -287,7 +253,6 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
     return lax.map(lambda z: make_grid(Heightfield(z, dx, dy), None, settings), heights)
 
 
-_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
 _make_ceilings = compiled(make_ceilings, static_argnames=("settings",))
 _make_world = compiled(make_world, static_argnames=("settings",))
 _make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
@@ -298,18 +263,3 @@ def prepared_world(scene: Scene, settings: Settings) -> World:
     make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
     scene = unfolded(scene) if is_traced() else scene
     return make(eqx.tree_at(lambda scene: scene.camera, scene, None), settings=settings)
-
-
-def _trace_in_parts(
-    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, progress: Callable[[int, int], None]
-) -> dict[str, np.ndarray]:
-    """As `_trace`, a few tiles at a time, with the picture on the host: device memory does not grow with it."""
-    tiling = Tiling(camera, world.settings)
-    size = math.ceil(tiling.count / 64)
-    pixels = tiling.width * tiling.height
-    parts = []
-    for first in range(0, tiling.count, size):
-        tiles = np.minimum(np.arange(first, first + size), tiling.count - 1)
-        parts.append(jax.device_get(_trace_tiles(mesh, world, camera, aovs, np.asarray(tiles, np.int32))))
-        progress(min(pixels, (first + size) * pixels // tiling.count), pixels)
-    return jax.tree.map(lambda *parts: tiling.assemble(np.concatenate(parts)[: tiling.count]), *parts)

@@ -10,7 +10,7 @@ from ..boundary.term import resampled_side
 from ..core.settings import Settings
 from ..core.types import AnyArray
 from ..scene.camera import Camera
-from .tiles import Tiling, sample_offset
+from .tiles import Tiling, pixels_from, sample_offset
 
 Points = tuple[Float[jax.Array, "chunks n"], Float[jax.Array, "chunks n"]]
 """Positions in the picture, x and y."""
@@ -26,13 +26,13 @@ class PictureSamples:
     """
 
     def __init__(self, camera: Camera, settings: Settings, resampled: Int[AnyArray, " pixels"] | None = None):
-        self.tiling, self.dtype = Tiling(camera, settings), camera.world_from_camera.dtype
+        self.tiling, self.dtype = Tiling(camera.width, camera.height, settings), camera.world_from_camera.dtype
         self.resampled, self.resampled_side = resampled, resampled_side(settings)
 
     def positions(self) -> Points:
         """Where all samples lie."""
         tiling, dtype = self.tiling, self.dtype
-        pixels = jax.vmap(tiling.pixels)(jnp.arange(tiling.count, dtype=jnp.int32))
+        pixels = jax.vmap(lambda corner: pixels_from(corner, tiling.side))(tiling.corners())
         offsets = sample_offset(jnp.arange(tiling.samples, dtype=jnp.int32), math.isqrt(tiling.samples), dtype)
         size = tiling.side * tiling.side
         x, y = (

@@ -6,16 +6,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from ..core.autodiff import recomputed
 from ..core.settings import Settings
+from ..core.types import Index
 from ..preparation.world import World
 from ..scene.camera import Camera
 from ..shade.radiance import radiance
-from ..xla.devices import map_over
+from ..xla.devices import map_first, map_over
 from ..xla.kernel import one_kernel
 from ..xla.materialise import materialise
 from .aovs import observe
@@ -24,21 +26,20 @@ from .aovs import observe
 class Tiling:
     """The cut of a picture into squares of one size: a fixed shape gives the same bits wherever a pixel lies."""
 
-    def __init__(self, camera: Camera, settings: Settings):
-        self.width, self.height = camera.width, camera.height
+    def __init__(self, width: int, height: int, settings: Settings):
+        self.width, self.height = width, height
         self.samples = settings.samples or 1
-        self.side = 1 << ((settings.chunk.bit_length() - 1) // 2)
+        self.side = tile_side(settings)
         self.columns, self.rows = math.ceil(self.width / self.side), math.ceil(self.height / self.side)
 
     @property
     def count(self) -> int:
         return self.columns * self.rows
 
-    def pixels(self, tile: Int[jax.Array, ""]) -> tuple[Int[jax.Array, " n"], Int[jax.Array, " n"]]:
-        """Column and row of each pixel of a tile, also of those beyond the picture."""
-        pixel = jnp.arange(self.side * self.side, dtype=jnp.int32)
-        column, row = (tile % self.columns) * self.side, (tile // self.columns) * self.side
-        return column + pixel % self.side, row + pixel // self.side
+    def corners(self) -> Int[np.ndarray, "count 2"]:
+        """Column and row of the top left pixel of each tile."""
+        rows, columns = np.divmod(np.arange(self.count, dtype=np.int32), np.int32(self.columns))
+        return np.stack([columns, rows], axis=1) * np.int32(self.side)
 
     def assemble(self, tiles: Any) -> Any:
         """(count, side * side, ...) to (height, width, ...), for NumPy and JAX arrays."""
@@ -47,12 +48,37 @@ class Tiling:
         return grid.reshape(self.rows * self.side, self.columns * self.side, *tail)[: self.height, : self.width]
 
 
+def tile_side(settings: Settings) -> int:
+    """Of the squares into which pictures are cut, pixels."""
+    return 1 << ((settings.chunk.bit_length() - 1) // 2)
+
+
+def pixels_from(corner: Int[jax.Array, "2"], side: int) -> tuple[Int[jax.Array, " n"], Int[jax.Array, " n"]]:
+    """Column and row of each pixel of the tile with this top left pixel, also of those beyond the picture."""
+    pixel = jnp.arange(side * side, dtype=jnp.int32)
+    return corner[0] + pixel % side, corner[1] + pixel // side
+
+
 def trace_tiles(
-    mesh: Mesh, world: World, camera: Camera, aovs: tuple[str, ...], tiles: Int[jax.Array, " n"]
+    mesh: Mesh,
+    world: World,
+    camera: Camera,
+    aovs: tuple[str, ...],
+    corners: Int[jax.Array | np.ndarray, "n 2"],
+    count: Index | None = None,
 ) -> dict[str, jax.Array]:
-    """The picture ("image") and AOVs of tiles, traced one after the other; (n, side * side, ...) each."""
+    """The picture ("image") and AOVs of tiles with these top left pixels, traced one after the other; (n, side², ...) each.
+
+    With a `count` of so many of the first alone, dealt out as by `map_first`.
+    """
     of_tile = functools.partial(_trace_tile, aovs)
-    return map_over(mesh, lambda seen, tile: one_kernel(of_tile, *seen, tile), (world, camera), tiles)
+
+    def traced(seen: tuple[World, Camera], corner: jax.Array) -> dict[str, jax.Array]:
+        return one_kernel(of_tile, *seen, corner)
+
+    if count is None:
+        return map_over(mesh, traced, (world, camera), corners)
+    return map_first(mesh, traced, (world, camera), corners, count)
 
 
 def sample_offset(k: Int[jax.Array, "*n"], side: int, dtype: Any) -> tuple[Float[jax.Array, "*n"], Float[jax.Array, "*n"]]:
@@ -71,9 +97,9 @@ def light_along(
     return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y))))(x, y)
 
 
-def _trace_tile(aovs: tuple[str, ...], world: World, camera: Camera, tile: jax.Array) -> dict[str, jax.Array]:
+def _trace_tile(aovs: tuple[str, ...], world: World, camera: Camera, corner: jax.Array) -> dict[str, jax.Array]:
     dtype = camera.world_from_camera.dtype
-    columns, rows = (place.astype(dtype) for place in Tiling(camera, world.settings).pixels(tile))
+    columns, rows = (place.astype(dtype) for place in pixels_from(corner, tile_side(world.settings)))
     image, exhausted = _pixels(world, camera, columns, rows)
     outputs = {"image": image}
     if aovs:
@@ -87,7 +113,7 @@ def _pixels(
     world: World, camera: Camera, x: Float[jax.Array, " n"], y: Float[jax.Array, " n"]
 ) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
     """The means over the samples of the pixels whose top left corners are (x, y), and how many walks ran out of steps."""
-    side = math.isqrt(Tiling(camera, world.settings).samples)
+    side = math.isqrt(world.settings.samples or 1)
 
     def sample(k: Int[jax.Array, ""]) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"]]:
         dx, dy = sample_offset(k, side, x.dtype)

@@ -1,6 +1,7 @@
 """Cameras: from a point of the picture to a ray in the world, and back."""
 
 import dataclasses
+import functools
 from typing import Any, Literal
 
 import equinox as eqx
@@ -13,7 +14,7 @@ from ..core.affine import affine, invertible
 from ..core.errors import whole_number
 from ..core.ray import Ray
 from ..core.rules import OneOf, Whole, require
-from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf
+from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, AnyArray, MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf
 from ..core.vector import dot, unit
 from .framing import framing_pose
 from .heightfield import Heightfield
@@ -42,6 +43,7 @@ class Perspective(Record):
     width: int = eqx.field(converter=whole_number, static=True, default=512, metadata={"rule": _PIXELS})
     height: int = eqx.field(converter=whole_number, static=True, default=512, metadata={"rule": _PIXELS})
     _ahead: ScalarLeaf | None = eqx.field(default=None, kw_only=True)  # see `localise_camera`
+    _size: Float[AnyArray, "2"] | None = eqx.field(default=None, kw_only=True)  # see `of_any_size`
 
     @classmethod
     def look_at(
@@ -226,6 +228,7 @@ class Orthographic(Record):
     width: int = eqx.field(converter=whole_number, static=True, default=512, metadata={"rule": _PIXELS})
     height: int = eqx.field(converter=whole_number, static=True, default=512, metadata={"rule": _PIXELS})
     _ahead: ScalarLeaf | None = eqx.field(default=None, kw_only=True)  # see `localise_camera`
+    _size: Float[AnyArray, "2"] | None = eqx.field(default=None, kw_only=True)  # see `of_any_size`
 
     @classmethod
     def look_at(
@@ -287,6 +290,19 @@ class Orthographic(Record):
 
 
 Camera = Perspective | Orthographic
+
+
+def of_any_size(camera: Camera) -> Camera:
+    """The same with its size as numbers, (width, height) in the dtype of its matrix, so that its programs serve all sizes."""
+    size = np.array([camera.width, camera.height], camera.world_from_camera.dtype)
+    return jax.tree.unflatten(_form_of_any_size(type(camera), camera._ahead is not None), [*jax.tree.leaves(camera), size])
+
+
+@functools.cache
+def _form_of_any_size(kind: type[Camera], far: bool) -> Any:
+    ahead: Any = np.ones(()) if far else None
+    size: Any = np.ones(2)
+    return jax.tree.structure(kind(np.eye(4), width=1, height=1, _ahead=ahead, _size=size))
 
 
 def cropped(camera: Camera, x: float | int, y: float | int, width: int, height: int) -> Camera:

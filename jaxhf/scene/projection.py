@@ -40,8 +40,12 @@ class Projection(eqx.Module):
 
 def screen(camera: Any, x: Any, y: Any) -> tuple[Any, Any]:
     """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
-    short = min(camera.width, camera.height)
-    return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
+    if camera._size is None:
+        short = min(camera.width, camera.height)
+        return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
+    width, height = camera._size
+    times = 1 / jnp.minimum(width, height)  # as XLA has it for a constant
+    return (2 * x - width) * times, (height - 2 * y) * times
 
 
 def camera_from_world(camera: Any) -> Affine:

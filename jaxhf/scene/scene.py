@@ -131,7 +131,8 @@ class Scene(Record):
         return f"Scene(objects={self.objects!r}, camera={self.camera!r}, lights={self.lights!r}, samples={self.samples})"
 
     def with_camera(self, camera: Camera) -> "Scene":
-        """The same scene seen by another camera; nothing is compiled again if its picture has the same size."""
+        """The same scene seen by another camera; nothing is compiled again if its picture is as large, or both have over 256²
+        pixels."""
         return dataclasses.replace(self, camera=camera)
 
     def with_lights(self, lights: Iterable[Light]) -> "Scene":

@@ -39,6 +39,14 @@ def is_staged() -> bool:
     return isinstance(jnp.zeros(()), Tracer)
 
 
+def is_part_of_more(tree: Any) -> bool:
+    """Whether what is computed from these values becomes part of a program or is differentiated or batched, or JAX has been
+    told of a mesh."""
+    if is_traced() or not jax.sharding.get_abstract_mesh().empty:
+        return True
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(tree))
+
+
 @contextlib.contextmanager
 def _garbage_left() -> Iterator[None]:
     """Within, Python looks for no garbage: tracing makes many objects that live on, and else takes up to a fifth longer."""

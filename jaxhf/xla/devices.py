@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jax.core import Tracer
 from jax.experimental import multihost_utils
+from jax.extend.core import jaxpr_as_fun
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 
 from ..core.errors import ArgumentError, UserError, require_kind
@@ -207,6 +208,60 @@ def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any
     return map_and_spread(mesh, lambda shared, item: (fun(shared, item), ()), shared, items)[0]
 
 
+def map_first(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any, count: Any) -> Any:
+    """`fun(shared, item)` for the first `count` items, a number that is data, dealt out in turn to the devices of a mesh.
+
+    Results stay where they are made, those of one device after those of the other; `in_order` puts them in order. Those of
+    further items are 0. Has no reverse derivative.
+    """
+
+    def the_first(shared: Any, items: Any, numbers: jax.Array, count: jax.Array) -> Any:
+        one, form = jax.make_jaxpr(fun, return_shape=True)(shared, jax.tree.map(lambda leaf: leaf[0], items))
+        forms, structure = jax.tree.flatten(form)
+
+        def step(k: jax.Array, found: list[jax.Array]) -> list[jax.Array]:
+            results = jaxpr_as_fun(one)(*jax.tree.leaves((shared, jax.tree.map(lambda leaf: leaf[k], items))))
+            return [lax.dynamic_update_index_in_dim(into, value, k, 0) for into, value in zip(found, results, strict=True)]
+
+        nothing = [jnp.zeros((len(numbers), *form.shape), form.dtype) for form in forms]
+        return jax.tree.unflatten(structure, lax.fori_loop(0, jnp.sum(numbers < count, dtype=jnp.int32), step, nothing))
+
+    devices, n = mesh.devices.size, jax.tree.leaves(items)[0].shape[0]
+    if devices == 1:
+        return the_first(shared, items, jnp.arange(n, dtype=jnp.int32), count)
+    turns = _turns(n, devices)
+
+    def on_one(shared: Any, items: Any, numbers: Any, count: Any) -> Any:
+        return the_first(shared, jax.tree.map(lambda leaf: leaf[0], items), numbers[0], count)
+
+    over = jax.shard_map(
+        on_one,
+        mesh=mesh,
+        in_specs=(P(), P(mesh.axis_names), P(mesh.axis_names), P()),
+        out_specs=P(mesh.axis_names),
+        check_vma=False,
+    )
+    return over(shared, jax.tree.map(lambda leaf: leaf[turns], items), turns.astype(np.int32), count)
+
+
+def everywhere(values: Any, mesh: Mesh) -> Any:
+    """The same on each device of a mesh; for tracing."""
+    return values if mesh.devices.size == 1 else lax.with_sharding_constraint(values, NamedSharding(mesh, P()))
+
+
+def _turns(n: int, devices: int) -> np.ndarray:
+    """Which items each device has; the last one is given out again, until each has as many."""
+    count = math.ceil(n / devices)
+    return np.minimum(np.arange(count * devices), n - 1).reshape(count, devices).T
+
+
+def in_order(devices: int, values: Any) -> Any:
+    """Results in the order of the items that were dealt out in turn to so many devices, and those of the last one again; for
+    NumPy and JAX arrays."""
+    tail = values.shape[1:]
+    return values.reshape(devices, -1, *tail).swapaxes(0, 1).reshape(-1, *tail)
+
+
 def map_and_spread(mesh: Mesh, fun: Callable[[Any, Any], tuple[Any, Any]], shared: Any, items: Any) -> tuple[Any, Any]:
     """`map_over` for the first of two results of `fun`. The second ones stay divided among the devices: in a row, to which so
     many more of the last are added that each device has as many."""
@@ -222,8 +277,7 @@ def map_and_spread(mesh: Mesh, fun: Callable[[Any, Any], tuple[Any, Any]], share
         dealt_out: Any = jax.sharding.auto_axes(functools.partial(map_and_spread, mesh, fun), out_sharding=P())
         return dealt_out(shared, items)
     given = mesh if around.empty else around
-    count = math.ceil(n / devices)
-    turns = np.minimum(np.arange(count * devices), n - 1).reshape(count, devices).T
+    turns = _turns(n, devices)
     over = jax.shard_map(
         lambda shared, items: one_after_the_other(shared, jax.tree.map(lambda leaf: leaf[0], items)),
         mesh=given,
@@ -232,16 +286,12 @@ def map_and_spread(mesh: Mesh, fun: Callable[[Any, Any], tuple[Any, Any]], share
         check_vma=False,
     )
 
-    def in_order(values: jax.Array) -> jax.Array:
-        tail = values.shape[1:]
-        return values.reshape(devices, count, *tail).swapaxes(0, 1).reshape(devices * count, *tail)
-
     def gathered(values: jax.Array) -> jax.Array:
         # Before anything is made of it, or XLA would take sums in parts, in another order than on one device.
-        return in_order(lax.with_sharding_constraint(values, NamedSharding(given, P())))[:n]
+        return in_order(devices, lax.with_sharding_constraint(values, NamedSharding(given, P())))[:n]
 
     def spread(values: jax.Array) -> jax.Array:
-        return lax.with_sharding_constraint(in_order(values), NamedSharding(given, P(mesh.axis_names)))
+        return lax.with_sharding_constraint(in_order(devices, values), NamedSharding(given, P(mesh.axis_names)))
 
     first, second = over(shared, jax.tree.map(lambda leaf: leaf[turns], items))
     return jax.tree.map(gathered, first), jax.tree.map(spread, second)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 PROGRAM = """
+import dataclasses
 import sys
 import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
@@ -40,10 +41,12 @@ scene = jaxhf.Scene(
 settings = jaxhf.Settings(chunk=64)
 results, mesh = {}, meshes.get("all")
 if "pictures" in parts:
+    large = scene.with_camera(dataclasses.replace(scene.camera, width=80, height=75))  # by the program for any size
     for name, each in meshes.items():
-        results[f"image {name}"] = jaxhf.render(scene, settings, mesh=each)
-    results["in parts"] = jaxhf.render(scene, settings, progress=lambda done, total: None, mesh=mesh)
-    prepared = jaxhf.prepare(scene, settings, mesh=mesh)
+        results[f"image {name}"] = jaxhf.render(large, settings, mesh=each)
+    results["of its size"] = jaxhf.render(scene, settings, mesh=mesh)
+    results["in parts"] = jaxhf.render(large, settings, progress=lambda done, total: None, mesh=mesh)
+    prepared = jaxhf.prepare(large, settings, mesh=mesh)
     results["prepared"] = jaxhf.render(prepared)
     if mesh is not None:
         try:
@@ -137,8 +140,10 @@ def test_pictures_have_the_same_bits_on_any_number_of_devices(found, name):
     (one,) = found("one")
     for each in found(name):
         assert each["devices"] == 4
+        assert each["image none"].shape == (75, 80, 3)
         pictures = [name for name in each if name.startswith("image")]
         assert len(pictures) == (4 if name == "some of four" else 2)
+        np.testing.assert_array_equal(each["of its size"], one["of its size"])
         for picture in (*pictures, "in parts", "prepared"):
             np.testing.assert_array_equal(each[picture], one["image none"], err_msg=picture)
         assert "render: the scene was prepared on Mesh" in str(each["refused"])

@@ -198,7 +198,7 @@ def test_there_is_no_progress_within_a_transformation(transformation):
 
 def test_tiles_cover_the_picture_and_no_more():
     camera = jaxhf.Perspective.look_at(EYE, TARGET, width=33, height=17)
-    assert Tiling(camera, jaxhf.Settings(chunk=64)).count == 5 * 3  # of 8 x 8 pixels
+    assert Tiling(camera.width, camera.height, jaxhf.Settings(chunk=64)).count == 5 * 3  # of 8 x 8 pixels
 
 
 def test_progress_gives_the_same_bits():

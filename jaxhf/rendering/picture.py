@@ -1,0 +1,118 @@
+"""The picture of a scene that is ready for tracing: by a program for its size, or by one for pictures of any size."""
+
+import functools
+import math
+from collections.abc import Callable, Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh
+from jaxtyping import Float
+
+from ..boundary.guiding import has_edges
+from ..boundary.term import Boundaries, draw_boundaries, moved_light
+from ..core.autodiff import with_tangent
+from ..core.settings import Settings
+from ..preparation.world import World
+from ..scene.camera import Camera, of_any_size
+from ..xla.compilation import compiled, is_part_of_more
+from ..xla.devices import everywhere, in_order, map_over, on_every_device, on_host
+from ..xla.kernel import in_turn, one_kernel
+from .samples import PictureSamples
+from .tiles import Tiling, light_along, trace_tiles
+
+_AT_ONCE = 128
+"""Tiles that a program for any size traces: with fewer devices wait more often, with more it clears memory for longer."""
+
+_OF_ITS_SIZE = 64
+"""Up to so many tiles a picture has a program for its size: by that for any size it would take 1.1 to 1.6 times as long."""
+
+
+def picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> dict[str, jax.Array]:
+    """The picture ("image") and AOVs, each of shape (h, w, ...)."""
+    few = Tiling(camera.width, camera.height, world.settings).count <= _OF_ITS_SIZE
+    if few or is_part_of_more((world, camera)):
+        drawn = on_every_device(key, mesh) if world.settings.edge_samples else None  # else the settings draw nothing
+        return trace_picture(world, camera, aovs, mesh, drawn)
+    parts = [part for _, part in _parts(world, camera, aovs, mesh, _AT_ONCE)]
+    return _assembled(parts, camera.width, camera.height, world.settings, mesh)
+
+
+@functools.partial(compiled, static_argnames=("aovs", "mesh"))
+def trace_picture(
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None
+) -> dict[str, jax.Array]:
+    """The same by a program for its size, also as a part of another program, and differentiable."""
+
+    def picture(world: World, camera: Camera, _: jax.Array | None = None) -> dict[str, jax.Array]:
+        tiling = Tiling(camera.width, camera.height, world.settings)
+        tiles = trace_tiles(mesh, world, camera, aovs, tiling.corners())
+        return jax.tree.map(tiling.assemble, tiles)
+
+    def across_boundaries(world: World, camera: Camera, key: jax.Array | None) -> dict[str, jax.Array]:
+        others = picture(world, camera) if aovs else {}
+        drawn = draw_boundaries(world, camera, key, mesh)
+        return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
+
+    return in_turn(picture, world, camera, key, derivative_of=across_boundaries if has_edges(world) else None)
+
+
+def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, mesh: Mesh) -> Float[jax.Array, "h w 3"]:
+    """The picture, with the derivative in which boundaries have a part.
+
+    One loop traces all samples, also those of pixels in which boundaries were seen: with a loop of their own for these the
+    program compiled for 7 s longer.
+    """
+    samples = PictureSamples(camera, world.settings, drawn.resampled)
+
+    def radiance(seen: tuple[World, Camera], points: tuple[jax.Array, ...]) -> jax.Array:
+        return one_kernel(lambda *args: light_along(*args)[0], *seen, *points)
+
+    light = map_over(mesh, radiance, (world, camera), samples.positions())
+    image = samples.in_pixels(light)
+    finer = samples.of_resampled(light).mean(1)
+    light = moved_light(world, camera, drawn, mesh)
+    change = image.reshape(-1, 3).at[drawn.resampled].set(finer, unique_indices=True).at[drawn.pixel].add(light)
+    return with_tangent(lax.stop_gradient(image), change.reshape(image.shape))
+
+
+_trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
+
+
+def trace_in_parts(
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, progress: Callable[[int, int], None]
+) -> dict[str, np.ndarray]:
+    """The same, with the picture on the host: device memory does not grow with it."""
+    tiling = Tiling(camera.width, camera.height, world.settings)
+    pixels, size, parts = tiling.width * tiling.height, min(_AT_ONCE, math.ceil(tiling.count / 64)), []
+    for done, part in _parts(world, camera, aovs, mesh, size):
+        parts.append({name: in_order(mesh.devices.size, values)[:size] for name, values in on_host(part).items()})
+        progress(min(pixels, done * pixels // tiling.count), pixels)
+    return {name: tiling.assemble(np.concatenate([part[name] for part in parts])[: tiling.count]) for name in parts[0]}
+
+
+def _parts(
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, size: int
+) -> Iterator[tuple[int, dict[str, jax.Array]]]:
+    """So many tiles after the other, as `map_first` leaves them, and how many are then done."""
+    corners, sizeless = Tiling(camera.width, camera.height, world.settings).corners(), of_any_size(camera)
+    for first in range(0, len(corners), size):
+        some = corners[first : first + size]
+        padded = np.concatenate([some, np.zeros((_AT_ONCE - len(some), 2), np.int32)])
+        yield first + size, _trace_tiles(mesh, world, sizeless, aovs, padded, np.int32(len(some)))
+
+
+@functools.partial(compiled, newer=True, static_argnames=("width", "height", "settings", "mesh"))
+def _assembled(
+    parts: list[dict[str, jax.Array]], width: int, height: int, settings: Settings, mesh: Mesh
+) -> dict[str, jax.Array]:
+    """A picture of parts as `map_first` leaves them, on each device."""
+    tiling = Tiling(width, height, settings)
+
+    def whole(*parts: jax.Array) -> jax.Array:
+        ordered = [in_order(mesh.devices.size, everywhere(part, mesh))[:_AT_ONCE] for part in parts]
+        return tiling.assemble(jnp.concatenate(ordered)[: tiling.count])
+
+    return jax.tree.map(whole, *parts)
