@@ -26,6 +26,7 @@ from ..trace.grid import Grid, make_grid
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import (
     chosen_mesh,
+    held_everywhere,
     on_every_device,
     prepared_mesh,
     takes_numbers,
@@ -149,7 +150,7 @@ def prepare(
     _require_scene("prepare", scene, Scene)
     mesh = chosen_mesh("prepare", mesh, scene)
     local = on_every_device(localise(scene), mesh)
-    world = prepared_world(local, resolve_settings(settings or Settings(), scene))
+    world = held_everywhere(prepared_world(local, resolve_settings(settings or Settings(), scene)), mesh)
     form = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), scene)
     return Prepared(scene.camera, mesh, world, tuple(anchor(scene).tolist()), form, _Given(scene))
 

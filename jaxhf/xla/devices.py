@@ -125,6 +125,19 @@ def on_every_device(tree: Any, mesh: Mesh) -> Any:
     return tree if _at_home(mesh) else jax.tree.map(placed, tree, is_leaf=lambda leaf: isinstance(leaf, Spread))
 
 
+def held_everywhere(tree: Any, mesh: Mesh) -> Any:
+    """What was computed of arrays that are on each device of a mesh, for many uses there.
+
+    Over several processes each computes it on one of its devices, and each use would copy it to the others.
+    """
+
+    def held(leaf: Any) -> Any:
+        values = np.asarray(leaf)
+        return jax.make_array_from_callback(values.shape, NamedSharding(mesh, P()), lambda index: values[index])
+
+    return jax.tree.map(held, tree) if mesh.is_multi_process and not is_traced() else tree
+
+
 def divided(tree: Any, mesh: Mesh) -> Any:
     """Divides arrays along their first axis among the devices of a mesh; those that it does not divide, and small ones, are
     copied to each."""

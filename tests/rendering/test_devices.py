@@ -48,6 +48,7 @@ if "pictures" in parts:
     results["in parts"] = jaxhf.render(large, settings, progress=lambda done, total: None, mesh=mesh)
     prepared = jaxhf.prepare(large, settings, mesh=mesh)
     results["prepared"] = jaxhf.render(prepared)
+    results["prepared on"] = min(len(leaf.sharding.device_set) for leaf in jax.tree.leaves(prepared._world))
     if mesh is not None:
         try:
             jaxhf.render(prepared, mesh=jax.make_mesh((4,), ("other",), axis_types=auto[:1]))
@@ -143,6 +144,7 @@ def test_pictures_have_the_same_bits_on_any_number_of_devices(found, name):
         assert each["image none"].shape == (75, 80, 3)
         pictures = [name for name in each if name.startswith("image")]
         assert len(pictures) == (4 if name == "some of four" else 2)
+        assert each["prepared on"] == 4  # or each frame would copy the terrain to the others
         np.testing.assert_array_equal(each["of its size"], one["of its size"])
         for picture in (*pictures, "in parts", "prepared"):
             np.testing.assert_array_equal(each[picture], one["image none"], err_msg=picture)
