@@ -18,6 +18,7 @@ from .maps.hillshade import hillshade as hillshade
 from .maps.relief import color_relief as color_relief, relief as relief
 from .maps.skyview import horizon as horizon, sky_view as sky_view
 from .maps.slope import aspect as aspect, slope as slope
+from .maps.viewshed import LineOfSight as LineOfSight, line_of_sight as line_of_sight, viewshed as viewshed
 from .rendering.aovs import AOVS as AOVS
 from .rendering.cast import cast as cast
 from .rendering.render import (

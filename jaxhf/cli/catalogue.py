@@ -5,7 +5,21 @@ from dataclasses import dataclass
 
 from ..core.settings import Settings
 from ..maps.choices import ALGORITHMS, ENTRIES, VARIANTS, WEIGHTINGS
-from .arguments import FINITE, POSITIVE, Option, choice, flag, names, number, option, settings_options, size, sun, whole
+from .arguments import (
+    FINITE,
+    POSITIVE,
+    Option,
+    choice,
+    flag,
+    names,
+    number,
+    option,
+    real_number,
+    settings_options,
+    size,
+    sun,
+    whole,
+)
 
 
 @dataclass(frozen=True)
@@ -100,6 +114,35 @@ def _sky(written: str, special: Option) -> dict[str, Sequence[Option]]:
 
 
 _SHARE = "share of the sky's solid angle, or of its light on horizontal ground or on the slope [solid-angle]"
+_OBSERVER = "x and y in the file's coordinates; may be said several times"
+_RADIUS = "of the sphere on which the terrain lies [it lies on a plane; for light over the Earth 7.44e6, as GDAL's 6/7]"
+_VIEWSHED = Command(
+    "viewshed",
+    "map what is seen of a terrain",
+    examples=(
+        "dem.tif -o seen.tif --observer 435200 5163000 --height 30 --radius 7.44e6",
+        "dem.tif -o mast.tif --observer 435200 5163000 --above-ground",
+    ),
+    options={
+        "": (
+            _IN,
+            _output("the map: .tif or .png (255 where it is seen, 0 elsewhere), or .npy"),
+            option(
+                "--observer", dest="observers", nargs=2, type=real_number, action="append", required=True, metavar=("X", "Y"),
+                help=_OBSERVER,
+            ),
+            flag("--line", "observers all along the line through these points, at most a cell apart"),
+            number("--height", "H", "of the eyes above the ground [1.8]"),
+            number("--target", "H", "height above the ground of what is to be seen [0]"),
+            flag("--above-ground", "the least height above the ground that is seen, in 32-bit floats; .tif or .npy"),
+            number("--radius", "R", _RADIUS),
+        ),
+        "spacing": _STEPS,
+        **_RASTER,
+        **_MACHINE,
+    },
+    about="A place is seen if it is from any observer: exact on the terrain's triangles.",
+)  # fmt: skip
 _MAPS = (
     Command(
         "hillshade",
@@ -155,6 +198,7 @@ _MAPS = (
         module="sky",
         about="They are in degrees above the horizontal, at least 0: exact and without a search radius.",
     ),
+    _VIEWSHED,
 )
 
 # Pictures.

@@ -75,6 +75,7 @@ def skyline_slope(
     active: Flag,
     between: tuple[Scalar, Scalar],
     above: bool = True,
+    t_max: Scalar | None = None,
 ) -> tuple[Scalar, Flag]:
     """The largest slope at which the surface is seen from a point, and whether the walk ran out of steps.
 
@@ -90,9 +91,10 @@ def skyline_slope(
       between: the slopes that matter: what is below the first counts as the first, and the walk gives up beyond the second.
       above: False for the smallest slope: then what is above the second counts as the second, and the walk gives up beyond the
         first.
+      t_max: the horizontal distance up to which the surface counts, world units; None: to its end.
     """
     o = jnp.where(leaving.object == number, point_on_grid(grid, leaving), grid.grid_from_world.point(leaving.p))
-    fixed = lax.stop_gradient((grid, o, level, leaving, between))
+    fixed = lax.stop_gradient((grid, o, level, leaving, between, t_max))
     edge, exhausted = stored(materialise(_outermost_edge(*fixed, number, active, above)))
     slope = _slope_to(grid, o, level, edge, above)
     return (greater(slope, between[0]) if above else lesser(slope, between[1])), exhausted
@@ -129,6 +131,7 @@ def _outermost_edge(
     level: Vector,
     leaving: Hit,
     between: tuple[Scalar, Scalar],
+    t_max: Scalar | None,
     number: int,
     active: Flag,
     above: bool,
@@ -150,6 +153,7 @@ def _outermost_edge(
         jnp.where(walk.back_y, grid.pyramid.height, grid.cells[1]),
     )
     by_side = lesser(walk.distance_x(ends[0]), walk.distance_y(ends[1]))
+    by_side = by_side if t_max is None else lesser(by_side, t_max - walk.t_start)
     # A point on a wall along the border may be inside by rounding; the border does not stand before it then.
     touching = jnp.where(own, 0, _rounding(grid, o) / greater(walk.dx, walk.dy))
     start = jnp.stack([o[0], o[1], z])
@@ -170,7 +174,7 @@ def _outermost_edge(
         state, slope, edge = carry
         here = tilted(slope)
         state = lax.fori_loop(0, SKIPS, lambda _, state: here.skip(state), state)
-        state, found = _beside_cell(here, state, touching, above)
+        state, found = _beside_cell(here, state, touching, above, t_max)
         slope = raised(slope, found)
         goes_on = slope < highest if above else slope > lowest
         return jnp.where(goes_on, state, MISS), slope, jnp.where(found >= 0, found, edge)
@@ -183,13 +187,14 @@ def _outermost_edge(
     return edge, walking(state)
 
 
-def _beside_cell(walk: Walk, state: jax.Array, beyond: Scalar, above: bool) -> tuple[jax.Array, Index]:
+def _beside_cell(walk: Walk, state: jax.Array, beyond: Scalar, above: bool, t_max: Scalar | None) -> tuple[jax.Array, Index]:
     """One cell, for a ray on one side of the surface that nothing stops: goes on, and says which edge is furthest past it.
 
     Args:
       state: of the walk.
       beyond: up to which t no edge counts.
       above: whether the ray is above the surface.
+      t_max: up to which t edges count; None: all.
 
     Returns:
       The state in the next cell, and the edge that is seen from where t is 0 at the largest slope of those above the ray
@@ -203,6 +208,8 @@ def _beside_cell(walk: Walk, state: jax.Array, beyond: Scalar, above: bool) -> t
     past_diagonal, past_exit = (-gap if above else gap for gap in (cell.gap_diagonal, cell.gap_out))
     on_diagonal = jnp.where(cell.crosses & ~cell.on_own & (near > beyond), past_diagonal, 0)
     on_exit = jnp.where(cell.skip_out | (far <= beyond), 0, past_exit)
+    if t_max is not None:
+        on_diagonal, on_exit = jnp.where(near > t_max, 0, on_diagonal), jnp.where(far > t_max, 0, on_exit)
     # A diagonal that is not crossed may lie behind, with a `near` below 0.
     kind = jnp.where((on_diagonal > 0) & (on_diagonal * far > on_exit * near), 2, cell.through_x.astype(jnp.int32))
     rises = visits & cell.whole & (greater(on_diagonal, on_exit) > 0)

@@ -97,3 +97,38 @@ def test_a_full_disk_leaves_none_of_several_maps(run, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["terrain.npz"]
     assert run("horizon", "out.tif", "--azimuths", "4")[0] == 0
     assert sorted(path.name for path in tmp_path.glob("out*")) == [f"out_{turn}.tif" for turn in ("000", "090", "180", "270")]
+
+
+def test_viewshed(run, tmp_path):
+    """From two points, and all along the line between them; in the coordinates of the file, which begin at (100, 50)."""
+    eyes = [(3.0, 2.0), (10.0, 2.5)]
+    observers = [word for x, y in eyes for word in ("--observer", str(100 + x), str(50 + y))]
+    terrain = jaxhf.Terrain(Z, 2.0, 3.0)
+    code, said = run("viewshed", "seen.png", *observers, "--height", "0.2", "--target", "0.1")
+    seen = jaxhf.viewshed(terrain, eyes, 0.2, 0.1)
+    assert code == 0
+    assert f": {100 * seen.sum() / 34:.1f} % is seen, from 2 points, " in said
+    with Image.open(tmp_path / "seen.png") as picture:
+        np.testing.assert_array_equal(np.asarray(picture)[::-1], np.where(seen, 255, 0))
+    assert 3 < seen.sum() < 34
+    assert run("viewshed", "above.npy", *observers, "--line", "--above-ground", "--radius", "50")[0] == 0
+    along = np.linspace(*eyes, 5)  # 3.5 cells: in 4 steps
+    expected = jaxhf.viewshed(terrain, along, wanted="above-ground", radius=50.0)
+    np.testing.assert_array_equal(np.load(tmp_path / "above.npy"), expected)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (("--observer", "90", "52"), "--observer must be on the terrain, x from 100 to 112 and y from 50 to 62; it is 90 52"),
+        (("--observer", "103", "52", "--line"), "--line needs two --observer at least, there is one"),
+        (("--observer", "103", "52", "--above-ground", "--target", "2"), "--target would change nothing: --above-ground"),
+        (("--observer", "106", "56"), "must be where there is a height, there is none in column 3, row 2"),
+        (("--observer", "103"), "expected 2 arguments"),
+        ((), "required: --observer"),
+    ],
+)
+def test_wrong_observers_are_refused(run, options, expected):
+    code, said = run("viewshed", "seen.npy", *options)
+    assert code == 2
+    assert expected in said
