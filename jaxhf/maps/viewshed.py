@@ -54,8 +54,8 @@ def viewshed(
     terrain models, International Journal of GIS 8(1), 1994). Over holes one sees.
 
     Args:
-      terrain: a `Terrain` (degrees count as metres, see `load_heights`), or heights, shape (ny, nx), row 0 in the south, nan
-        where there is none.
+      terrain: a `Terrain` (degrees count as metres, see `load_heights`), a `Heightfield`, or heights, shape (ny, nx), row 0 in
+        the south, nan where there is none.
       observers: x and y of one, shape (2,), or of several, (n, 2), on the terrain, in its coordinates; for an array from
         vertex (0, 0) on, in the unit of `dx`. Those along a line are points a cell apart.
       height: of the eyes above the ground, in the unit of the heights.
@@ -81,6 +81,7 @@ def viewshed(
     if radius is not None:
         require("viewshed", "radius", radius, POSITIVE)
     require_progress("viewshed", progress, False)
+    terrain = _with_place(terrain)
     places = _cells("viewshed", "observers", terrain, observers, dx, dy)
     ground = surface("viewshed", terrain, dx, dy)
     field = Heightfield(ground.heights, ground.dx, ground.dy)
@@ -202,6 +203,7 @@ def line_of_sight(
     require(owner, "target_height", target_height, _at_least_0)
     if radius is not None:
         require(owner, "radius", radius, POSITIVE)
+    terrain = _with_place(terrain)
     places = [_one(owner, name, terrain, at, dx, dy) for name, at in (("observer", observer), ("target", target))]
     ground = surface(owner, terrain, dx, dy)
     z = ground.heights.astype(np.float64)
@@ -225,6 +227,12 @@ def line_of_sight(
         visible = not (profile[between] > line[between]).any()
         needed = (profile[between] - eye) / share[between] + eye - profile[-1]
     return LineOfSight(distance, profile, line, visible, float(max(0, np.nanmax(needed, initial=0))))
+
+
+def _with_place(terrain: Any) -> Any:
+    if isinstance(terrain, Heightfield):
+        return Terrain(np.asarray(terrain.heights), terrain.dx, terrain.dy, terrain.x0, terrain.y0)
+    return terrain
 
 
 def _at_least_0(value: Any) -> str | None:

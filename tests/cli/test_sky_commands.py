@@ -112,7 +112,7 @@ def test_viewshed(run, tmp_path):
         np.testing.assert_array_equal(np.asarray(picture)[::-1], np.where(seen, 255, 0))
     assert 3 < seen.sum() < 34
     assert run("viewshed", "above.npy", *observers, "--line", "--above-ground", "--radius", "50")[0] == 0
-    along = np.linspace(*eyes, 5)  # 3.5 cells: in 4 steps
+    along = np.linspace(eyes[0], eyes[1], 5)  # 3.5 cells: in 4 steps
     expected = jaxhf.viewshed(terrain, along, wanted="above-ground", radius=50.0)
     np.testing.assert_array_equal(np.load(tmp_path / "above.npy"), expected)
 

@@ -120,6 +120,8 @@ def test_a_terrain_has_its_own_coordinates():
     terrain = jaxhf.Terrain(z, DX, DY, x0=5e5, y0=4e6)
     by_terrain = jaxhf.viewshed(terrain, (5e5 + EYE[0], 4e6 + EYE[1]))
     np.testing.assert_array_equal(by_terrain, jaxhf.viewshed(z, EYE, dx=DX, dy=DY))
+    field = jaxhf.Heightfield(z, DX, DY, x0=5e5, y0=4e6)
+    np.testing.assert_array_equal(by_terrain, jaxhf.viewshed(field, (5e5 + EYE[0], 4e6 + EYE[1])))
 
 
 def test_flat_ground_is_seen_as_a_whole():
