@@ -48,7 +48,8 @@ class Fit:
       samples: terrains that pictures and prior allow, one for each draw, shape (draws, ny, nx): what is derived from each, a
         slope or a volume, varies as it is unsure. None as `std`.
       seen: whether a change of the height would change any picture, shape (ny, nx).
-      albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c); None where it was known.
+      albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c), c = 1 where all channels share it;
+        None where it was known.
       exposures, offsets: of each picture; None where they were known.
       noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated. Of a
         `Noise` it is the root mean square over the values that count.
