@@ -360,7 +360,8 @@ CASES = {
     "jacksboro": Definition("float32", jacksboro),
     "topobathy": Definition("float32", topobathy),
     "hfield": Definition("float32", hfield, UNEXPLAINED),
-    "evening": Definition("float32", evening, ("unseen", *UNEXPLAINED)),  # begun at the true heights it says so, too
+    # Begun at the true heights it says so, too.
+    "evening": Definition("float32", evening, ("unseen", "one light", *UNEXPLAINED)),
     "photographs": Definition("float64", photographs),
     "orthophoto": Definition("float32", orthophoto),
     "aslant": Definition("float32", aslant),

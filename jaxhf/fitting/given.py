@@ -94,6 +94,8 @@ class Unknown:
       albedo_length: correlation length of the logarithms of a map's factors, world units as dx and dy are: their correlation at
         the distance r is exp(-r / albedo_length). So they do not explain all of one picture. `noise` must be given then: what
         they leave does not tell it. None: each factor is for itself.
+      albedo_shared: whether all channels of the pictures have the same factors, as where the colour of the ground is known and
+        how bright it is varies: a third of the unknowns. False: each channel has factors of its own.
       exposures, offsets: whether each picture has an unknown factor, an unknown addend. Where the albedo is unknown too, only
         the product of exposure and albedo is known; the fit keeps near 1.
       sky_std: the standard deviation of the logarithm of the sky's radiance in each picture: 0.7 is a factor of 2. None: it is
@@ -110,6 +112,7 @@ class Unknown:
     albedo: Albedo | str | None = None
     albedo_std: float | int = 1.0
     albedo_length: float | int | None = None
+    albedo_shared: bool = False
     exposures: bool = False
     offsets: bool = False
     sky_std: float | int | None = None
@@ -128,9 +131,11 @@ class Unknown:
             raise ArgumentError("Unknown", "albedo_length", 'must stand with albedo="map"')
         _require_positive("Unknown", "albedo_length", self.albedo_length)
         _require_positive("Unknown", "sky_std", self.sky_std)
-        for name in ("exposures", "offsets"):
+        for name in ("albedo_shared", "exposures", "offsets"):
             value = getattr(self, name)
             require("Unknown", name, bool(value) if isinstance(value, np.bool_) else value, flag)
+        if self.albedo_shared and self.albedo is None:
+            raise ArgumentError("Unknown", "albedo_shared", "must stand with an albedo that is sought")
         if self.material_std is not None and not (isinstance(self.material_std, Mapping) and self.material_std):
             raise ArgumentError("Unknown", "material_std", f"must have deviations by name, it is {self.material_std!r}")
         for name, deviation in (self.material_std or {}).items():

@@ -29,6 +29,7 @@ CAMERAS = [
 TEXELS = np.random.default_rng(1).uniform(0.2, 0.9, (3, 4, 3))
 KNOWN_LAW = jaxhf.Unknown(albedo="map", exposures=True, offsets=True, light_std=1.0, camera_std=(0.1, 1.0), sky_std=0.5)
 EVERYTHING = dataclasses.replace(KNOWN_LAW, material_std={"limb": 0.2})
+SHARED = dataclasses.replace(KNOWN_LAW, albedo_shared=True)
 ROUNDING = {"single": 2e-4, "double": 1e-10}  # of the largest value: sums of some hundred terms that are rounded
 
 
@@ -100,11 +101,13 @@ FLAT = dataclasses.replace(NO_EDGES, shading="flat", samples=4)
     ("settings", "channels", "precision", "unknown"),
     [
         (NO_EDGES, (1,), "single", EVERYTHING),
+        (NO_EDGES, (3,), "single", SHARED),
         pytest.param(NO_EDGES, (1, 3), "double", EVERYTHING, marks=[pytest.mark.x64, pytest.mark.slow]),
+        pytest.param(NO_EDGES, (1, 3), "double", SHARED, marks=[pytest.mark.x64, pytest.mark.deep]),
         pytest.param(EDGES, (3,), "double", KNOWN_LAW, marks=[pytest.mark.x64, pytest.mark.deep]),
         pytest.param(FLAT, (3,), "double", KNOWN_LAW, marks=[pytest.mark.x64, pytest.mark.deep]),
     ],
-    ids=["single", "crowded, double", "edges, double", "flat, double"],
+    ids=["single", "shared, single", "crowded, double", "crowded, shared, double", "edges, double", "flat, double"],
 )
 def test_products_are_those_of_the_derivative_of_render(settings, channels, precision, unknown, monkeypatch):
     """J and its transpose, in all unknowns at once; and the derivative in heights as a sparse matrix.
@@ -153,16 +156,21 @@ ALBEDOS = {
 
 
 @pytest.mark.deep  # test_fit.py finds a map of it
-@pytest.mark.parametrize(("name", "channels"), [("texels that repeat", 3), *((name, 1) for name in ALBEDOS)])
-def test_the_derivative_in_an_albedo_is_a_difference_of_two_pictures(name, channels):
+@pytest.mark.parametrize(
+    ("name", "channels", "shared"),
+    [("texels that repeat", 3, False), *((name, 1, False) for name in ALBEDOS), *((name, 3, True) for name in ALBEDOS)],
+)
+def test_the_derivative_in_an_albedo_is_a_difference_of_two_pictures(name, channels, shared):
     """Light is proportional to it, so the difference is exact however far apart they are."""
     albedo, kind = ALBEDOS[name]
     scene = scenes(TRUTH, albedo)[:1]
     target = np.random.default_rng(0).uniform(0.1, 0.3, (SIZE, SIZE, channels)).astype(np.float32)
-    here = expanded(scene, [target], settings=SETTINGS, noise=0.1, unknown=jaxhf.Unknown(albedo=kind))
+    unknown = jaxhf.Unknown(albedo=kind, albedo_shared=shared)
+    here = expanded(scene, [target], settings=SETTINGS, noise=0.1, unknown=unknown)
     assert here.unknowns.albedo is not None
     old = albedo if isinstance(albedo, jaxhf.ImageTexture) else jaxhf.ImageTexture(np.full((1, 1, 3), albedo, np.float32))
     rng, shape = np.random.default_rng(1), here.unknowns.albedo.shape
+    assert shape[2] == (1 if shared else channels)
     at = rng.uniform(0.5, 1.5, shape).astype(np.float32)
     here = expand(dataclasses.replace(here.unknowns, albedo=jnp.asarray(at)), here.problem)
 

@@ -1,6 +1,7 @@
 """What a fit chooses by itself, and what it says of its result."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,8 @@ from jaxhf.fitting.trust.facts import (
     Left,
     _share_of_normals,
     dependent_channels,
+    have_same_light,
+    have_same_view,
     neighbour_correlation,
     shows_mean,
     unlike_noise,
@@ -250,8 +253,8 @@ def test_channels_that_are_off_alike_are_said_to_be_one_measurement():
 
 GOOD = Findings(
     result=jaxhf.Stop.CONVERGED, chi2=1.0, noise_given=True, where="", regions=(), unlike_noise=None, channels=None,
-    help="try this", strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, lights=3, scaled=1.0,
-    displaced=(0.5, 1.01), draws=(20, 20), parts=(0.1, 0.2), unsure_noise=None, length=None,
+    help="try this", strayed=0.9, seen=np.ones((4, 5), bool), mean_shown=True, noise_share=0.01, same_light=False,
+    same_view=True, scaled=1.0, displaced=(0.5, 1.01), draws=(20, 20), parts=(0.1, 0.2), unsure_noise=None, length=None,
 )  # fmt: skip
 
 
@@ -271,7 +274,8 @@ GOOD = Findings(
         ({"seen": np.arange(20).reshape(4, 5) > 4}, "no picture shows 5 of 20 heights (25%): they are what the prior makes"),
         ({"seen": np.arange(20).reshape(4, 5) > 4, "strayed": None}, "they are a smooth continuation of their neighbours"),
         ({"seen": np.zeros((4, 5), bool), "strayed": None}, "they are the start"),
-        ({"strayed": None, "lights": 1}, "same light and there is no prior"),
+        ({"strayed": None, "same_light": True}, "same light and there is no prior"),
+        ({"same_light": True}, "same light: slopes across it hardly show, and standard deviations are often too small"),
         ({"strayed": None, "mean_shown": False}, "not how high all of it stands"),
         ({"strayed": None, "noise_share": 0.3, "scaled": None}, "the noise is 30% of the pictures' brightness"),
         ({"scaled": 1.8}, "1.8 times the noise"),
@@ -286,6 +290,60 @@ GOOD = Findings(
 def test_warnings_say_what_speaks_against_the_heights(change, said):
     assert warnings(GOOD) == ()
     assert any(said in warning for warning in warnings(GOOD._replace(**change)))
+
+
+def test_beside_a_prior_one_light_is_said_where_nothing_else_tells_slopes_and_deviations_were_asked_for():
+    assert warnings(GOOD._replace(same_light=True, draws=(0, 0))) == ()
+    assert warnings(GOOD._replace(same_light=True, same_view=False)) == ()
+
+
+def test_a_fit_of_one_picture_beside_a_prior_says_that_it_has_one_light():
+    options = {"settings": SETTINGS, "noise": 0.01, "prior": jaxhf.Prior(0.05, 0.03), "draws": 2, "max_steps": 3}
+    found = jaxhf.fit(scenes()[:1], pictures()[:1], **options)
+    assert any("all pictures have the same light: slopes" in warning for warning in found.warnings)
+
+
+def test_lights_are_the_same_that_come_from_one_direction():
+    """Over the terrain as it lies: a lamp that moved, a sky beside the sun, a terrain that was turned are other lights."""
+
+    def sun(azimuth: float, altitude: float = 40.0, **options) -> jaxhf.Directional:
+        return jaxhf.Directional.from_angles(azimuth, altitude, **options)
+
+    def lit(lights: list[Any], turn: float = 0.0) -> jaxhf.Scene:
+        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        place = np.array([[2 * c, -s, 0, 0], [2 * s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        ground = jaxhf.Object(jaxhf.Heightfield(TRUTH), jaxhf.Matte(0.5), place if turn else None)
+        return jaxhf.Scene([ground], CAMERA, lights)
+
+    lamps = [jaxhf.Point((0.5, 0.5, 2.0)), jaxhf.Point((0.5, 0.8, 2.0))]
+    assert have_same_light([lit([sun(100)])])
+    assert have_same_light([lit([sun(100)]), lit([sun(103, irradiance=(1.0, 2.0, 3.0))]), lit([sun(102, 42)])])
+    assert not have_same_light([lit([sun(100)]), lit([sun(100)]), lit([sun(105.5)])])
+    assert not have_same_light([lit([sun(100)]), lit([sun(220)])])
+    assert not have_same_light([lit([sun(100)]), lit([sun(100), jaxhf.Sky(0.5)])])
+    assert have_same_light([lit([sun(100), sun(220)]), lit([sun(220), sun(100)])])
+    assert have_same_light([lit(lamps[:1]), lit(lamps[:1])])
+    assert not have_same_light([lit(lamps[:1]), lit(lamps[1:])])
+    assert have_same_light([lit([sun(100)], 30.0), lit([sun(200)], -70.0)])
+    assert not have_same_light([lit([sun(100)], 30.0), lit([sun(100)], -70.0)])
+
+
+def test_views_are_the_same_that_are_from_one_direction():
+    """Towards the terrain's middle, as it lies; from a point, and from infinitely far away."""
+
+    def seen(eye: tuple[float, float, float], place: Any = None, orthographic: bool = False) -> jaxhf.Scene:
+        x, y, z = eye
+        camera = jaxhf.Perspective.look_at(eye, (x, y, z - 1), up=(0, 1, 0))  # straight down, wherever it stands
+        if orthographic:
+            camera = jaxhf.Orthographic.look_at(eye, (0.5, 0.5, 0.05), up=(0, 1, 0))
+        return jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(TRUTH), jaxhf.Matte(0.5), place)], camera)
+
+    tilted = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 1], [0, 0, 0, 1]])
+    assert have_same_view([seen((0.5, 0.5, 3.0))])
+    assert have_same_view([seen((0.5, 0.5, 3.0)), seen((0.9, 0.5, 3.0)), seen((0.5, 0.5, 3.0), orthographic=True)])
+    assert not have_same_view([seen((0.5, 0.5, 3.0)), seen((2.0, 0.5, 3.0))])
+    assert not have_same_view([seen((0.5, 0.5, 3.0)), seen((2.0, 0.5, 3.0), orthographic=True)])
+    assert not have_same_view([seen((0.5, 0.5, 3.0)), seen((0.5, 0.5, 3.0), tilted)])
 
 
 def test_an_orthophoto_does_not_show_the_mean_height():

@@ -275,6 +275,7 @@ REFUSED: dict[str, list[dict[str, Any]]] = {  # the argument that is to be named
     "albedo": [unknown(albedo="known")],
     "albedo_std": [unknown(albedo_std=2), unknown(albedo="map", albedo_std=0)],
     "albedo_length": [unknown(albedo_length=0.1), unknown(albedo="map", albedo_length=0)],
+    "albedo_shared": [unknown(albedo_shared=True), unknown(albedo="map", albedo_shared="yes")],
     "sky_std": [unknown(sky_std=0), unknown(sky_std=1)],
     "light_std": [unknown(light_std=0), unknown(light_std=60), {"scenes": lambda: lamps(), **unknown(light_std=1)}],
     "material_std": [

@@ -57,6 +57,7 @@ prior = {{ heights = "prior.npy", std = 0.5, length = 4 }}
 albedo = "map"
 albedo_std = 0.5
 albedo_length = 3
+albedo_shared = true
 sky_std = 0.7
 exposures = true
 offsets = false
@@ -93,7 +94,7 @@ def test_every_key_arrives(folder):
     assert found.settings == jaxhf.Settings(shadows=False, samples=9)
     np.testing.assert_array_equal(found.prior.pop("heights"), np.arange(9).reshape(3, 3))
     assert (found.options, found.prior) == ({"start": 3, "draws": 9, "max_steps": 7}, {"std": 0.5, "length": 4})
-    assert tuple(found.unknown.values()) == ("map", 0.5, 3, 0.7, 1, True, False, [2, 0.5], {"limb": 0.2})
+    assert tuple(found.unknown.values()) == ("map", 0.5, 3, 0.7, 1, True, True, False, [2, 0.5], {"limb": 0.2})
     assert found.unknown.keys() == {field.name for field in dataclasses.fields(jaxhf.Unknown)}
     first, second = found.scenes
     assert first.heights is second.heights

@@ -85,8 +85,8 @@ class AlbedoRows(NamedTuple):
     """The part of the factors of an albedo.
 
     Attributes:
-      slopes: derivatives of each sample in the factors' relative changes at four texels, channel by channel of these,
-        (chunks, k, 4, samples).
+      slopes: derivatives of each sample in the factors' relative changes at four texels, channel by channel of these or,
+        where the picture's share them, of the picture, (chunks, k, 4, samples).
       texels: their numbers, row by row, (chunks, 4, samples).
     """
 

@@ -292,7 +292,7 @@ def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknow
             rule = f"is sought, so the heightfield's material must have an albedo; {type(material).__name__} has none"
             raise ArgumentError("Unknown", "albedo", rule)
         image = known.texels.shape[:2] if isinstance(known, ImageTexture) else shape
-        shape = (*(image if unknown.albedo == "map" else (1, 1)), channels)
+        shape = (*(image if unknown.albedo == "map" else (1, 1)), 1 if unknown.albedo_shared else channels)
         albedo = (jnp.ones if unknown.albedo_length is None else jnp.zeros)(shape, dtype)
     return Unknowns(
         jnp.zeros_like(basis.base),

@@ -91,7 +91,7 @@ def _of_samples(
     found = _by_vertices(at_vertices, *joined).reshape(n, chunks, channels, size)
     if rows.albedo is not None and relative is not None:
         factors = relative.reshape(-1, relative.shape[-1]).at[rows.albedo.texels].get(mode="promise_in_bounds")
-        change = jnp.einsum("nqkts,nqtsk->nqks", rows.albedo.slopes, factors)
+        change = jnp.einsum("nqkts,nqtsk->nqks", rows.albedo.slopes, factors)  # broadcasts factors that channels share
         found = found + (change if channels == change.shape[2] else jnp.sum(change, axis=2, keepdims=True))
     return jax.vmap(_with_view)(jnp.moveaxis(found, 2, -1), rows.view, view)
 

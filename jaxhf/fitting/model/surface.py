@@ -27,8 +27,8 @@ class Unknowns(eqx.Module):
     Attributes:
       coefficients: of the DCT modes that are added to `Basis.base`, in units of `Basis.scale`, shape (my, mx): that of the
         heights, or more, see `Basis.padding`.
-      albedo: a factor for each texel of the albedo (or for all of them: (1, 1)) in each channel, shape (ty, tx, c); or the
-        modes of their logarithms, see `AlbedoField`.
+      albedo: a factor for each texel of the albedo (or for all of them: (1, 1)) in each channel (or for all of them: c = 1),
+        shape (ty, tx, c); or the modes of their logarithms, see `AlbedoField`.
       exposures: a factor for each picture, shape (pictures,).
       offsets: added to each picture, in units of `Problem.bright`, shape (pictures,).
       view: how far the light and the camera of each picture are moved, in units of `Problem.view_unit`, shapes (pictures, 2)

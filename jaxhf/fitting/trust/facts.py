@@ -2,12 +2,15 @@
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ...core.affine import Affine, affine
+from ...scene.light import Point, Sky
+from ...scene.scene import Scene
 from ...trace.normals import vertex_normals
 from ...xla.compilation import compiled
 from ..given import Given
@@ -34,6 +37,7 @@ _LEAST_CHI2 = 0.5  # below which what is left is mostly the error of few samples
 _MOST_UNKNOWNS = 0.25  # of the values, where it is not known how much of the noise is explained: it is told 13 % too small then
 _MOST_EXPLAINED = 0.75  # of a picture's noise: one sun without a prior has 0.8, and 0.65 to 1 of its noise is found
 _LEAST_SLOPE = 0.1  # of a robust loss, on average
+_SAME_LIGHT, _SAME_VIEW = 3.0, 20.0  # degrees: from 5 and 20 on deviations held, docs/measurements/photometry.md
 _WIDER = 1.2  # the spread of residuals over the noise, above which that may be larger
 
 
@@ -239,13 +243,51 @@ def shows_mean(gradients: Float[np.ndarray, "k ny nx"]) -> bool:
     return float(np.linalg.norm(sums)) > _RELATIVE * float(np.linalg.norm(gradients))
 
 
-def light_directions(problem: Problem) -> int:
-    """How many different sets of lights the pictures have."""
-    found = set()
-    for group in problem.groups:
-        for k in range(len(group.indices)):
-            found.add(b"".join(np.asarray(leaf)[k].tobytes() for leaf in jax.tree.leaves(group.scenes.lights)))
-    return len(found)
+def have_same_light(scenes: Sequence[Scene]) -> bool:
+    """Whether light comes from about one direction in all pictures: that of their light vectors."""
+    return _are_within(_SAME_LIGHT, [_light_vector(scene) for scene in scenes])
+
+
+def have_same_view(scenes: Sequence[Scene]) -> bool:
+    """Whether all pictures show the terrain from about one direction."""
+    vectors = []
+    for scene in scenes:
+        world, middle = _terrain(scene)
+        eye, at_place = scene.camera.viewpoint()
+        vectors.append(np.linalg.solve(world.linear, np.asarray(eye, np.float64) - (middle if at_place else 0)))
+    return _are_within(_SAME_VIEW, vectors)
+
+
+def _are_within(degrees: float, vectors: Sequence[Float[np.ndarray, "3"]]) -> bool:
+    directions = np.array([vector / max(float(np.linalg.norm(vector)), 1e-30) for vector in vectors])
+    return bool(np.min(directions @ directions.T) >= np.cos(np.radians(degrees)))
+
+
+def _terrain(scene: Scene) -> tuple[Affine, Float[np.ndarray, "3"]]:
+    """Where the first heightfield lies, and its middle in the world."""
+    place, field = scene.objects[scene.first_heightfield].world_from_object, scene.heightfields[0]
+    matrix: Any = np.eye(4) if place is None else np.asarray(place, np.float64)
+    world = affine(matrix)
+    y, x = (step * (n - 1) / 2 for n, step in zip(field.heights.shape, (field.dy, field.dx), strict=True))
+    middle: Any = np.array([field.x0 + x, field.y0 + y, np.mean(np.asarray(field.heights, np.float64))])
+    return world, np.asarray(world.point(middle))
+
+
+def _light_vector(scene: Scene) -> Float[np.ndarray, "3"]:
+    """The sum of what each light sends to the middle of the first heightfield, as a vector towards it, in that one's frame
+    (Gershun, The light field, 1939); a surface by Lambert's law is as bright as under one light from there, but for shadows
+    and, under a sky, for what it adds everywhere."""
+    (world, middle), total = _terrain(scene), np.zeros(3)
+    for light in scene.lights:
+        if isinstance(light, Sky):
+            towards, power = np.array([0.0, 0.0, 1.0]), np.pi / 2 * np.asarray(light.radiance, np.float64)
+        elif isinstance(light, Point):
+            towards = np.asarray(light.p, np.float64) - middle
+            power = np.asarray(light.intensity, np.float64) / (towards @ towards)
+        else:
+            towards, power = np.asarray(light.towards, np.float64), np.asarray(light.irradiance, np.float64)
+        total += np.mean(power) * towards / np.linalg.norm(towards)
+    return np.linalg.solve(world.linear, total)
 
 
 def why_noise_is_unsure(problem: Problem, unknowns: int, freedom: Freedom | None) -> str | None:

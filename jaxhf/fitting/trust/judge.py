@@ -23,7 +23,8 @@ from .facts import (
     boundary_places,
     chi_squared,
     dependent_channels,
-    light_directions,
+    have_same_light,
+    have_same_view,
     misfit_of_length,
     shows_mean,
     strayed,
@@ -48,7 +49,8 @@ class Fit:
       samples: terrains that pictures and prior allow, one for each draw, shape (draws, ny, nx): what is derived from each, a
         slope or a volume, varies as it is unsure. None as `std`.
       seen: whether a change of the height would change any picture, shape (ny, nx).
-      albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c); None where it was known.
+      albedo: what the albedo of the scenes is to be multiplied by, shape (ty, tx, c), c = 1 where all channels share it;
+        None where it was known.
       exposures, offsets: of each picture; None where they were known.
       noise: standard deviation of each picture's values at weight 1, shape (pictures,): as given, or as estimated. Of a
         `Noise` it is the root mean square over the values that count.
@@ -108,10 +110,12 @@ def judged(
     std, samples, scaled, displaced, parts = None, None, None, None, None
     if given.draws and ended.stop is not Stop.NON_FINITE:
         borne_out, scaled = with_unexplained(expansion, counted, share)
-        found = standard_deviations(borne_out, given.draws, report)
-        std, samples, displaced, parts = found.std, heights + found.samples, (found.displacement, found.raised), found.parts
+        drawn = standard_deviations(borne_out, given.draws, report)
+        std, samples, displaced, parts = drawn.std, heights + drawn.samples, (drawn.displacement, drawn.raised), drawn.parts
         if not problem.known:
             std = np.where(seen, std, np.inf)
+    sought = expansion.unknowns
+    found = found_scenes(scenes, sought, problem)
     findings = Findings(
         result=ended.stop,
         chi2=chi2,
@@ -125,7 +129,8 @@ def judged(
         seen=seen,
         mean_shown=shows_mean(gradients),
         noise_share=float(np.min(problem.noise / problem.brightness)),
-        lights=light_directions(problem),
+        same_light=have_same_light(found),
+        same_view=have_same_view(found),
         unsure_noise=None if given.noise is not None else why_noise_is_unsure(problem, expansion.unknowns.count, free),
         length=misfit_of_length(problem, given),
         scaled=scaled,
@@ -133,7 +138,7 @@ def judged(
         draws=(0, 0) if samples is None else (given.draws, len(samples)),
         parts=parts,
     )
-    found, state = expansion.unknowns, ended.state
+    state = ended.state
     off = [np.where(picture.residual == 0, 0, picture.image - picture.target) for picture in left]
     images, residuals = (tuple(map(_in_shape, each, map(np.shape, targets))) for each in ([p.image for p in left], off))
     return Fit(
@@ -142,11 +147,11 @@ def judged(
         std=std,
         samples=samples,
         seen=seen,
-        albedo=problem.factors(found),
-        exposures=found.exposures,
-        offsets=None if found.offsets is None else found.offsets * problem.bright,
+        albedo=problem.factors(sought),
+        exposures=sought.exposures,
+        offsets=None if sought.offsets is None else sought.offsets * problem.bright,
         noise=problem.noise,
-        scenes=found_scenes(scenes, found, problem),
+        scenes=found,
         settings=problem.settings,
         images=images,
         residuals=residuals,

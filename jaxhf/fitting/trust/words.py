@@ -104,7 +104,7 @@ class Findings(NamedTuple):
       help: what to try where the pictures are not explained.
       seen: which heights the pictures show.
       noise_share: the least noise of a picture over its brightness.
-      lights: how many directions light comes from, over all pictures.
+      same_light, same_view: whether light comes from one direction in all pictures; whether they are from one direction.
       scaled: by what the noise was multiplied for the standard deviations.
       displaced: by how much boundaries may be, height units, and what that multiplies the deviations by.
       draws: asked for, made.
@@ -124,7 +124,8 @@ class Findings(NamedTuple):
     seen: Bool[np.ndarray, "ny nx"]
     mean_shown: bool
     noise_share: float
-    lights: int
+    same_light: bool
+    same_view: bool
     scaled: float | None
     displaced: tuple[float, float] | None
     draws: tuple[int, int]
@@ -179,10 +180,16 @@ def warnings(found: Findings) -> tuple[str, ...]:
         if found.strayed is None:
             kept = "a smooth continuation of their neighbours" if found.seen.any() else "the start"
         said.append(f"no picture shows {hidden} of {found.seen.size} heights ({hidden / found.seen.size:.0%}): they are {kept}")
-    if found.strayed is None and found.lights == 1:
+    if found.same_light and found.strayed is None:
         said.append(
             "all pictures have the same light and there is no prior: of slopes across the light only silhouettes and shadows "
             "tell; give a prior, or pictures with other lights"
+        )
+    elif found.same_light and found.same_view and found.draws[1]:
+        said.append(
+            "all pictures have the same light: slopes across it hardly show, and standard deviations are often too small (one "
+            "held for a fifth to four fifths of the heights of right scenes, not for 68%: docs/measurements/photometry.md); "
+            "add pictures under another sun"
         )
     if found.strayed is None and not found.mean_shown and found.seen.any():
         said.append(

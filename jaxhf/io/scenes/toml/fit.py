@@ -60,7 +60,7 @@ _PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number), needed=
 _UNKNOWN: Keys = {
     **optional("albedo", kind=word),
     **optional("albedo_std", "albedo_length", "sky_std", "light_std", kind=number),
-    **optional("exposures", "offsets", kind=flag),
+    **optional("albedo_shared", "exposures", "offsets", kind=flag),
     **optional("camera_std", kind=numbers(2)),
     **optional("material_std", kind=table),
 }
