@@ -11,16 +11,35 @@ import time
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
+import jaxlib.version
 import jaxtyping
 import pytest
+from jax._src import compiler  # JAX has no other way to give options to every program
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # To look for garbage, and to note where each equation came from, is a fifth of the time that tracing takes.
 gc.disable()
 jax.config.update("jax_traceback_in_locations_limit", 0)
+
+# Without most optimisations XLA is spared more: emitters of loops that go through MLIR, which jaxlib 0.11 has no others than;
+# to split a program into up to 32 modules of LLVM; and to deal out kernels of microseconds to threads.
+SPARED: dict[str, Any] = {"xla_cpu_parallel_codegen_split_count": 1, "xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
+if jaxlib.version.__version_info__ < (0, 11):
+    SPARED["xla_cpu_use_fusion_emitters"] = False
+_options_of_jax = compiler.get_compile_options
+
+
+def _compile_options(*args: Any, env_options_overrides: Any = None, **others: Any) -> Any:
+    """JAX's, for each program."""
+    spared = SPARED if jax.config.read("jax_disable_most_optimizations") else {}
+    return _options_of_jax(*args, env_options_overrides={**(env_options_overrides or {}), **spared}, **others)
+
+
+compiler.get_compile_options = _compile_options
 
 SEEDS = Path(__file__).parents[2] / "shared" / "pbrt"
 
