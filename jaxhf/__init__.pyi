@@ -16,6 +16,7 @@ from .io.terrain.save import save_heights as save_heights
 from .io.terrain.terrain import Terrain as Terrain
 from .maps.hillshade import hillshade as hillshade
 from .maps.relief import color_relief as color_relief, relief as relief
+from .maps.ruggedness import ruggedness as ruggedness
 from .maps.skyview import horizon as horizon, sky_view as sky_view
 from .maps.slope import aspect as aspect, slope as slope
 from .maps.viewshed import LineOfSight as LineOfSight, line_of_sight as line_of_sight, viewshed as viewshed

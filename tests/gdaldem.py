@@ -35,6 +35,6 @@ def gdaldem(
     for old in (*folder.glob("out.*"), *folder.glob("*.aux.xml")):  # GDAL keeps statistics in the latter
         old.unlink(missing_ok=True)
     subprocess.run(command, check=True, cwd=folder, capture_output=True, timeout=60)
-    dtype = np.float32 if mode in ("slope", "aspect") else np.uint8
+    dtype = np.uint8 if mode in ("hillshade", "color-relief") else np.float32
     found = np.fromfile(folder / "out.bin", dtype).reshape(-1, *heights.shape)[:, ::-1]
     return found[0] if len(found) == 1 else np.moveaxis(found, 0, -1)

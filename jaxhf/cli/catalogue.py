@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ..core.settings import Settings
-from ..maps.choices import ALGORITHMS, ENTRIES, VARIANTS, WEIGHTINGS
+from ..maps.choices import ALGORITHMS, ENTRIES, RUGGEDNESS, VARIANTS, WEIGHTINGS
 from .arguments import (
     FINITE,
     POSITIVE,
@@ -167,6 +167,20 @@ _MAPS = (
         options={**_files(_NUMBERS, *_DIRECTION), **_SLOPES},
         module="maps",
         about="Degrees clockwise from north in 32-bit floats, -9999 where flat, as gdaldem aspect.",
+    ),
+    Command(
+        "ruggedness",
+        "map how uneven a terrain is",
+        examples=("terrain.tif -o tri.tif --measure tri", "terrain.tif -o tpi.tif --measure tpi --compute-edges"),
+        options={
+            **_files(
+                _NUMBERS,
+                choice("--measure", RUGGEDNESS, "gdaldem's roughness, TRI (Riley's or Wilson's) or TPI [roughness]"),
+                flag("--compute-edges", "also at the border and beside holes"),
+            )
+        },
+        module="maps",
+        about="32-bit floats in the unit of the heights, -9999 where there is no value, as gdaldem roughness, TRI and TPI.",
     ),
     Command(
         "relief",

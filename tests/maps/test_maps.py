@@ -95,6 +95,34 @@ def test_slopes_and_aspects_are_those_of_gdal(tmp_path, grid):
         np.testing.assert_array_max_ulp(found, expected, 1)
 
 
+@needed
+@pytest.mark.parametrize(
+    ("measure", "words"),
+    {"roughness": ("roughness",), "tri": ("TRI",), "tri-wilson": ("TRI", "-alg", "Wilson"), "tpi": ("TPI",)}.items(),
+)
+def test_ruggedness_is_that_of_gdal(tmp_path, grid, measure, words):
+    ours, _, theirs, nodata = grid
+    for on in (False, True):
+        mode, *options = *words, *edges(on)
+        theirs_as_floats = theirs[0].astype(np.float32), *theirs[1:]  # GDAL rounds means of integers to integers
+        expected = gdaldem(tmp_path, mode, *theirs_as_floats, *options, **nodata)
+        np.testing.assert_array_equal(jaxhf.ruggedness(ours[0], measure, compute_edges=on), expected)
+        assert len(np.unique(expected)) > 50
+
+
+def test_ruggedness_by_hand():
+    """Of a pyramid of height 8 with its top in the middle, and beside it."""
+    z = np.zeros((5, 5))
+    z[2, 2] = 8
+    found = {measure: jaxhf.ruggedness(z, measure)[2, 1:3].tolist() for measure in ("roughness", "tri", "tri-wilson", "tpi")}
+    assert found == {
+        "roughness": [8, 8], "tri": [8, pytest.approx(8 * math.sqrt(8))], "tri-wilson": [1, 8], "tpi": [-1, 8]
+    }  # fmt: skip
+    assert set(jaxhf.ruggedness(z)[0]) == {HOLE}
+    with pytest.raises(ValueError, match=r"^ruggedness: measure must be one of roughness, tri, tri-wilson, tpi; it is 'TRI'$"):
+        jaxhf.ruggedness(z, "TRI")
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize(("east", "north"), [(0.5, 0.0), (0.0, -0.7), (-0.3, 0.4), (0.0, 0.0), (-2.0, 1.5)])
 def test_planes_by_hand(algorithm, east, north):

@@ -1,4 +1,4 @@
-"""`jaxhf hillshade`, `slope`, `aspect` and `relief`: maps that NumPy makes of a terrain file."""
+"""`jaxhf hillshade`, `slope`, `aspect`, `ruggedness` and `relief`: maps that NumPy makes of a terrain file."""
 
 import argparse
 import inspect
@@ -13,6 +13,7 @@ from ...io.terrain.rasters import require_writable_raster, save_raster
 from ...io.terrain.terrain import Terrain
 from ...maps.hillshade import hillshade
 from ...maps.relief import color_relief, relief
+from ...maps.ruggedness import ruggedness
 from ...maps.slope import NODATA, aspect, slope
 from .. import arguments
 
@@ -37,8 +38,10 @@ def run(options: argparse.Namespace) -> None:
 def _chosen(options: argparse.Namespace) -> tuple[Callable[..., Any], float | None]:
     """The function that makes the map, of those options that it has parameters for, and the value there that means none."""
     name = options.command.name
-    if name in ("slope", "aspect"):
+    if name in ("slope", "aspect", "ruggedness"):
         require_numbers(options.output, name)
+        if name == "ruggedness":
+            return ruggedness, NODATA
         return (slope, NODATA) if name == "slope" else (aspect, None if options.zero_for_flat else NODATA)
     if name == "relief" and not options.shading:
         arguments.refuse(options, *_LIGHT, because="--no-shading leaves the light out")
