@@ -133,7 +133,7 @@ _VIEWSHED = Command(
             ),
             flag("--line", "observers all along the line through these points, at most a cell apart"),
             number("--height", "H", "of the eyes above the ground [1.8]"),
-            number("--target", "H", "height above the ground of what is to be seen [0]"),
+            number("--target-height", "H", "of what is to be seen, above the ground [0]"),
             flag("--above-ground", "the least height above the ground that is seen, in 32-bit floats; .tif or .npy"),
             number("--radius", "R", _RADIUS),
         ),

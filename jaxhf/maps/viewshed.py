@@ -14,7 +14,8 @@ from jaxtyping import Float
 from ..core.errors import ArgumentError, require_progress
 from ..core.rules import OneOf, require
 from ..core.settings import Settings
-from ..core.types import POSITIVE, Index, Scalar, Vector
+from ..core.types import POSITIVE, Index, Number, Scalar, Vector
+from ..core.vector import greater
 from ..io.terrain.terrain import Terrain
 from ..preparation.horizon import assemble
 from ..scene.heightfield import Heightfield
@@ -26,7 +27,7 @@ from ..xla.compilation import compiled
 from ..xla.devices import chosen_mesh, map_over, on_every_device, takes_numbers
 from ..xla.kernel import one_kernel
 from .choices import WANTED
-from .surface import surface, with_spacing
+from .surface import Surface, require_positive, surface, with_spacing
 
 _ROUNDING = 1e-9  # cells
 _TILE = 32  # vertices along a side of what `assemble` takes
@@ -38,7 +39,7 @@ def viewshed(
     terrain: Any,
     observers: Any,
     height: float = 1.8,
-    target: float = 0.0,
+    target_height: float = 0.0,
     *,
     wanted: Literal["visible", "above-ground"] = "visible",
     radius: float | None = None,
@@ -59,7 +60,7 @@ def viewshed(
       observers: x and y of one, shape (2,), or of several, (n, 2), on the terrain, in its coordinates; for an array from
         vertex (0, 0) on, in the unit of `dx`. Those along a line are points a cell apart.
       height: of the eyes above the ground, in the unit of the heights.
-      target: height above the ground of what is to be seen.
+      target_height: of what is to be seen, above the ground.
       wanted: "visible", or "above-ground": the least height above the ground that is seen, 0 where the ground itself is.
       radius: of the sphere that the terrain lies on, in the unit of the heights: what is at a distance d stands lower by
         d² / (2 radius). None: the terrain lies on a plane. For light over the Earth, which air bends, 7.44e6 m (GDAL's 6/7).
@@ -68,95 +69,105 @@ def viewshed(
       mesh: the devices that share the work, see `render`.
 
     Returns:
-      Shape (ny, nx): bool, False where there is no height; or the terrain's dtype, nan there.
+      Shape (ny, nx): bool, False where there is no height; or float32 (float64 of such heights in JAX's x64 mode), nan there.
 
     Raises:
-      ValueError: an argument has a value that it cannot have, or an observer stands beside the terrain or over a hole.
+      ValueError: an argument has a value that it cannot have, or an observer stands beside the terrain or in a hole.
     """
+    terrain = _with_place(terrain)
+    ground = surface("viewshed", terrain, dx, dy)
+    cells = cells_of("viewshed", "observers", observers, ground.heights.shape, *_frame(terrain, dx, dy))
+    return seen_from(ground, cells, "observers", height, target_height, wanted, radius, progress, mesh)
+
+
+def seen_from(
+    ground: Surface,
+    cells: Float[np.ndarray, "n 2"],
+    name: str,
+    height: float = 1.8,
+    target_height: float = 0.0,
+    wanted: str = "visible",
+    radius: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    mesh: Mesh | None = None,
+) -> np.ndarray:
+    """`viewshed` from places in columns and rows; errors call them by `name`."""
     require("viewshed", "wanted", wanted, OneOf(WANTED))
     require("viewshed", "height", height, POSITIVE)
-    require("viewshed", "target", target, _at_least_0)
-    if wanted == "above-ground" and target:
-        raise ArgumentError("viewshed", "target", f"must be 0 where wanted is above-ground, it is {target}")
+    require("viewshed", "target_height", target_height, _AT_LEAST_0)
+    if wanted == "above-ground" and target_height:
+        raise ArgumentError("viewshed", "target_height", f"must be 0 where wanted is above-ground, it is {target_height}")
     if radius is not None:
-        require("viewshed", "radius", radius, POSITIVE)
+        require_positive("viewshed", "radius", radius)
     require_progress("viewshed", progress, False)
-    terrain = _with_place(terrain)
-    places = _cells("viewshed", "observers", terrain, observers, dx, dy)
-    ground = surface("viewshed", terrain, dx, dy)
     field = Heightfield(ground.heights, ground.dx, ground.dy)
-    eyes = [
-        (*place, _height_at(ground.heights, place, "viewshed", f"observers[{k}]") + height) for k, place in enumerate(places)
-    ]
-    mesh = chosen_mesh("viewshed", mesh)
-    dtype = field.heights.dtype
+    heights_there = [require_height(ground.heights, cell, "viewshed", f"{name}[{k}]") for k, cell in enumerate(cells)]
+    eyes = np.column_stack([cells, np.add(heights_there, height)])
+    mesh, dtype = chosen_mesh("viewshed", mesh), field.heights.dtype
     heights = on_every_device(jnp.asarray(field.heights), mesh)
-    numbers = np.asarray([target, 0.0 if radius is None else 0.5 / radius], dtype)
+    falls = None if radius is None else np.array([ground.dx, ground.dy], dtype) / np.sqrt(np.array(2 * radius, dtype))
     hidden: Any = None
-    for done, eye in enumerate(np.asarray(eyes, dtype), 1):
-        by = np.asarray(_hidden(heights, eye, numbers, field.dx, field.dy, wanted == "visible", mesh))
+    for done, eye in enumerate(eyes.astype(dtype), 1):
+        by = np.asarray(_hidden(heights, eye, np.array(target_height, dtype), falls, wanted == "visible", mesh))
         hidden = by if hidden is None else np.minimum(hidden, by)  # nan where there is no height
         if progress is not None:
             progress(done, len(eyes))
     return hidden <= 0 if wanted == "visible" else hidden
 
 
-@functools.partial(compiled, static_argnames=("dx", "dy", "visible", "mesh"))
+@functools.partial(compiled, static_argnames=("visible", "mesh"))
 def _hidden(
     heights: Float[jax.Array, "ny nx"],
     eye: Vector,
-    numbers: Float[jax.Array, "2"],
-    dx: float,
-    dy: float,
+    target: Scalar,
+    falls: Float[jax.Array, "2"] | None,
     visible: bool,
     mesh: Mesh,
 ) -> Float[jax.Array, "ny nx"]:
     """By how much each vertex must be raised to be seen from one eye, besides the target's height; nan where there is none.
 
+    Along a line all horizontal distances are as many cells, so that the size of cells does not matter.
+
     Args:
-      heights, dx, dy: of the terrain.
+      heights: of the terrain.
       eye: its column and row, and its height.
-      numbers: the target's height above the ground, and by how much what is at a distance of 1 stands lower.
+      target: the target's height above the ground.
+      falls: a vertex so many cells away stands lower by the sum of the squares of these times the cells; None: it does not.
       visible: whether no more is to be said than whether that is 0.
       mesh: the devices that share the work.
     """
     (ny, nx), dtype = heights.shape, heights.dtype
-    x, y = (jnp.arange(n, dtype=dtype) for n in (nx, ny))
-    square = ((y - eye[1]) * dy)[:, None] ** 2 + ((x - eye[0]) * dx)[None, :] ** 2
-    target, bend = numbers[0], numbers[1]
-    grid = make_grid(Heightfield(heights - bend * square, dx, dy), None, Settings(shading="flat"))
+    if falls is not None:
+        x, y = (jnp.arange(n, dtype=dtype) - eye[k] for k, n in enumerate((nx, ny)))
+        heights = heights - (jnp.square(y * falls[1])[:, None] + jnp.square(x * falls[0])[None, :])
+    grid = make_grid(Heightfield(heights, 1.0, 1.0), None, Settings(shading="flat"))
     columns = math.ceil(nx / _TILE)
-    of_vertex = functools.partial(_hidden_at, visible)
 
-    def tile(shared: Any, number: jax.Array) -> jax.Array:
+    def tile(shared: tuple[Grid, Vector, Scalar], number: Index) -> jax.Array:
         grid, eye, target = shared
         at = jnp.arange(_TILE, dtype=jnp.int32)
         ix, iy = jnp.minimum((number % columns) * _TILE + at, nx - 1), jnp.minimum((number // columns) * _TILE + at, ny - 1)
-        return jax.vmap(lambda iy: jax.vmap(lambda ix: of_vertex(grid, eye, target, ix, iy))(ix))(iy)
+        return jax.vmap(lambda iy: jax.vmap(lambda ix: _hidden_at(visible, grid, eye, target, ix, iy))(ix))(iy)
 
-    count = columns * math.ceil(ny / _TILE)
-    shared = grid, eye * jnp.array([dx, dy, 1], dtype), target
-    tiles = map_over(mesh, lambda shared, number: one_kernel(tile, shared, number), shared, np.arange(count, dtype=np.int32))
+    numbers = np.arange(columns * math.ceil(ny / _TILE), dtype=np.int32)
+    tiles = map_over(mesh, lambda shared, number: one_kernel(tile, shared, number), (grid, eye, target), numbers)
     return assemble(tiles, heights.shape)
 
 
 def _hidden_at(visible: bool, grid: Grid, eye: Vector, target: Scalar, ix: Index, iy: Index) -> Scalar:
     dtype, z = eye.dtype, value_at(grid.rows, iy * grid.shape[1] + ix)
     there = jnp.isfinite(z)
-    at = grid.world_from_grid.point(jnp.stack([ix.astype(dtype), iy.astype(dtype), jnp.where(there, z, 0)]))
-    to = at - eye
+    to = grid.world_from_grid.point(jnp.stack([ix.astype(dtype), iy.astype(dtype), jnp.where(there, z, 0)])) - eye
     distance = jnp.hypot(to[0], to[1])
     apart = there & (distance > 0)
     distance = jnp.where(apart, distance, 1)
     level = jnp.where(apart, jnp.stack([to[0], to[1], jnp.zeros_like(distance)]) / distance, jnp.array([1, 0, 0], dtype))
-    cells = grid.grid_from_world.vector(level)
-    t_max = distance - _BEFORE / jnp.hypot(cells[0], cells[1])
-    slope = (to[2] + target) / distance
-    up = jnp.array([0, 0, 1], dtype)
-    # The first edge above the line of sight ends the walk, if no more is to be known.
-    highest = jnp.nextafter(slope, jnp.inf) if visible else jnp.full_like(slope, jnp.inf)
+    slope, up = (to[2] + target) / distance, jnp.array([0, 0, 1], dtype)
+    # The first edge above the line of sight ends the walk, if no more is to be known. What follows 0 would be flushed to it.
+    just_above = greater(jnp.nextafter(slope, jnp.inf), slope + jnp.finfo(dtype).tiny)
+    highest = just_above if visible else jnp.full_like(slope, jnp.inf)
     standing = hit_of_closed_form(-1, eye, up, jnp.zeros(2, dtype), -up)
-    steepest, _ = skyline_slope(grid, 0, level, standing, apart, (slope, highest), t_max=t_max)
+    steepest, _ = skyline_slope(grid, 0, level, standing, apart, (slope, highest), t_max=distance - _BEFORE)
     return jnp.where(there, jnp.where(apart, (steepest - slope) * distance, 0), jnp.nan)
 
 
@@ -200,33 +211,41 @@ def line_of_sight(
     """
     owner = "line_of_sight"
     require(owner, "height", height, POSITIVE)
-    require(owner, "target_height", target_height, _at_least_0)
+    require(owner, "target_height", target_height, _AT_LEAST_0)
     if radius is not None:
-        require(owner, "radius", radius, POSITIVE)
+        require_positive(owner, "radius", radius)
     terrain = _with_place(terrain)
-    places = [_one(owner, name, terrain, at, dx, dy) for name, at in (("observer", observer), ("target", target))]
-    ground = surface(owner, terrain, dx, dy)
-    z = ground.heights.astype(np.float64)
-    ends = [_height_at(z, place, owner, name) for place, name in zip(places, ("observer", "target"), strict=True)]
+    ground, frame = surface(owner, terrain, dx, dy), _frame(terrain, dx, dy)
+    z, places, ends = ground.heights.astype(np.float64), [], []
+    for name, point in (("observer", observer), ("target", target)):
+        cells = cells_of(owner, name, point, z.shape, *frame)
+        if len(cells) != 1:
+            raise ArgumentError(owner, name, f"must be x and y of one point, there are {len(cells)}")
+        places.append(tuple(cells[0].tolist()))
+        ends.append(require_height(z, cells[0], owner, name))
     (x0, y0), (x1, y1) = places
-    crossed: list[Any] = [[0.0, 1.0]]
+    crossed: list[Any] = []
     for begin, end in ((x0, x1), (y0, y1), (x0 - y0, x1 - y1)):  # lines along y and x, and diagonals
         low, high = sorted((begin, end))
         lines = np.arange(math.ceil(low), math.floor(high) + 1)
         crossed.append((lines - begin) / (end - begin) if high > low else [])
-    share = np.unique(np.clip(np.concatenate(crossed), 0, 1))
-    profile = np.array([_interpolated(z, x0 + (x1 - x0) * s, y0 + (y1 - y0) * s) for s in share])
-    profile[[0, -1]] = ends
+    share = np.unique(np.concatenate(crossed))
+    near = _ROUNDING / max(abs(x1 - x0), abs(y1 - y0), _ROUNDING)  # what touches an end is that
+    share = np.concatenate([[0.0], share[(share > near) & (share < 1 - near)], [1.0]])
+    between = [height_at(z, x0 + (x1 - x0) * s, y0 + (y1 - y0) * s) for s in share[1:-1]]
+    profile = np.array([ends[0], *between, ends[1]])
     length = math.hypot((x1 - x0) * ground.dx, (y1 - y0) * ground.dy)
     distance = share * length
     profile = profile - (0 if radius is None else distance**2 / (2 * radius))
     eye = profile[0] + height
     line = eye + share * (profile[-1] + target_height - eye)
-    between = slice(1, -1)
     with np.errstate(invalid="ignore"):
-        visible = not (profile[between] > line[between]).any()
-        needed = (profile[between] - eye) / share[between] + eye - profile[-1]
+        visible = not (profile > line)[1:-1].any()
+        needed = ((profile - eye)[1:-1] / share[1:-1]) + eye - profile[-1]
     return LineOfSight(distance, profile, line, visible, float(max(0, np.nanmax(needed, initial=0))))
+
+
+_AT_LEAST_0 = Number("be at least 0 and finite", lambda value: (value >= 0) & (value < np.inf))
 
 
 def _with_place(terrain: Any) -> Any:
@@ -235,42 +254,56 @@ def _with_place(terrain: Any) -> Any:
     return terrain
 
 
-def _at_least_0(value: Any) -> str | None:
-    return None if 0 <= value < math.inf else f"must be at least 0 and finite, it is {value}"
-
-
-def _cells(owner: str, name: str, terrain: Any, points: Any, dx: float | None, dy: float | None) -> Float[np.ndarray, "n 2"]:
-    """Where points of the terrain's coordinates stand, in columns and rows."""
-    given = np.asarray(points, np.float64)
-    if given.ndim not in (1, 2) or given.shape[-1:] != (2,) or not given.size or not np.isfinite(given).all():
-        raise ArgumentError(owner, name, f"must be x and y, shape (2,) or (n, 2), finite, shape is {given.shape}: {points!r}")
+def _frame(terrain: Any, dx: float | None, dy: float | None) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Where vertex (0, 0) stands in a terrain's own coordinates, and how far apart vertices are."""
     if isinstance(terrain, Terrain):
-        begin, step = (terrain.x0, terrain.y0), (terrain.dx, terrain.dy)
-    else:
-        _, *step = with_spacing(owner, terrain, dx, dy)
-        begin = (0.0, 0.0)
-    return ((given - begin) / step).reshape(-1, 2)
+        return (terrain.x0, terrain.y0), (terrain.dx, terrain.dy)
+    _, *step = with_spacing("", terrain, dx, dy)
+    return (0.0, 0.0), (step[0], step[1])
 
 
-def _one(owner: str, name: str, terrain: Any, point: Any, dx: float | None, dy: float | None) -> tuple[float, float]:
-    if np.shape(point) != (2,):
-        raise ArgumentError(owner, name, f"must be x and y of one point, its shape is {np.shape(point)}")
-    ((x, y),) = _cells(owner, name, terrain, point, dx, dy).tolist()
-    return x, y
+def cells_of(
+    owner: str, name: str, points: Any, shape: tuple[int, ...], begin: tuple[float, float], step: tuple[float, float]
+) -> Float[np.ndarray, "n 2"]:
+    """Where points stand in columns and rows of a terrain of this shape; ArgumentError where that is beside it.
+
+    Args:
+      points: x and y, shape (2,) or (n, 2).
+      begin, step: x and y of vertex (0, 0), and the spacing, in the points' coordinates.
+    """
+    try:
+        given = np.asarray(points, np.float64)
+    except (TypeError, ValueError):
+        given = np.empty(0)
+    if given.ndim not in (1, 2) or given.shape[-1:] != (2,) or not given.size or not np.isfinite(given).all():
+        raise ArgumentError(owner, name, f"must be x and y, finite, of shape (2,) or (n, 2): {points!r}")
+    ny, nx = shape
+    cells, last = ((given - begin) / step).reshape(-1, 2), np.array([nx - 1, ny - 1])
+    rounding = _ROUNDING + 8 * np.finfo(float).eps * np.abs(np.array(begin) / step)  # of coordinates
+    for k, cell in enumerate(cells):
+        if not ((cell >= -rounding) & (cell <= last + rounding)).all():
+            spans = [f"{a:.10g} to {a + (n - 1) * d:.10g}" for a, d, n in zip(begin, step, (nx, ny), strict=True)]
+            x, y = given.reshape(-1, 2)[k]
+            raise ArgumentError(
+                owner, name, f"must be on the terrain, x from {spans[0]} and y from {spans[1]}; one is {x:.10g} {y:.10g}"
+            )
+    return np.clip(cells, 0, last)
 
 
-def _height_at(z: Float[np.ndarray, "ny nx"], place: Any, owner: str, name: str) -> float:
+def require_height(z: Float[np.ndarray, "ny nx"], cell: Float[np.ndarray, "2"], owner: str, name: str) -> float:
     """The surface's height at a place in columns and rows; ArgumentError where there is none."""
-    (ny, nx), (x, y) = z.shape, map(float, place)
-    if not (0 <= x <= nx - 1 and 0 <= y <= ny - 1):
-        raise ArgumentError(owner, name, f"must be on the terrain of {nx} x {ny} vertices, it is in column {x:g}, row {y:g}")
-    found = _interpolated(z, x, y)
+    found = height_at(z, *cell.tolist())
     if not math.isfinite(found):
-        raise ArgumentError(owner, name, f"must be where there is a height, there is none in column {x:g}, row {y:g}")
+        place = "column {:.6g} and row {:.6g}".format(*cell)
+        raise ArgumentError(
+            owner,
+            name,
+            f"must be on a triangle of the terrain; a height of its cell is missing, at {place} from the south-west",
+        )
     return found
 
 
-def _interpolated(z: Float[np.ndarray, "ny nx"], x: float, y: float) -> float:
+def height_at(z: Float[np.ndarray, "ny nx"], x: float, y: float) -> float:
     """The surface's height at a place in columns and rows; nan where no cell with all its vertices touches that."""
     sides = [_cells_at(at, n) for at, n in ((x, z.shape[1]), (y, z.shape[0]))]
     for ix, u in sides[0]:

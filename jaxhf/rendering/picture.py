@@ -21,10 +21,10 @@ from ..xla.compilation import compiled, is_part_of_more
 from ..xla.devices import everywhere, in_order, map_over, on_every_device, on_host
 from ..xla.kernel import in_turn, one_kernel
 from .samples import PictureSamples
-from .tiles import Tiling, light_along, trace_tiles
+from .tiles import Tiling, light_along, tile_side, trace_tiles
 
-_AT_ONCE = 128
-"""Tiles that a program for any size traces: with fewer devices wait more often, with more it clears memory for longer."""
+_PIXELS = 2**17
+"""That a program for any size traces at once: with fewer devices wait more often, with more it clears memory for longer."""
 
 _OF_ITS_SIZE = 64
 """Up to so many tiles a picture has a program for its size: by that for any size it would take 1.1 to 1.6 times as long."""
@@ -32,12 +32,20 @@ _OF_ITS_SIZE = 64
 
 def picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> dict[str, jax.Array]:
     """The picture ("image") and AOVs, each of shape (h, w, ...)."""
-    few = Tiling(camera.width, camera.height, world.settings).count <= _OF_ITS_SIZE
-    if few or is_part_of_more((world, camera)):
+    if _are_few(Tiling(camera.width, camera.height, world.settings)) or is_part_of_more((world, camera)):
         drawn = on_every_device(key, mesh) if world.settings.edge_samples else None  # else the settings draw nothing
         return trace_picture(world, camera, aovs, mesh, drawn)
-    parts = [part for _, part in _parts(world, camera, aovs, mesh, _AT_ONCE)]
+    parts = [part for _, part in _parts(world, camera, aovs, mesh, _at_once(world.settings, mesh))]
     return _assembled(parts, camera.width, camera.height, world.settings, mesh)
+
+
+def _are_few(tiling: Tiling) -> bool:
+    return tiling.count <= _OF_ITS_SIZE
+
+
+def _at_once(settings: Settings, mesh: Mesh) -> int:
+    """Tiles that a program for any size traces at once."""
+    return max(mesh.devices.size, _PIXELS // tile_side(settings) ** 2)
 
 
 @functools.partial(compiled, static_argnames=("aovs", "mesh"))
@@ -84,9 +92,14 @@ _trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
 def trace_in_parts(
     world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, progress: Callable[[int, int], None]
 ) -> dict[str, np.ndarray]:
-    """The same, with the picture on the host: device memory does not grow with it."""
+    """As `picture`, on the host: device memory does not grow with it."""
     tiling = Tiling(camera.width, camera.height, world.settings)
-    pixels, size, parts = tiling.width * tiling.height, min(_AT_ONCE, math.ceil(tiling.count / 64)), []
+    pixels, parts = tiling.width * tiling.height, []
+    if _are_few(tiling):
+        found = jax.device_get(trace_picture(world, camera, aovs, mesh, None))
+        progress(pixels, pixels)
+        return found
+    size = min(_at_once(world.settings, mesh), math.ceil(tiling.count / 64))
     for done, part in _parts(world, camera, aovs, mesh, size):
         parts.append({name: in_order(mesh.devices.size, values)[:size] for name, values in on_host(part).items()})
         progress(min(pixels, done * pixels // tiling.count), pixels)
@@ -97,10 +110,11 @@ def _parts(
     world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, size: int
 ) -> Iterator[tuple[int, dict[str, jax.Array]]]:
     """So many tiles after the other, as `map_first` leaves them, and how many are then done."""
+    most = _at_once(world.settings, mesh)
     corners, sizeless = Tiling(camera.width, camera.height, world.settings).corners(), of_any_size(camera)
     for first in range(0, len(corners), size):
         some = corners[first : first + size]
-        padded = np.concatenate([some, np.zeros((_AT_ONCE - len(some), 2), np.int32)])
+        padded = np.concatenate([some, np.zeros((most - len(some), 2), np.int32)])
         yield first + size, _trace_tiles(mesh, world, sizeless, aovs, padded, np.int32(len(some)))
 
 
@@ -111,8 +125,10 @@ def _assembled(
     """A picture of parts as `map_first` leaves them, on each device."""
     tiling = Tiling(width, height, settings)
 
+    most = _at_once(settings, mesh)
+
     def whole(*parts: jax.Array) -> jax.Array:
-        ordered = [in_order(mesh.devices.size, everywhere(part, mesh))[:_AT_ONCE] for part in parts]
+        ordered = [in_order(mesh.devices.size, everywhere(part, mesh))[:most] for part in parts]
         return tiling.assemble(jnp.concatenate(ordered)[: tiling.count])
 
     return jax.tree.map(whole, *parts)

@@ -179,10 +179,7 @@ def _outermost_edge(
         goes_on = slope < highest if above else slope > lowest
         return jnp.where(goes_on, state, MISS), slope, jnp.where(found >= 0, found, edge)
 
-    # Where the surface's border stands past a ray that comes from outside.
-    first = lowest if above else highest
-    edge = jnp.where(~own & (walk.t_start > touching), _border(tilted(first), state, above), -1)
-    init = state, raised(first, edge), edge
+    init = state, lowest if above else highest, jnp.full_like(leaving.object, -1)
     state, _, edge = until_ended(advance, init, enough_steps(grid), grid.early_exit)
     return edge, walking(state)
 
@@ -204,31 +201,38 @@ def _beside_cell(walk: Walk, state: jax.Array, beyond: Scalar, above: bool, t_ma
     side, ix, iy, size = walk.unpack(state)
     visits = walking(state) & (size == 1)
     cell = walk.cell(state, ix, iy, size)
-    far, near = walk.t_start + cell.out, walk.t_start + cell.diagonal
-    past_diagonal, past_exit = (-gap if above else gap for gap in (cell.gap_diagonal, cell.gap_out))
-    on_diagonal = jnp.where(cell.crosses & ~cell.on_own & (near > beyond), past_diagonal, 0)
-    on_exit = jnp.where(cell.skip_out | (far <= beyond), 0, past_exit)
-    if t_max is not None:
-        on_diagonal, on_exit = jnp.where(near > t_max, 0, on_diagonal), jnp.where(far > t_max, 0, on_exit)
-    # A diagonal that is not crossed may lie behind, with a `near` below 0.
-    kind = jnp.where((on_diagonal > 0) & (on_diagonal * far > on_exit * near), 2, cell.through_x.astype(jnp.int32))
-    rises = visits & cell.whole & (greater(on_diagonal, on_exit) > 0)
-    edge = materialise(jnp.where(rises, _edge(walk, ix, iy, kind, ahead=True), -1))
+    kind_entry, gap_entry = _entry(walk, ix, iy, cell.near)
+
+    def past(t: Scalar, gap: Scalar, counts: Flag) -> Scalar:
+        """How far an edge stands past the ray; 0 where it does not, or does not count."""
+        counts = counts & (t > beyond) if t_max is None else counts & (t > beyond) & (t <= t_max)
+        return jnp.where(counts, greater(-gap if above else gap, jnp.zeros_like(gap)), 0)
+
+    at_entry, at_diagonal, at_exit = (walk.t_start + t for t in (cell.near, cell.diagonal, cell.out))
+    entry = past(at_entry, gap_entry, jnp.ones_like(visits))
+    diagonal = past(at_diagonal, cell.gap_diagonal, cell.crosses & ~cell.on_own)
+    exit_ = past(at_exit, cell.gap_out, ~cell.skip_out)
+    # A diagonal that is not crossed may lie behind, with a t below 0.
+    by_diagonal = (diagonal > 0) & (diagonal * at_exit > exit_ * at_diagonal)
+    most, at_most = jnp.where(by_diagonal, diagonal, exit_), jnp.where(by_diagonal, at_diagonal, at_exit)
+    ahead = _edge(walk, ix, iy, jnp.where(by_diagonal, 2, cell.through_x.astype(jnp.int32)), ahead=True)
+    # That of the cell before, which may have no triangle.
+    by_entry = (entry > 0) & (entry * at_most > most * at_entry)
+    edge = jnp.where(by_entry, _edge(walk, ix, iy, kind_entry, ahead=False), ahead)
+    rises = visits & cell.whole & (greater(entry, most) > 0)
+    edge = materialise(jnp.where(rises, edge, -1))
     return jnp.where(visits, walk.onwards(side, ix, iy, size, cell.out_x, cell.out_y), state), edge
 
 
-def _border(walk: Walk, state: jax.Array, above: bool) -> Index:
-    """The edge by which a ray comes into the grid, see `_edge`; -1 where the ray is above it (below it, if not `above`)."""
-    _, ix, iy, _ = walk.unpack(state)
+def _entry(walk: Walk, ix: Index, iy: Index, near: Scalar) -> tuple[Index, Scalar]:
+    """The kind of the edge by which a ray comes into a cell, and how high it is above that edge."""
     z00, z10, z01, z11 = corners(walk.rows, walk.nx, ix ^ walk.flip[0], iy ^ walk.flip[1], walk.first)
-    u, v = walk.x - ix.astype(walk.x.dtype), walk.y - iy.astype(walk.y.dtype)
+    u, v = walk.x + near * walk.dx - ix.astype(near.dtype), walk.y + near * walk.dy - iy.astype(near.dtype)
     through_x = walk.distance_x(ix) >= walk.distance_y(iy)
     low = jnp.where(through_x, jnp.where(walk.back_x, z10, z00), jnp.where(walk.back_y, z01, z00))
     high = jnp.where(through_x, jnp.where(walk.back_x, z11, z01), jnp.where(walk.back_y, z11, z10))
     along = jnp.where(through_x, jnp.where(walk.back_y, 1 - v, v), jnp.where(walk.back_x, 1 - u, u))
-    gap = walk.gap(jnp.zeros_like(u), low, high, along)
-    rises = walking(state) & (gap < 0 if above else gap > 0)
-    return jnp.where(rises, _edge(walk, ix, iy, through_x.astype(jnp.int32), ahead=False), -1)
+    return through_x.astype(jnp.int32), walk.gap(near, low, high, along)
 
 
 def _edge(walk: Walk, ix: Index, iy: Index, kind: Index, ahead: bool) -> Index:

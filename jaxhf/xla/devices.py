@@ -242,6 +242,10 @@ def map_first(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: An
     devices, n = mesh.devices.size, jax.tree.leaves(items)[0].shape[0]
     if devices == 1:
         return the_first(shared, items, jnp.arange(n, dtype=jnp.int32), count)
+    around = jax.sharding.get_abstract_mesh()
+    if AxisType.Explicit in around.axis_types:
+        dealt_out: Any = jax.sharding.auto_axes(functools.partial(map_first, mesh, fun), out_sharding=P(mesh.axis_names))
+        return dealt_out(shared, items, count)
     turns = _turns(n, devices)
 
     def on_one(shared: Any, items: Any, numbers: Any, count: Any) -> Any:
@@ -249,7 +253,7 @@ def map_first(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: An
 
     over = jax.shard_map(
         on_one,
-        mesh=mesh,
+        mesh=mesh if around.empty else around,
         in_specs=(P(), P(mesh.axis_names), P(mesh.axis_names), P()),
         out_specs=P(mesh.axis_names),
         check_vma=False,

@@ -104,7 +104,7 @@ def test_viewshed(run, tmp_path):
     eyes = [(3.0, 2.0), (10.0, 2.5)]
     observers = [word for x, y in eyes for word in ("--observer", str(100 + x), str(50 + y))]
     terrain = jaxhf.Terrain(Z, 2.0, 3.0)
-    code, said = run("viewshed", "seen.png", *observers, "--height", "0.2", "--target", "0.1")
+    code, said = run("viewshed", "seen.png", *observers, "--height", "0.2", "--target-height", "0.1")
     seen = jaxhf.viewshed(terrain, eyes, 0.2, 0.1)
     assert code == 0
     assert f": {100 * seen.sum() / 34:.1f} % is seen, from 2 points, " in said
@@ -114,16 +114,22 @@ def test_viewshed(run, tmp_path):
     assert run("viewshed", "above.npy", *observers, "--line", "--above-ground", "--radius", "50")[0] == 0
     along = np.linspace(eyes[0], eyes[1], 5)  # 3.5 cells: in 4 steps
     expected = jaxhf.viewshed(terrain, along, wanted="above-ground", radius=50.0)
+    over_hole = ("--observer", "102", "53", "--observer", "110", "59", "--line")  # through the middle of the hole
+    code, said = run("viewshed", "over.npy", *over_hole)
+    assert (code, "from 4 points" in said) == (0, True), said
     np.testing.assert_array_equal(np.load(tmp_path / "above.npy"), expected)
 
 
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (("--observer", "90", "52"), "--observer must be on the terrain, x from 100 to 112 and y from 50 to 62; it is 90 52"),
+        (("--observer", "90", "52"), "--observer must be on the terrain, x from 100 to 112 and y from 50 to 62; one is 90 52"),
         (("--observer", "103", "52", "--line"), "--line needs two --observer at least, there is one"),
-        (("--observer", "103", "52", "--above-ground", "--target", "2"), "--target would change nothing: --above-ground"),
-        (("--observer", "106", "56"), "must be where there is a height, there is none in column 3, row 2"),
+        (
+            ("--observer", "103", "52", "--above-ground", "--target-height", "2"),
+            "--target-height would change nothing: --above-ground",
+        ),
+        (("--observer", "106", "56"), "--observer[0] must be on a triangle of the terrain"),
         (("--observer", "103"), "expected 2 arguments"),
         ((), "required: --observer"),
     ],

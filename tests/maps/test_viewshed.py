@@ -29,6 +29,32 @@ def profile(z: np.ndarray, begin: tuple[float, float], end: tuple[float, float])
     return share, low + first * (last - low) + second * (high - last)
 
 
+def touched(z: np.ndarray) -> np.ndarray:
+    """The vertices that cells with all their heights touch."""
+    whole = np.pad(np.isfinite(z[:-1, :-1] + z[1:, :-1] + z[:-1, 1:] + z[1:, 1:]), 1)
+    return whole[1:, 1:] | whole[1:, :-1] | whole[:-1, 1:] | whole[:-1, :-1]
+
+
+@pytest.mark.x64
+@pytest.mark.parametrize("eye", [EYE, (10 * DX, 20 * DY), (0.0, 7.5 * DY)])  # within a triangle, at a vertex, on the border
+def test_holes_are_looked_through_and_their_rims_stand(eye):
+    """With 5 % of the heights missing: what stands behind a hole counts from the edge on that faces the eye."""
+    z = ground()
+    z[np.random.default_rng(1).uniform(size=z.shape) < 0.05] = np.nan
+    z[6:9, 0:2] = z[19:22, 9:12] = 20.0  # whole where the eyes are
+    found = jaxhf.viewshed(z, eye, 1.5, wanted="above-ground", dx=DX, dy=DY)
+    for iy, ix in np.argwhere(touched(z))[::3]:
+        line = jaxhf.line_of_sight(z, eye, (DX * ix, DY * iy), 1.5, dx=DX, dy=DY)
+        assert line.above_ground == pytest.approx(found[iy, ix], abs=1e-9), (iy, ix)
+
+
+def test_a_rim_behind_a_hole_hides_as_a_wall_does():
+    z = np.zeros((3, 30), np.float32)
+    z[:, 7], z[:, 8] = np.nan, 5
+    found = jaxhf.viewshed(z, (1.0, 1.0), 2.0, wanted="above-ground", dx=1.0)[1]
+    np.testing.assert_allclose(found[9:], 2 + 3 / 7 * np.arange(8, 29), rtol=1e-6)
+
+
 @pytest.mark.x64
 def test_heights_above_ground_are_those_of_profiles():
     z = ground()
@@ -39,7 +65,7 @@ def test_heights_above_ground_are_those_of_profiles():
     assert not seen[np.isnan(z)].any()
     np.testing.assert_array_equal(seen, found == 0)
     assert 0.1 < seen.mean() < 0.9
-    for iy, ix in np.argwhere(np.isfinite(z))[::7]:
+    for iy, ix in np.argwhere(touched(z))[::7]:
         line = jaxhf.line_of_sight(z, EYE, (DX * ix, DY * iy), 1.5, dx=DX, dy=DY)
         assert line.above_ground == pytest.approx(found[iy, ix], abs=1e-11)
         assert line.visible == seen[iy, ix]
@@ -89,8 +115,30 @@ def test_a_wall_hides_what_is_behind_it():
     distance = np.arange(41) - 1.0
     np.testing.assert_allclose(found[12:], 2 + 0.3 * distance[12:], rtol=1e-6)
     assert (found[:12] == 0).all()
-    seen = jaxhf.viewshed(z, (1.0, 2.0), 2.0, target=8.0, dx=1.0)[2]
+    seen = jaxhf.viewshed(z, (1.0, 2.0), 2.0, target_height=8.0, dx=1.0)[2]
     np.testing.assert_array_equal(seen, (2 + 0.3 * distance <= 8) | (distance <= 10))
+    level = jaxhf.viewshed(z, (1.0, 2.0), 2.0, target_height=2.0, dx=1.0)[2]  # a line of slope 0
+    np.testing.assert_array_equal(level, distance <= 10)
+
+
+def test_heights_in_whole_metres():
+    """Of which many are as high as the eye."""
+    z = np.rint(fractal([120, 120], seed=5, exponent=2.4, range=(0.0, 40.0))).astype(np.float32)
+    eye, height = (60.0, 60.0), 2.0
+    found = jaxhf.viewshed(z, eye, height, wanted="above-ground", dx=1.0)
+    assert (z[60, 60] + height == z).sum() > 100
+    np.testing.assert_array_equal(jaxhf.viewshed(z, eye, height, dx=1.0), found == 0)
+
+
+@pytest.mark.parametrize("dx", [0.1, 0.3, 30.0, 87.36])
+def test_planes_are_seen_from_any_vertex(dx):
+    """By profiles: what a crossing at the target itself says by rounding does not count. And at the last row and column."""
+    z = 0.3 * np.arange(20)[None, :] + 0.7 * np.arange(15)[:, None] + 5.0
+    terrain = jaxhf.Terrain(z, dx, dx, x0=0.3, y0=0.7)
+    eye = (terrain.x0 + 19 * dx, terrain.y0 + 14 * dx)
+    for iy, ix in np.ndindex(z.shape):
+        assert jaxhf.line_of_sight(terrain, eye, (terrain.x0 + ix * dx, terrain.y0 + iy * dx)).visible
+    assert jaxhf.viewshed(terrain, eye).all()
 
 
 def test_a_plain_ends_where_the_earth_falls_away():
@@ -159,21 +207,24 @@ def test_gdal_sees_about_the_same(tmp_path):
         tmp_path / "v.tif",
     ]
     subprocess.run(command, check=True, capture_output=True)
-    theirs = np.flipud(jaxhf.load_heights(tmp_path / "v.tif").heights[::-1]) > 0
+    theirs = jaxhf.load_heights(tmp_path / "v.tif").heights > 0
     ours = jaxhf.viewshed(z, (4500.0, 4500.0), 5.0, dx=30.0)
     assert np.mean(theirs != ours) < 0.05
     assert 0.05 < ours.mean() < 0.9
 
 
 WRONG = {
-    "on the terrain": {"observers": (100.0, 0.0)},
-    "where there is a height": {"observers": (0.5, 0.5)},
-    "shape (2,) or (n, 2)": {"observers": [1.0, 2.0, 3.0]},
+    "observers must be on the terrain, x from 0 to 46 and y from 0 to 39; one is 100 0": {"observers": (100.0, 0.0)},
+    "observers[1] must be on a triangle": {"observers": [(20.0, 20.0), (0.5, 0.5)]},
+    "shape (2,) or (n, 2): [1.0, 2.0, 3.0]": {"observers": [1.0, 2.0, 3.0]},
+    "shape (2,) or (n, 2): 'here'": {"observers": "here"},
     "height must be positive": {"height": 0.0},
-    "target must be at least 0": {"target": -1.0},
-    "must be 0 where wanted is above-ground": {"target": 1.0, "wanted": "above-ground"},
+    "target_height must be at least 0": {"target_height": -1.0},
+    "target_height must be within": {"target_height": 1e39},
+    "must be 0 where wanted is above-ground": {"target_height": 1.0, "wanted": "above-ground"},
     "one of visible, above-ground": {"wanted": "all"},
     "radius must be positive": {"radius": 0.0},
+    "radius must be from": {"radius": 1e-40},
     "dx must be given": {"dx": None},
 }
 

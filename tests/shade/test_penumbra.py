@@ -248,3 +248,16 @@ def test_the_shadow_of_a_sheet_has_a_derivative():
 def test_what_is_refused(arguments, message):
     with pytest.raises(jaxhf.ArgumentError, match=f"Sun: {message}"):
         jaxhf.Sun(*arguments)
+
+
+def test_a_wall_behind_a_hole_hides_the_sun():
+    """A ray that comes to a wall over a hole meets it by the edge between them, which no cell before has."""
+    z = np.zeros((9, 21), np.float32)
+    z[:, 8] = 5
+    z[2:7, 7] = np.nan
+    above = jaxhf.Orthographic.look_at((1.2, 4.3, 50), (1.2, 4.3, 0), (0, 1, 0), extent=0.2, width=1, height=1)
+    field = jaxhf.Heightfield(z, 1.0, 1.0)
+    for up, light in ((0.6, 0.0), (0.9, 1.0)):  # the wall's top is seen at a slope of 0.735
+        scene = jaxhf.Scene([jaxhf.Object(field, jaxhf.Matte(1.0))], above, [jaxhf.Sun((1, 0, up), irradiance=np.pi)])
+        cosine = up / np.hypot(1, up)
+        np.testing.assert_allclose(jaxhf.render(scene)[0, 0], light * cosine, atol=1e-3)

@@ -283,10 +283,10 @@ def _light_vector(scene: Scene) -> Float[np.ndarray, "3"]:
             towards, power = np.array([0.0, 0.0, 1.0]), np.pi / 2 * np.asarray(light.radiance, np.float64)
         elif isinstance(light, Point):
             towards = np.asarray(light.p, np.float64) - middle
-            power = np.asarray(light.intensity, np.float64) / (towards @ towards)
+            power = np.asarray(light.intensity, np.float64) / max(float(towards @ towards), 1e-30)
         else:
             towards, power = np.asarray(light.towards, np.float64), np.asarray(light.irradiance, np.float64)
-        total += np.mean(power) * towards / np.linalg.norm(towards)
+        total += np.mean(power) * towards / max(float(np.linalg.norm(towards)), 1e-30)
     return np.linalg.solve(world.linear, total)
 
 
