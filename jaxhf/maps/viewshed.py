@@ -52,7 +52,8 @@ def viewshed(
 
     Exact on the surface that is rendered, two triangles to a cell: between the edges that a line of sight crosses, the ground
     is straight, so that the steepest crossing decides (De Floriani and Magillo, Visibility algorithms on triangulated digital
-    terrain models, International Journal of GIS 8(1), 1994). Over holes one sees.
+    terrain models, International Journal of GIS 8(1), 1994). Over holes one sees; a line that only touches the rim of one may
+    pass it.
 
     Args:
       terrain: a `Terrain` (degrees count as metres, see `load_heights`), a `Heightfield`, or heights, shape (ny, nx), row 0 in
