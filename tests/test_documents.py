@@ -37,10 +37,10 @@ DEEP = {  # over four seconds of a processor
     "docs/coming-from/gdal.md",
     "docs/coming-from/mitsuba.md",
     "docs/index.md",
-    *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/sun-and-sky", "guides/view")),
+    *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/maps", "guides/sun-and-sky", "guides/view")),
     *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "picture", "robots")),
 }
-FOREIGN = {"gdaldem", "gdalinfo", "gdal_translate"}  # programs that may not be here
+FOREIGN = {"gdaldem", "gdalinfo", "gdal_translate", "gdal_viewshed"}  # programs that may not be here
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
 
