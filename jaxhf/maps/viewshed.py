@@ -17,7 +17,7 @@ from ..core.settings import Settings
 from ..core.types import POSITIVE, Index, Number, Scalar, Vector
 from ..core.vector import greater
 from ..io.terrain.terrain import Terrain
-from ..preparation.horizon import assemble
+from ..preparation.horizon import TILE, assemble, tile_count
 from ..scene.heightfield import Heightfield
 from ..trace.grid import Grid, make_grid
 from ..trace.hit import hit_of_closed_form
@@ -30,7 +30,6 @@ from .choices import WANTED
 from .surface import Surface, require_positive, surface, with_spacing
 
 _ROUNDING = 1e-9  # cells
-_TILE = 32  # vertices along a side of what `assemble` takes
 _BEFORE = 0.35  # cells: no edge that does not touch a vertex is crossed nearer to it than twice as far away
 
 
@@ -142,15 +141,15 @@ def _hidden(
         x, y = (jnp.arange(n, dtype=dtype) - eye[k] for k, n in enumerate((nx, ny)))
         heights = heights - (jnp.square(y * falls[1])[:, None] + jnp.square(x * falls[0])[None, :])
     grid = make_grid(Heightfield(heights, 1.0, 1.0), None, Settings(shading="flat"))
-    columns = math.ceil(nx / _TILE)
+    columns = math.ceil(nx / TILE)
 
     def tile(shared: tuple[Grid, Vector, Scalar], number: Index) -> jax.Array:
         grid, eye, target = shared
-        at = jnp.arange(_TILE, dtype=jnp.int32)
-        ix, iy = jnp.minimum((number % columns) * _TILE + at, nx - 1), jnp.minimum((number // columns) * _TILE + at, ny - 1)
+        at = jnp.arange(TILE, dtype=jnp.int32)
+        ix, iy = jnp.minimum((number % columns) * TILE + at, nx - 1), jnp.minimum((number // columns) * TILE + at, ny - 1)
         return jax.vmap(lambda iy: jax.vmap(lambda ix: _hidden_at(visible, grid, eye, target, ix, iy))(ix))(iy)
 
-    numbers = np.arange(columns * math.ceil(ny / _TILE), dtype=np.int32)
+    numbers = np.arange(tile_count(heights.shape), dtype=np.int32)
     tiles = map_over(mesh, lambda shared, number: one_kernel(tile, shared, number), (grid, eye, target), numbers)
     return assemble(tiles, heights.shape)
 

@@ -24,11 +24,11 @@ from ..trace.edges import STEPS, present_edges, whole_cells
 from ..xla.devices import map_over
 
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
-_TILE = 32  # vertices along its side
+TILE = 32  # vertices along its side
 _STRETCH = 24  # cells, along the axis on which a direction moves faster; up to `_TOGETHER` crossings longer
 _TOGETHER = 8  # crossings in one pass over a tile
 _GRAIN = 8  # cells from one of the windows whose highest points are kept to the next
-_MARGIN = _TILE + 1
+_MARGIN = TILE + 1
 _STEEPEST = 1e18  # of slopes: a right angle, whose square is a number in single precision
 
 # The kinds of edges, see `edges`; and a last one, for crossings at a vertex, which leads nowhere.
@@ -151,7 +151,7 @@ def _searched(
 
 def tile_count(shape: tuple[int, ...]) -> int:
     """Square tiles that cover a grid of this shape."""
-    return math.prod(math.ceil(n / _TILE) for n in shape)
+    return math.prod(math.ceil(n / TILE) for n in shape)
 
 
 def over_tiles(
@@ -163,11 +163,11 @@ def over_tiles(
     numbered: bool = False,
 ) -> tuple[jax.Array, jax.Array | None]:
     """As `over_horizon`, for some of the tiles, without a derivative; also in holes. Besides, the entries that were found."""
-    columns = math.ceil((view.heights.shape[1] - 2 * _MARGIN - _TILE) / _TILE)
+    columns = math.ceil((view.heights.shape[1] - 2 * _MARGIN - TILE) / TILE)
 
     def one_tile(shared: tuple["HorizonView", Scalar], number: Index) -> tuple[jax.Array, jax.Array | None]:
         view, lowest = shared
-        x, y = (number % columns) * _TILE, (number // columns) * _TILE
+        x, y = (number % columns) * TILE, (number // columns) * TILE
         ways = jnp.arange(view.end.shape[0], dtype=jnp.int32)
         slopes, found = lax.map(lambda way: _from_tile(view, way, x, y, lowest, numbered), ways)
         return summary(slopes), found
@@ -177,11 +177,11 @@ def over_tiles(
 
 def assemble(tiles: Any, shape: tuple[int, ...]) -> Any:
     """An array over the grid from all its tiles, of JAX or NumPy: shape (tiles, ..., tile, tile) to (..., ny, nx)."""
-    rows, columns = (math.ceil(n / _TILE) for n in shape)
+    rows, columns = (math.ceil(n / TILE) for n in shape)
     tail = tiles.shape[1:-2]
     last = 2 + len(tail)
-    grid = tiles.reshape(rows, columns, *tail, _TILE, _TILE).transpose(*range(2, last), 0, last, 1, last + 1)
-    return grid.reshape(*tail, rows * _TILE, columns * _TILE)[..., : shape[0], : shape[1]]
+    grid = tiles.reshape(rows, columns, *tail, TILE, TILE).transpose(*range(2, last), 0, last, 1, last + 1)
+    return grid.reshape(*tail, rows * TILE, columns * TILE)[..., : shape[0], : shape[1]]
 
 
 class HorizonView(eqx.Module):
@@ -213,7 +213,7 @@ class HorizonView(eqx.Module):
     def of(z: Float[jax.Array, "ny nx"], directions: Float[jax.Array, "k 2"]) -> "HorizonView":
         (ny, nx), dtype = z.shape, z.dtype
         count = math.ceil((max(nx, ny) - 1) / _STRETCH)
-        margin = ((_MARGIN, _MARGIN + _TILE), (_MARGIN, _MARGIN + _TILE))
+        margin = ((_MARGIN, _MARGIN + TILE), (_MARGIN, _MARGIN + TILE))
 
         def along(direction: jax.Array) -> tuple[_Crossings, jax.Array, jax.Array, jax.Array, jax.Array]:
             crossings, size = _crossings((ny, nx), direction), jnp.abs(direction)
@@ -250,11 +250,11 @@ def _from_tile(
     def moved(heights: jax.Array, by_x: Index, by_y: Index) -> jax.Array:
         """Of the tile, moved by some cells. The start is clamped: a tile beyond the margin is one within it, all nan."""
         start = y + _MARGIN + by_y, x + _MARGIN + by_x
-        return lax.dynamic_slice(heights, start, (_TILE, _TILE), allow_negative_indices=False)
+        return lax.dynamic_slice(heights, start, (TILE, TILE), allow_negative_indices=False)
 
     def moved_edges(kind: Index, by_x: Index, by_y: Index) -> jax.Array:
         start = kind, y + _MARGIN + by_y, x + _MARGIN + by_x
-        return lax.dynamic_slice(view.edges, start, (1, _TILE, _TILE), allow_negative_indices=False)[0]
+        return lax.dynamic_slice(view.edges, start, (1, TILE, TILE), allow_negative_indices=False)[0]
 
     z = moved(view.heights, jnp.zeros_like(x), jnp.zeros_like(y))
     window = [(at + first[:, k]) // _GRAIN + _reach() for k, at in enumerate((x, y))]
@@ -310,7 +310,7 @@ def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
 
 def _reach() -> int:
     """Windows side by side that a tile moves over within a stretch, wherever between their beginnings it begins."""
-    return math.ceil((_TILE + _STRETCH + _TOGETHER + 4) / _GRAIN) + 1
+    return math.ceil((TILE + _STRETCH + _TOGETHER + 4) / _GRAIN) + 1
 
 
 def _windows(values: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "window_rows window_columns"]:

@@ -1,6 +1,7 @@
 """`jaxhf hillshade`, `slope`, `aspect`, `ruggedness` and `relief`: maps that NumPy makes of a terrain file."""
 
 import argparse
+import dataclasses
 import inspect
 import sys
 import time
@@ -8,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ...core.errors import UserError
+from ...io.errors import FileError
 from ...io.terrain.load import read_terrain
 from ...io.terrain.rasters import require_writable_raster, save_raster
 from ...io.terrain.terrain import Terrain
@@ -69,3 +71,16 @@ def report_spacing(options: argparse.Namespace, terrain: Terrain) -> None:
         said = "does not say how far apart its heights are, 1 is taken (--dx and --dy overrule)"
     if said and not options.quiet:
         print(f"jaxhf: {options.terrain} {said}", file=sys.stderr)
+
+
+def read_in_metres(options: argparse.Namespace) -> tuple[Terrain, Terrain]:
+    """The terrain of a file as it is stored, in the precision that was asked for, and with lengths in metres."""
+    stored = read_terrain(options.terrain, options.z_scale, options.nodata)
+    if stored.nodata.all():
+        raise UserError(f"{options.terrain}: there is no height in it")
+    stored = dataclasses.replace(stored, heights=stored.heights.astype(options.precision))
+    report_spacing(options, stored)
+    try:
+        return stored, stored.in_metres(**arguments.given(options, "dx", "dy"))
+    except FileError as error:
+        raise FileError(f"{options.terrain}: {error}") from error

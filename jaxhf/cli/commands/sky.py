@@ -1,23 +1,20 @@
 """`jaxhf skyview` and `jaxhf horizon`: how much of the sky the terrain leaves to see, and how high it stands."""
 
 import argparse
-import dataclasses
 import time
 from pathlib import Path
 
 import numpy as np
 
-from ...core.errors import UserError, counted
-from ...io.errors import FileError
+from ...core.errors import counted
 from ...io.files import replacing_all, write_npy
-from ...io.terrain.load import read_terrain
 from ...io.terrain.rasters import geotiff, require_writable_raster, save_raster
 from ...io.terrain.terrain import Terrain
 from ...maps.skyview import horizon, sky_view
 from ...preparation.horizon import even_azimuths
 from .. import arguments, limits
 from ..progress import compiled_bar
-from .maps import report_spacing, require_numbers
+from .maps import read_in_metres, require_numbers
 
 
 def run(options: argparse.Namespace) -> None:
@@ -28,15 +25,7 @@ def run(options: argparse.Namespace) -> None:
             arguments.refuse(options, "azimuths", because="--azimuth asks for one")
     path = require_writable_raster(options.output)
     options.azimuths = 32 if options.azimuths is None else options.azimuths
-    stored = read_terrain(options.terrain, options.z_scale, options.nodata)
-    if stored.nodata.all():
-        raise UserError(f"{options.terrain}: there is no height in it")
-    stored = dataclasses.replace(stored, heights=stored.heights.astype(options.precision))
-    report_spacing(options, stored)
-    try:
-        terrain = stored.in_metres(**arguments.given(options, "dx", "dy"))
-    except FileError as error:
-        raise FileError(f"{options.terrain}: {error}") from error
+    stored, terrain = read_in_metres(options)
     limits.set_up_jax(options)
     begin = time.perf_counter()
     said, count = make(options, path, stored, terrain)

@@ -1,7 +1,6 @@
 """`jaxhf viewshed`: what is seen of a terrain from points on it."""
 
 import argparse
-import dataclasses
 import itertools
 import math
 import time
@@ -9,14 +8,12 @@ import time
 import numpy as np
 
 from ...core.errors import UserError, counted
-from ...io.errors import FileError
-from ...io.terrain.load import read_terrain
 from ...io.terrain.rasters import require_writable_raster, save_raster
 from ...maps.surface import surface
 from ...maps.viewshed import cells_of, height_at, seen_from
 from .. import arguments, limits
 from ..progress import compiled_bar
-from .maps import report_spacing, require_numbers
+from .maps import read_in_metres, require_numbers
 
 
 def run(options: argparse.Namespace) -> None:
@@ -26,19 +23,11 @@ def run(options: argparse.Namespace) -> None:
     if options.line and len(options.observers) < 2:
         raise UserError("viewshed: --line needs two --observer at least, there is one")
     path = require_writable_raster(options.output)
-    stored = read_terrain(options.terrain, options.z_scale, options.nodata)
-    if stored.nodata.all():
-        raise UserError(f"{options.terrain}: there is no height in it")
-    stored = dataclasses.replace(stored, heights=stored.heights.astype(options.precision))
-    report_spacing(options, stored)
+    stored, terrain = read_in_metres(options)
     dx, dy, x0, y0 = stored.in_file
     cells = cells_of("viewshed", "--observer", options.observers, stored.heights.shape, (x0, y0), (dx, dy))
     if options.line:
         cells = _along(cells, stored.heights)
-    try:
-        terrain = stored.in_metres(**arguments.given(options, "dx", "dy"))
-    except FileError as error:
-        raise FileError(f"{options.terrain}: {error}") from error
     limits.set_up_jax(options)
     begin = time.perf_counter()
     known = arguments.given(options, "height", "target_height", "radius")
