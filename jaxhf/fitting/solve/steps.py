@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
@@ -184,7 +185,9 @@ def _of_j(position: Any) -> tuple[Any, Any]:
 
 
 @functools.partial(compiled, jit=eqx.filter_jit, newer=None, donate="all-except-first")
-def _advance(kept: tuple[LevenbergMarquardt, Unknowns, Any, Expansion], of_j: Any) -> tuple[Unknowns, list[Array], Outcome]:
+def _advance(
+    kept: tuple[LevenbergMarquardt, Unknowns, Any, Expansion], of_j: Any
+) -> tuple[Unknowns, list[Array | np.ndarray], Outcome]:
     solver, unknowns, rest, expansion = kept
     problem, position = expansion.problem, eqx.combine(of_j, rest)
     with jax.numpy_dtype_promotion("standard"):
