@@ -20,7 +20,8 @@ class Pyramid(eqx.Module):
 
     Blocks are rounded outwards by 32 units in the last place of the largest height, more than a height on the ray or on
     an edge can be off: a ray that is clear of a block has no change of sign in it that the test of a cell could report. A
-    block with a hole is unbounded.
+    block with a cell that has no surface is unbounded, as a ray finds its side anew there; but where the eight around such a
+    cell have none, either, rays pass it by.
 
     Attributes:
       bounds: level after level, each row padded to the finest's width; first for rays above, then for rays below.
@@ -60,12 +61,17 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None
     levels = most if levels is None else min(levels, most)
     outwards = 32 * jnp.finfo(z.dtype).eps * z_top
     hole = jnp.isnan(z)
+    gone = jnp.pad(hole[:-1] | hole[1:], ((1, 1), (0, 0)), constant_values=True)
+    gone = jnp.pad(gone[:, :-1] | gone[:, 1:], ((0, 0), (1, 1)), constant_values=True)  # of cells, with those beyond the border
+    gone = gone[:-2] & gone[1:-1] & gone[2:]
+    amid_gone = gone[:, :-2] & gone[:, 1:-1] & gone[:, 2:]
 
     def chain(values: jax.Array) -> jax.Array:
         values = jnp.where(hole, jnp.inf, values)
         block = jnp.maximum(jnp.maximum(values[:-1, :-1], values[1:, :-1]), jnp.maximum(values[:-1, 1:], values[1:, 1:]))
         padding = ((0, height - (ny - 1)), (0, width - (nx - 1)))
-        block = jnp.pad(block + outwards, padding, constant_values=-jnp.inf)
+        block = jnp.where(amid_gone, -jnp.inf, block + outwards)
+        block = jnp.pad(block, padding, constant_values=-jnp.inf)
         rows = [block]
         for _ in range(levels):
             block = jnp.maximum(

@@ -50,6 +50,23 @@ def test_where_all_are_holes_nothing_is_met():
     np.testing.assert_array_equal(hit["status"], MISS)
 
 
+def test_a_large_hole_is_passed_by():
+    """By rays that begin within it, too: as cell by cell, in a fraction of the steps."""
+    rng = np.random.default_rng(5)
+    heights = rng.uniform(size=(70, 130)).astype(np.float32)
+    heights[3:60, 5:110] = np.nan
+    heights[20:24, 60:65] = rng.uniform(size=(4, 5))  # an island
+    o, to = rng.uniform((6, 4, 0.2), (108, 58, 0.8), (2, 4000, 3)).astype(np.float32)
+    field = jaxhf.Heightfield(heights, 1.0, 1.0)
+    all_cells = jaxhf.cast(field, o, to - o, jaxhf.Settings(traversal="dda"))
+    few_steps = jaxhf.cast(field, o, to - o, jaxhf.Settings(max_steps=64))
+    met = np.asarray(all_cells.status) == HIT
+    np.testing.assert_array_equal(few_steps.status, all_cells.status)
+    for one, other in zip(jax.tree.leaves(all_cells), jax.tree.leaves(few_steps), strict=True):
+        np.testing.assert_array_equal(np.asarray(one)[met], np.asarray(other)[met])
+    assert 800 < met.sum() < 3200
+
+
 @aimed.PRECISIONS
 def test_where_the_ray_starts(dtype):
     """Over z = |x| on a grid whose numbers are all exact: above, below, on a flank, on the ridge, in front of its end."""
