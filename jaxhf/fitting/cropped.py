@@ -1,7 +1,7 @@
 """A part of a terrain and of its pictures, for a fit of that part within the terrain that goes on around it."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,12 +15,14 @@ from ..preparation.localise import localise
 from ..rendering.render import render
 from ..scene.camera import cropped as cropped_camera
 from ..scene.heightfield import Heightfield
-from ..scene.material import map_textures
+from ..scene.light import Directional, Point, Sky, Sun
+from ..scene.material import Mirror, map_textures
 from ..scene.scene import Object, Scene
 from ..scene.texture import ImageTexture
 
 _MARGIN = 2  # cells from the rim, where normals lack their neighbours; and pixels that a moving rim may come to
-_REACH = 3.0  # deviations by which heights may differ from what is known of them
+REACH = 3.0
+"""Deviations by which heights may differ from what is known of them."""
 _LEAST_SIDE = 16  # of a picture, pixels
 
 ndimage: Any = scipy.ndimage  # whose stubs miss much
@@ -63,6 +65,64 @@ class Seen(NamedTuple):
     number: int
 
 
+def surroundings(scenes: Sequence[Scene], heights: tuple[float, float], windows: Sequence[Window]) -> list[Window]:
+    """For each window of a terrain the part of it that may hide the window from a light or a camera, all of one size.
+
+    Beyond it all rays from the window to lights and cameras are above the highest height. Where light comes from all around, or
+    a mirror shows any place, it is the whole terrain.
+
+    Args:
+      heights: the lowest and the highest that the terrain may have, in its own frame.
+    """
+    field = scenes[0].heightfields[0]
+    shape, steps = np.array(field.heights.shape), np.array([field.dy, field.dx])
+    low, high = heights
+    ends = []  # of each window: first and last row and column
+    for window in windows:
+        first = np.array([window.y, window.x])
+        last = np.array([window.y + window.ny - 1, window.x + window.nx - 1])
+        corners = np.array([[y, x] for y in (first[0], last[0]) for x in (first[1], last[1])])
+        ends.append([corners.min(0), corners.max(0)])
+        for scene in scenes:
+            for end in _ends_of_rays(scene, corners * steps, low, high):
+                ends[-1] = [np.minimum(ends[-1][0], end.min(0) / steps), np.maximum(ends[-1][1], end.max(0) / steps)]
+    first, last = np.moveaxis(np.array(ends), 1, 0)
+    first, last = (np.clip(found, 0, shape - 1) for found in (np.floor(first) - _MARGIN, np.ceil(last) + _MARGIN))
+    size = (last - first).max(0).astype(int) + 1
+    first = np.minimum(first, shape - size).astype(int)
+    return [Window(y, x, *size.tolist()) for y, x in first.tolist()]
+
+
+def _ends_of_rays(
+    scene: Scene, starts: Float[np.ndarray, "n 2"], low: float, high: float
+) -> Iterator[Float[np.ndarray, "n 2"]]:
+    """Where rays from places at the lowest height, y and x, come above the highest on their way to each light and to the
+    camera, in the terrain's frame; infinitely far off where they never do."""
+    local = localise(scene)
+    world = local.objects[scene.first_heightfield].world_from_object
+    to_object = np.linalg.inv(np.eye(4) if world is None else np.asarray(world, np.float64))
+    mirrors = any(isinstance(obj.material, Mirror) for obj in local.objects)
+    for source in (local.camera, *local.lights):
+        if isinstance(source, Sky) and source.occlusion is None:
+            continue
+        if mirrors or isinstance(source, Sky | Sun):
+            yield np.array([[-np.inf, -np.inf], [np.inf, np.inf]])
+            continue
+        if isinstance(source, Directional | Point):
+            at_place = isinstance(source, Point)
+            there: Any = source.p if isinstance(source, Point) else source.towards
+        else:
+            there, at_place = source.viewpoint()
+        x, y, z = to_object[:3, :3] @ np.asarray(there, np.float64) + (to_object[:3, 3] if at_place else 0)
+        if at_place:
+            share = min(1.0, (high - low) / (z - low)) if z > low else 1.0
+            yield starts + share * (np.array([y, x]) - starts)
+        elif z > 0:
+            yield starts + (high - low) / z * np.array([y, x])
+        else:
+            yield starts + np.where(np.array([y, x]) == 0, 0, np.copysign(np.inf, [y, x]))
+
+
 def cropped(
     scenes: Sequence[Scene],
     targets: Sequence[np.ndarray],
@@ -70,15 +130,18 @@ def cropped(
     terrain: Float[np.ndarray, "my mx"],
     deviation: float,
     window: Window,
+    around: Window,
 ) -> list[Seen]:
     """What the pictures show of a window of a terrain.
 
     Scenes, targets and weights are those of the whole terrain, a weight for each value; `terrain`: its heights as far as they
-    are known; `deviation`: the largest standard deviation of these.
+    are known; `deviation`: the largest standard deviation of these; `around`: see `surroundings`.
     """
-    fields = _fields(scenes[0].heightfields[0], terrain, window)
-    parts = [_with_surroundings(scene, *fields, window) for scene in scenes]
-    places = [_in_sight(scene, terrain[window.place], _REACH * deviation) for scene in parts]
+    whole = Window(0, 0, *terrain.shape)
+    field = scenes[0].heightfields[0]
+    parts = [_with_surroundings(scene, *_fields(field, terrain, window, around), window, around) for scene in scenes]
+    everything = [_with_surroundings(scene, *_fields(field, terrain, window, whole), window, whole) for scene in scenes]
+    places = [_in_sight(scene, terrain[window.place], REACH * deviation) for scene in parts]
     # Pictures of one size share a program, those of this window and of the next ones.
     height, width = (max([1, *(place[1][axis] - place[0][axis] for place in places if place is not None)]) for axis in (0, 1))
     found = []
@@ -91,38 +154,41 @@ def cropped(
             int(np.clip((low + high - side) // 2, 0, most - side))
             for low, high, side, most in zip(*place, sides, (camera.height, camera.width), strict=True)
         )
-        scene = scene.with_camera(cropped_camera(camera, x, y, sides[1], sides[0]))
-        here = slice(y, y + sides[0]), slice(x, x + sides[1])
-        shows, other = _sight_of(scene, window, terrain.shape)
+        camera, here = cropped_camera(camera, x, y, sides[1], sides[0]), (slice(y, y + sides[0]), slice(x, x + sides[1]))
+        shows, other = _sight_of(everything[index].with_camera(camera), window, terrain.shape)
         weight = np.where(other.reshape(*sides, *(1,) * (weights[index].ndim - 2)), 0, weights[index][here])
         if (weight.reshape(*sides, -1).any(-1) & shows).any():
-            found.append(Seen(scene, targets[index][here], weight, index))
+            found.append(Seen(scene.with_camera(camera), targets[index][here], weight, index))
     return found
 
 
-def _fields(whole: Heightfield, terrain: Float[np.ndarray, "my mx"], window: Window) -> tuple[Heightfield, Heightfield]:
+def _fields(
+    whole: Heightfield, terrain: Float[np.ndarray, "my mx"], window: Window, around: Window
+) -> tuple[Heightfield, Heightfield]:
     """A window of a terrain, and what is around it, with a hole there."""
-    around = terrain.astype(whole.heights.dtype)
-    part = around[window.place].copy()
-    around[window.y + 1 : window.y + window.ny - 1, window.x + 1 : window.x + window.nx - 1] = np.nan
-    corner = whole.x0 + window.x * whole.dx, whole.y0 + window.y * whole.dy
     seam = None if whole.seam is None else np.asarray(whole.seam)
-    return (
-        Heightfield(part, whole.dx, whole.dy, *corner, None if seam is None else seam[window.place]),
-        Heightfield(around, whole.dx, whole.dy, whole.x0, whole.y0, seam),
-    )
+
+    def part(place: Window, heights: Float[np.ndarray, "ny nx"]) -> Heightfield:
+        corner = whole.x0 + place.x * whole.dx, whole.y0 + place.y * whole.dy
+        return Heightfield(heights, whole.dx, whole.dy, *corner, None if seam is None else seam[place.place])
+
+    heights = terrain.astype(whole.heights.dtype)
+    inside = heights[window.place].copy()
+    heights[window.y + 1 : window.y + window.ny - 1, window.x + 1 : window.x + window.nx - 1] = np.nan
+    return part(window, inside), part(around, heights[around.place])
 
 
-def _with_surroundings(scene: Scene, part: Heightfield, around: Heightfield, window: Window) -> Scene:
+def _with_surroundings(scene: Scene, part: Heightfield, beyond: Heightfield, window: Window, around: Window) -> Scene:
     """The scene with the one in place of its terrain and the other as its last object."""
-    old = scene.heightfields[0]
-    objects = list(scene.objects)
+    shape, objects = scene.heightfields[0].heights.shape, list(scene.objects)
     k = scene.first_heightfield
     material, world = objects[k].material, objects[k].world_from_object
-    there = map_textures(material, lambda image: _cropped_texture(image, old.heights.shape, window))
+    there = map_textures(material, lambda image: _cropped_texture(image, shape, window))
     objects[k] = Object(part, there, world)
+    if beyond.heights.shape != shape:
+        material = map_textures(material, lambda image: _cropped_texture(image, shape, around))
     # Its place is given also where it is the world's: windows at the corner then share a program with the others.
-    objects.append(Object(around, material, np.eye(4) if world is None else world))
+    objects.append(Object(beyond, material, np.eye(4) if world is None else world))
     return eqx.tree_at(lambda scene: scene.objects, scene, tuple(objects))
 
 

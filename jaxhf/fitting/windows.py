@@ -17,7 +17,7 @@ from ..core.settings import Settings
 from ..io.checkpoint import load_arrays, load_facts_of, save_checkpoint
 from ..preparation.localise import localise
 from ..scene.scene import Scene
-from .cropped import Seen, Window, cropped
+from .cropped import REACH, Seen, Window, cropped, surroundings
 from .fit import fit
 from .given import Checkpoint, Prior
 from .history import Draws, Step
@@ -132,6 +132,8 @@ def fit_windows(
     terrain = Mosaic(with_seam(field, np.where(std > 0, begin, mean)), std.copy(), np.zeros(shape, bool), ())
     order = divided(shape, window, overlap)
     options = {**options, "settings": _settings(scenes, options.get("settings") or Settings(), len(order))}
+    off = REACH * float(std.max())
+    around = surroundings(scenes, (float(terrain.heights.min()) - off, float(terrain.heights.max()) + off), order)
     path = None if checkpoint is None else Path(checkpoint.path)
     values = scenes, targets, weights, mean, std, begin, noise
     choices = prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)
@@ -140,7 +142,8 @@ def fit_windows(
         terrain = _load(path, terrain, name)
     for number in range(len(terrain.windows), len(order)):
         place = order[number]
-        seen = cropped(scenes, targets, weights, terrain.heights, float(std[place.place].max()), place)
+        deviation = float(std[place.place].max())
+        seen = cropped(scenes, targets, weights, terrain.heights, deviation, place, around[number])
         tell = None if progress is None else lambda done, number=number: progress(number, len(order), done)
         found = _fit(seen, terrain, known, place, noise, tell or False, options) if seen else None
         done = Fitted(*place, len(seen))

@@ -41,6 +41,7 @@ class Grid(eqx.Module):
         numbers alone; None: nothing.
       first: the place of the first vertex in `rows` and `normals`; None: 0, else they hold several grids, see `joined`.
       seam: the vertices where the surface goes on in another grid; None: there are none.
+      still: whether it is known where its edges are seen, so that no derivative asks for these; their shadows may move.
     """
 
     rows: Float[jax.Array, " vertices"]
@@ -56,6 +57,7 @@ class Grid(eqx.Module):
     perturbation: Corners | None = None
     first: Index | None = None
     seam: Bool[jax.Array, "ny nx"] | None = None
+    still: bool = eqx.field(static=True, default=False)
 
     @property
     def z(self) -> Float[jax.Array, "ny nx"]:

@@ -7,7 +7,7 @@ import pytest
 
 import jaxhf
 from jaxhf.fitting import windows as _windows
-from jaxhf.fitting.cropped import Window, _fields, cropped
+from jaxhf.fitting.cropped import Window, _fields, cropped, surroundings
 from jaxhf.fitting.model.surface import with_seam
 from jaxhf.fitting.windows import divided, fit_windows
 from jaxhf.scene.procedural import fractal
@@ -74,7 +74,10 @@ def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
     """Where it counts it is the whole picture's part, with its texture and shadows from outside; the rim does not count."""
     whole = scenes(TRUTH, CAMERAS[name], albedo)
     images = [np.asarray(jaxhf.render(scene, SETTINGS)) for scene in whole]
-    parts = cropped(whole, images, [np.ones_like(image) for image in images], TRUTH.astype(np.float64), 0.0, WINDOW)
+    (around,) = surroundings(whole, (0.0, 0.15), [WINDOW])
+    assert 24 < around.ny < SIDE
+    terrain = TRUTH.astype(np.float64)
+    parts = cropped(whole, images, [np.ones_like(image) for image in images], terrain, 0.0, WINDOW, around)
     assert len(parts) == len(whole)
     for part in parts:
         assert part.scene.heightfields[0].heights.shape == (24, 24)
@@ -85,14 +88,40 @@ def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
         assert not (counts & (number == 1)).any()
 
 
+@pytest.mark.parametrize(
+    ("lights", "camera", "expected"),
+    [
+        # A height of 0.1 above 0 hides light of slope 1 for 0.1, 4.7 cells, and two cells are to spare.
+        ([jaxhf.Directional((1, 0, 1))], ABOVE, (6, 14, 28, 28 + 5)),
+        ([jaxhf.Directional((0, -2, 1))], ABOVE, (0, 14, 24 + 8 + 2, 28)),
+        ([jaxhf.Point((3.0, -1.7, 0.2))], ABOVE, (6, 6, 28, 36)),  # half of the way from the window to the light
+        ([jaxhf.Directional((1, 0, -1))], ABOVE, (6, 14, 28, 34)),  # from below: all along its way
+        ([jaxhf.Sky(1.0, occlusion=16)], ABOVE, (0, 0, SIDE, SIDE)),
+        ([jaxhf.Sky(1.0)], jaxhf.Orthographic.look_at((3.5, -4.5, 3), (3.5, -1.5, 0), extent=0.9), (1, 14, 33, 28)),
+    ],
+)
+def test_what_may_hide_a_window_is_around_it(lights, camera, expected):
+    field = jaxhf.Heightfield(np.zeros((SIDE, SIDE), np.float32), x0=3.0, y0=-2.0)
+    scene = jaxhf.Scene([jaxhf.Object(field)], camera, lights)
+    assert surroundings([scene], (0.0, 0.1), [WINDOW]) == [Window(*expected)]
+    both = surroundings([scene], (0.0, 0.1), [WINDOW, Window(0, 0, 24, 24)])
+    assert both[0][2:] == both[1][2:]
+    for window, around in zip([WINDOW, Window(0, 0, 24, 24)], both, strict=True):
+        assert around.y <= window.y
+        assert around.x <= window.x
+        assert around.y + around.ny >= window.y + window.ny
+        assert around.x + around.nx >= window.x + window.nx
+        assert max(around.y + around.ny, around.x + around.nx) <= SIDE
+
+
 def test_a_window_at_a_seam_has_its_part_of_it():
     """So that its heights are held there, as those of the whole terrain."""
     region = jaxhf.Heightfield(np.zeros((20, 20), np.float32), 8 / (SIDE - 1), x0=2.7, y0=-2.3)
     terrain, _ = jaxhf.nested(jaxhf.Heightfield(TRUTH, x0=3.0, y0=-2.0), region)
     window = Window(0, 4, 12, 12)
-    part, around = _fields(terrain, np.asarray(terrain.heights), window)
+    part, around = _fields(terrain, np.asarray(terrain.heights), window, Window(0, 2, 20, 30))
     np.testing.assert_array_equal(part.seam, np.asarray(terrain.seam)[window.place])
-    np.testing.assert_array_equal(around.seam, terrain.seam)
+    np.testing.assert_array_equal(around.seam, np.asarray(terrain.seam)[:20, 2:32])
     held = np.isfinite(np.asarray(terrain.seam)).all(-1)
     begin = with_seam(terrain, np.asarray(terrain.heights) + 0.3)  # as `fit_windows` begins from a start
     np.testing.assert_array_equal(begin[held], np.asarray(terrain.heights)[held])

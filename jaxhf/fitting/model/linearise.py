@@ -32,7 +32,6 @@ from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 from ...shade.radiance import direct, has_mirrors
-from ...trace.grid import Grid
 from ...trace.hit import Hit
 from ...trace.triangle import Corners, triangle_vertices
 from ...xla.devices import Spread, map_and_spread, map_over, on_every_device
@@ -47,7 +46,9 @@ _SAMPLING_ERROR = 0.25
 
 
 class Linearised(eqx.Module):
-    """A picture, and its derivative in the heights and normals at the vertices of its scene.
+    """A picture, and its derivative in the heights and normals at the vertices of its first heightfield.
+
+    These are numbered row by row; the number beyond the last one stands for those of other surfaces, whose slopes are 0.
 
     Attributes:
       image: shape (h, w, c). Pixels that are resampled have the mean of those samples: where a boundary crosses a pixel, few
@@ -70,7 +71,7 @@ class SampleRows(NamedTuple):
 
     Attributes:
       slopes: of each sample, (chunks, c, 3 or 12, samples): in the three heights, then, vertex by vertex, in the normals.
-      vertices: the numbers of those three vertices over all grids, (chunks, 3, samples).
+      vertices: the numbers of those three vertices, (chunks, 3, samples).
       view: in the numbers of the light and of the camera that are sought, see `moved`, (chunks, c, 2 or 6, samples).
       albedo: in the factors of the albedo that are sought; None where it is known.
     """
@@ -179,6 +180,8 @@ class _Seen(NamedTuple):
     def of(cls, scene: Scene, view: View, settings: Settings) -> "_Seen":
         lights, camera = moved(scene.lights, scene.camera, view)
         world, material = make_world(scene.with_lights(lights), settings), scene.objects[scene.first_heightfield].material
+        if view.camera is None:
+            world = _with_still_grids(world)
         return cls(_with_material(world, material, view), camera, (scene.lights, scene.camera, material), view)
 
     def moved(self, view: View) -> tuple[World, Camera]:
@@ -190,6 +193,14 @@ class _Seen(NamedTuple):
     def view_for(self, count: int) -> View:
         """The same numbers for each of so many samples, which come last."""
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*leaf.shape, count)), self.view)
+
+
+def _with_still_grids(world: World) -> World:
+    """The world, of whose grids all but the first stay where they are."""
+    surfaces = list(world.surfaces)
+    for k, grid, _ in world.grids[1:]:
+        surfaces[k] = dataclasses.replace(grid, still=True)
+    return dataclasses.replace(world, surfaces=tuple(surfaces))
 
 
 def _with_material(world: World, material: Material | Mirror, view: View) -> World:
@@ -262,16 +273,14 @@ def _samples(channels: int, factors: tuple[int, ...] | None, seen: _Seen, points
     """Radiance at points of the picture, (n, c), whether it changes with the sought heights, (n, 1), and its `SampleRows`;
     `factors` is the shape of those that are sought."""
     (x, y), world = points, seen.world
-    smooth = world.settings.shading == "smooth"
+    (number, sought, _), smooth = world.grids[0], world.settings.shading == "smooth"
 
     def one(x: jax.Array, y: jax.Array, perturbation: jax.Array, view: View) -> tuple[jax.Array, Any]:
         corners = Corners(perturbation[:3], perturbation[3:].reshape(3, 3) if smooth else None)
-        surfaces = tuple(
-            dataclasses.replace(surface, perturbation=corners) if isinstance(surface, Grid) else surface
-            for surface in world.surfaces
-        )
+        surfaces = list(world.surfaces)
+        surfaces[number] = dataclasses.replace(sought, perturbation=corners)
         there, eye = seen.moved(view)
-        light, _, hit = direct(dataclasses.replace(there, surfaces=surfaces), materialise(eye.ray(x, y)))
+        light, _, hit = direct(dataclasses.replace(there, surfaces=tuple(surfaces)), materialise(eye.ray(x, y)))
         albedo = None if factors is None else _texels(world, hit, lax.stop_gradient(light), channels, factors)
         return _channels(light, channels), (_vertices(world, hit), albedo)
 
@@ -285,7 +294,7 @@ def _samples(channels: int, factors: tuple[int, ...] | None, seen: _Seen, points
         slopes, view = jax.tree.map(lambda leaf: leaf[None], pull_back(each[0]))
     else:
         slopes, view = jax.vmap(pull_back)(each)
-    moving = (slopes != 0).any(axis=(0, 1)) & (vertices[0] < world.grids[0][1].rows.shape[0])
+    moving = (slopes != 0).any(axis=(0, 1))
     return (light, moving.astype(light.dtype)[:, None]), SampleRows(slopes, vertices, view, albedo)
 
 
@@ -307,12 +316,10 @@ def _texels(world: World, hit: Hit, light: jax.Array, channels: int, factors: tu
 
 
 def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
-    """The numbers of the vertices of the triangle that was hit, over all grids; any that there are where there is no hit."""
-    vertices, cell = jnp.zeros(3, jnp.int32), hit.cell
-    for number, grid, first in world.grids:
-        here = triangle_vertices(grid.shape[1], cell[0], cell[1], hit.triangle == 1)
-        vertices = jnp.where(hit.object == number, first + jnp.stack(here), vertices)
-    return vertices
+    """The numbers of the vertices of the triangle that was hit; one too large where that is not of the first heightfield."""
+    number, grid, _ = world.grids[0]
+    here = triangle_vertices(grid.shape[1], hit.cell[0], hit.cell[1], hit.triangle == 1)
+    return jnp.where(hit.object == number, jnp.stack(here), grid.rows.shape[0])
 
 
 def _boundary_samples(channels: int, seen: _Seen, drawn: Packed[tuple[BoundarySample, jax.Array]]):
@@ -329,4 +336,6 @@ def _boundary_samples(channels: int, seen: _Seen, drawn: Packed[tuple[BoundarySa
     count = flows.shape[1]
     _, pull_back = jax.vjp(positions, jnp.zeros((5, count), flows.dtype), seen.view_for(count))
     slopes, view = jax.vmap(pull_back)(flows)
-    return slopes, jax.vmap(functools.partial(deciding_vertices, seen.world), out_axes=1)(samples), view
+    vertices = jax.vmap(functools.partial(deciding_vertices, seen.world), out_axes=1)(samples)
+    beyond = seen.world.grids[0][1].rows.shape[0]
+    return jnp.where(vertices < beyond, slopes, 0), jnp.minimum(vertices, beyond), view

@@ -39,9 +39,10 @@ def picture_each(
         return vertex_values(make_world(on_every_device(group.complete(scene, heights, factors), mesh), settings))
 
     scenes = group.scenes
+    count = math.prod(heights.shape)
     if jax.tree.leaves(scenes.objects):  # each picture has vertices of its own
         each = lax.map(values, scenes)
-        first = jnp.arange(each.shape[0])[:, None, None, None] * each.shape[1]
+        first = jnp.arange(each.shape[0])[:, None, None, None] * count
         at_vertices = each.reshape(-1, each.shape[-1])
     else:
         at_vertices, first = values(jax.tree.map(lambda leaf: leaf[0], scenes)), jnp.int32(0)
@@ -50,7 +51,8 @@ def picture_each(
     of_samples = over_spread(mesh, _of_samples, (at_vertices, first, view, relative), known.samples)
     light = None
     if known.edges is not None:
-        heights = at_vertices[:, 0].at[known.edges.vertices + first].get(mode="promise_in_bounds")
+        places = jnp.minimum(known.edges.vertices, count - 1) + first
+        heights = at_vertices[:, 0].at[places].get(mode="promise_in_bounds")
         light = jnp.moveaxis(jnp.sum(known.edges.slopes * heights[:, :, None], axis=3), 2, -1)
 
     def one(
@@ -70,11 +72,10 @@ def picture_each(
 
 
 def vertex_values(world: World) -> Float[jax.Array, "vertices n"]:
-    """Heights and, with smooth shading, the normals' components, over all surfaces."""
-    grids = [grid for _, grid, _ in world.grids]
-    heights = jnp.concatenate([grid.rows for grid in grids])[:, None]
-    normals = [grid.normals for grid in grids if grid.normals is not None]
-    return jnp.concatenate([heights, jnp.concatenate(normals)], axis=1) if normals else heights
+    """Heights and, with smooth shading, the normals' components, of the first heightfield."""
+    _, grid, _ = world.grids[0]
+    heights = grid.rows[:, None]
+    return heights if grid.normals is None else jnp.concatenate([heights, grid.normals], axis=1)
 
 
 def _of_samples(
@@ -87,7 +88,9 @@ def _of_samples(
     """
     at_vertices, first, view, relative = shared
     n, chunks, channels, k, size = rows.slopes.shape
-    joined = rows.slopes.reshape(-1, channels, k, size), (rows.vertices + first).reshape(-1, 3, size)
+    of_one = at_vertices.shape[0] // (n if first.ndim else 1)
+    vertices = jnp.minimum(rows.vertices, of_one - 1) + first
+    joined = rows.slopes.reshape(-1, channels, k, size), vertices.reshape(-1, 3, size)
     found = _by_vertices(at_vertices, *joined).reshape(n, chunks, channels, size)
     if rows.albedo is not None and relative is not None:
         factors = relative.reshape(-1, relative.shape[-1]).at[rows.albedo.texels].get(mode="promise_in_bounds")

@@ -17,7 +17,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...preparation.world import make_world
 from ...rendering.samples import PictureSamples
-from ...scene.heightfield import Heightfield
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, on_host
@@ -157,34 +156,28 @@ def _slopes(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem
 def _vertices_by_heights(
     slopes: Float[np.ndarray, "9 vertices m"], scene: Scene, near: Bool[np.ndarray, "ny nx"] | None
 ) -> Sparse:
-    """The derivative of what stands at the vertices of all grids, number by number, in the first heightfield's heights.
+    """The derivative of what stands at the vertices, number by number, in the heights; that beyond the last stays.
 
     Args:
       slopes: `_slopes`.
-      scene: whose grids they are.
-      near: which vertices matter, of each grid of this size; None: all.
+      scene: whose first heightfield it is.
+      near: which vertices matter; None: all.
     """
-    # Of several pictures, where that differs from one to the other, heights have an axis for them.
-    shapes = [obj.shape.heights.shape[-2:] for obj in scene.objects if isinstance(obj.shape, Heightfield)]
-    shape = scene.heightfields[0].heights.shape
-    numbers, (ny, nx) = slopes.shape[2], shape
+    numbers, (ny, nx) = slopes.shape[2], scene.heightfields[0].heights.shape[-2:]
     chosen = np.arange(ny * nx) if near is None else np.flatnonzero(near)
     at = np.divmod(chosen, nx)
-    rows, columns, values, first = [], [], [], 0
-    for other in shapes:
-        if other == shape:  # of another size it has heights of its own
-            for k in range(_REACH**2):
-                # The nearest height of this phase.
-                row, column = (i + (phase - i + 1) % _REACH - 1 for i, phase in zip(at, divmod(k, _REACH), strict=True))
-                inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
-                here = slopes[k, first + chosen]
-                vertex, number = np.nonzero(np.where(inside[:, None], here, 0))
-                rows.append((first + chosen[vertex]) * numbers + number)
-                columns.append((row * nx + column)[vertex])
-                values.append(here[vertex, number])
-        first += other[0] * other[1]
+    rows, columns, values = [], [], []
+    for k in range(_REACH**2):
+        # The nearest height of this phase.
+        row, column = (i + (phase - i + 1) % _REACH - 1 for i, phase in zip(at, divmod(k, _REACH), strict=True))
+        inside = (row >= 0) & (row < ny) & (column >= 0) & (column < nx)
+        here = slopes[k, chosen]
+        vertex, number = np.nonzero(np.where(inside[:, None], here, 0))
+        rows.append(chosen[vertex] * numbers + number)
+        columns.append((row * nx + column)[vertex])
+        values.append(here[vertex, number])
     entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
-    return sp.csr_array(entries, shape=(first * numbers, ny * nx))
+    return sp.csr_array(entries, shape=((ny * nx + 1) * numbers, ny * nx))
 
 
 def _slots(samples: PictureSamples) -> Int[np.ndarray, "pixels each"]:
