@@ -15,6 +15,7 @@ from .io.terrain.meshes import save_mesh as save_mesh
 from .io.terrain.save import save_heights as save_heights
 from .io.terrain.terrain import Terrain as Terrain
 from .maps.hillshade import hillshade as hillshade
+from .maps.insolation import insolation as insolation
 from .maps.relief import color_relief as color_relief, relief as relief
 from .maps.ruggedness import ruggedness as ruggedness
 from .maps.skyview import horizon as horizon, sky_view as sky_view

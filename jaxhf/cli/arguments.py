@@ -94,6 +94,18 @@ def sun(text: str) -> tuple[float, float] | datetime.datetime:
     raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
 
 
+def moment(text: str) -> datetime.date:
+    """A date, or a `datetime` with its offset from UTC."""
+    with contextlib.suppress(ValueError):
+        return datetime.date.fromisoformat(text)
+    with contextlib.suppress(ValueError):
+        time = datetime.datetime.fromisoformat(text)
+        if time.tzinfo is not None:
+            return time
+    rule = "must be a date, as 2026-06-21, or a time with its offset from UTC, as 2026-06-21T07:00-05:00"
+    raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
+
+
 def names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(","))
 

@@ -4,13 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ..core.settings import Settings
-from ..maps.choices import ALGORITHMS, ENTRIES, RUGGEDNESS, VARIANTS, WEIGHTINGS
+from ..maps.choices import ALGORITHMS, ENTRIES, RUGGEDNESS, SUNLIGHT, VARIANTS, WEIGHTINGS
 from .arguments import (
     FINITE,
     POSITIVE,
     Option,
     choice,
     flag,
+    moment,
     names,
     number,
     option,
@@ -108,12 +109,20 @@ _COLOURS = {
 }
 
 
-def _sky(written: str, special: Option) -> dict[str, Sequence[Option]]:
-    azimuths = whole("--azimuths", "K", "directions, at even steps from north on [32]", least=1)
-    return {"": (_IN, _output(written), azimuths, special), "spacing": _STEPS, **_RASTER, **_MACHINE}
+_DEGREES = "DEGREES"
+_PLACE = (
+    number("--latitude", _DEGREES, "for times [that of the terrain's middle]"),
+    number("--longitude", _DEGREES, "for times [that of the terrain's middle]"),
+)
+
+
+def _sky(written: str, *special: Option, azimuths: int = 32) -> dict[str, Sequence[Option]]:
+    directions = whole("--azimuths", "K", f"directions, at even steps from north on [{azimuths}]", least=1)
+    return {"": (_IN, _output(written), directions, *special), "spacing": _STEPS, **_RASTER, **_MACHINE}
 
 
 _SHARE = "share of the sky's solid angle, or of its light on horizontal ground or on the slope [solid-angle]"
+_TIME = "2026-06-21 (midnight of mean solar time there), or a time with its offset from UTC, 2026-06-21T07:00-05:00"
 _OBSERVER = "x and y in the file's coordinates; may be said several times"
 _RADIUS = "of the sphere on which the terrain lies [it lies on a plane; for light over the Earth 7.44e6, as GDAL's 6/7]"
 _VIEWSHED = Command(
@@ -212,6 +221,27 @@ _MAPS = (
         module="sky",
         about="They are in degrees above the horizontal, at least 0: exact and without a search radius.",
     ),
+    Command(
+        "insolation",
+        "map the sunlight of a day, a month or a year",
+        examples=(
+            "dem.tif -o year.tif --begin 2026-01-01 --end 2027-01-01",
+            "dem.tif -o hours.tif --wanted hours --begin 2026-06-21 --end 2026-06-22",
+        ),
+        options=_sky(
+            "the map: .tif or .npy, kWh/m² of each vertex's own tilted surface, or hours",
+            option("--begin", type=moment, metavar="TIME", required=True, help=_TIME),
+            option("--end", type=moment, metavar="TIME", required=True, help="ten years later at most"),
+            choice(
+                "--wanted", SUNLIGHT, "all energy, its parts, or the hours in which the sun shines there [energy]", "energy"
+            ),
+            number("--turbidity", "T", "haze and vapour after Linke, 1 to 10; mountains 2, lowlands 3 to 5 [3]"),
+            *_PLACE,
+            azimuths=64,
+        ),
+        module="sky",
+        about="The sky is cloudless. Mountains cast their shadows and hide the sky, exact and without a search radius.",
+    ),
     _VIEWSHED,
 )
 
@@ -219,7 +249,6 @@ _MAPS = (
 
 PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel of `jaxhf view`
 MATERIALS = "matte", "lommel-seeliger", "lunar-lambert", "minnaert", "oren-nayar", "hapke"  # of `scene.material.SCATTERING`
-_DEGREES = "DEGREES"
 _PRESET = "1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]"
 _FROM = "where the camera stands, clockwise from north [110 left of the sun]"
 _SUN_FROM = "a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00"
@@ -250,8 +279,7 @@ _VIEW = Command(
             number("--altitude", _DEGREES, "of the sun, above the horizon [45]"),
             option("--sun-from", type=sun, metavar="AZ,ALT|TIME", help=_SUN_FROM),
             option("--sun-to", type=sun, metavar="AZ,ALT|TIME", help="and where it ends, or when"),
-            number("--latitude", _DEGREES, "for times [that of the terrain's middle]"),
-            number("--longitude", _DEGREES, "for times [that of the terrain's middle]"),
+            *_PLACE,
             number("--haze", "SHARE", "of light lost along the terrain [0.15]"),
         ),
         "terrain": (

@@ -1,7 +1,5 @@
 """How high the terrain stands round each of its points, and how much of the sky it leaves to see."""
 
-import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,25 +10,13 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
-from ..core.errors import ArgumentError, require_progress
+from ..core.errors import ArgumentError
 from ..core.rules import OneOf, Whole, require
-from ..preparation.horizon import (
-    HorizonView,
-    Summary,
-    assemble,
-    cell_directions,
-    even_azimuths,
-    over_horizon,
-    over_tiles,
-    tile_count,
-)
-from ..preparation.sky import sky_vector
-from ..scene.heightfield import Heightfield
+from ..preparation.crossings import even_azimuths
 from ..trace.normals import vertex_normals
-from ..xla.compilation import compiled, is_traced
-from ..xla.devices import chosen_mesh, on_every_device, takes_numbers
+from ..xla.devices import takes_numbers
 from .choices import WEIGHTINGS
-from .surface import with_spacing
+from .horizons import field_of, map_over_horizons
 
 
 @takes_numbers
@@ -65,7 +51,7 @@ def horizon(
     Raises:
       ValueError: an argument has a value that it cannot have.
     """
-    field = _field("horizon", terrain, dx, dy)
+    field = field_of("horizon", terrain, dx, dy)
     if np.ndim(azimuths) == 0:
         require("horizon", "azimuths", azimuths, Whole(1))
         azimuths = even_azimuths(int(azimuths))
@@ -74,7 +60,7 @@ def horizon(
         raise ArgumentError("horizon", "azimuths", f"must be a whole number or a list of finite numbers, they are {azimuths}")
     if not -90 <= lowest < 90:
         raise ArgumentError("horizon", "lowest", f"must be from -90 to below 90 degrees, it is {lowest}")
-    return _mapped(
+    return map_over_horizons(
         "horizon", "degrees", field, azimuths, -np.inf if lowest == -90 else np.tan(np.deg2rad(lowest)), progress, mesh
     )
 
@@ -108,77 +94,13 @@ def sky_view(
     Returns:
       Shape (ny, nx), nan where there is no height; differentiable in the heights.
     """
-    field = _field("sky_view", terrain, dx, dy)
+    field = field_of("sky_view", terrain, dx, dy)
     require("sky_view", "weighting", weighting, OneOf(WEIGHTINGS))
     require("sky_view", "azimuths", azimuths, Whole(1))
-    found = _mapped("sky_view", weighting, field, even_azimuths(int(azimuths)), 0.0, progress, mesh)
+    found = map_over_horizons("sky_view", weighting, field, even_azimuths(int(azimuths)), 0.0, progress, mesh)
     if weighting != "slope":
         return found
     normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
     normals = normals / lax.stop_gradient(jnp.max(jnp.abs(normals), -1, keepdims=True))  # whose squares are numbers
     received = jnp.sum(jnp.moveaxis(found, 0, -1) * normals, -1) / jnp.linalg.norm(normals, axis=-1)
     return jnp.maximum(received, 0)
-
-
-_PARTS = 64  # of a map that reports its progress
-_ROOM = 4  # heights and horizontal distances are divided by it, so that differences of heights stay numbers
-_SUMMARIES: dict[str, Summary] = {
-    "degrees": lambda slopes: jnp.rad2deg(jnp.arctan(slopes)),
-    "solid-angle": lambda slopes: jnp.mean(1 - slopes * lax.rsqrt(1 + slopes * slopes), 0),
-    "horizontal": lambda slopes: jnp.mean(1 / (1 + slopes * slopes), 0),
-    "slope": sky_vector,
-}
-
-
-def _mapped(
-    owner: str,
-    summary: str,
-    field: Heightfield,
-    azimuths: np.ndarray,
-    lowest: float,
-    progress: Callable[[int, int], None] | None,
-    mesh: Mesh | None,
-) -> jax.Array:
-    require_progress(owner, progress, is_traced())
-    dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh, field)
-    directions = _ROOM * cell_directions(azimuths, field.dx, field.dy, dtype)
-    heights, directions = on_every_device((field.heights, directions), mesh)
-    if progress is None:
-        return _over(summary, mesh, heights, directions, np.asarray(lowest, dtype))
-    count, parts = tile_count(heights.shape), []
-    size = mesh.size * math.ceil(count / mesh.size / _PARTS)
-    view = _view(heights, directions)
-    for first in range(0, count, size):
-        numbers = np.minimum(np.arange(first, first + size, dtype=np.int32), count - 1)
-        parts.append(jax.device_get(_over_tiles(summary, mesh, view, np.asarray(lowest, dtype), numbers)))
-        progress(heights.size * min(count, first + size) // count, heights.size)
-    found = assemble(np.concatenate(parts)[:count], heights.shape)
-    return jnp.asarray(np.where(np.isfinite(heights), found, np.asarray(np.nan, dtype)))
-
-
-@functools.partial(compiled, newer=True, static_argnames=("summary", "mesh"))
-def _over(summary: str, mesh: Mesh, heights: jax.Array, directions: jax.Array, lowest: jax.Array) -> jax.Array:
-    return over_horizon(_SUMMARIES[summary], mesh, _holed(heights), directions, lowest)
-
-
-@functools.partial(compiled, newer=True)
-def _view(heights: jax.Array, directions: jax.Array) -> HorizonView:
-    return HorizonView.of(_holed(heights), directions)
-
-
-@functools.partial(compiled, newer=True, static_argnames=("summary", "mesh"))
-def _over_tiles(summary: str, mesh: Mesh, view: HorizonView, lowest: jax.Array, numbers: jax.Array) -> jax.Array:
-    return over_tiles(_SUMMARIES[summary], mesh, view, lowest, numbers)[0]
-
-
-def _holed(heights: jax.Array) -> jax.Array:
-    return jnp.where(jnp.isfinite(heights), heights / _ROOM, jnp.nan)
-
-
-def _field(owner: str, terrain: Any, dx: float | None, dy: float | None) -> Heightfield:
-    if not isinstance(terrain, Heightfield):
-        return Heightfield(*with_spacing(owner, terrain, dx, dy))
-    for name, value in (("dx", dx), ("dy", dy)):
-        if value is not None:
-            raise ArgumentError(owner, name, "must stand without a Heightfield, which has its own cell size")
-    return terrain

@@ -9,121 +9,74 @@ leaves out stretches of the way over which nothing is high enough to raise the s
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
 from ..core.types import Index, Scalar
-from ..trace.edges import STEPS, present_edges, whole_cells
+from ..trace.edges import present_edges, whole_cells
 from ..xla.devices import map_over
+from .crossings import TOGETHER, Crossings, crossings_of
 
 # Found best on the CPU at 1024 x 1024 vertices; smaller tiles leave more out, and run slower.
 TILE = 32  # vertices along its side
-_STRETCH = 24  # cells, along the axis on which a direction moves faster; up to `_TOGETHER` crossings longer
-_TOGETHER = 8  # crossings in one pass over a tile
+_STRETCH = 24  # cells, along the axis on which a direction moves faster; up to `TOGETHER` crossings longer
 _GRAIN = 8  # cells from one of the windows whose highest points are kept to the next
 _MARGIN = TILE + 1
 _STEEPEST = 1e18  # of slopes: a right angle, whose square is a number in single precision
 
-# The kinds of edges, see `edges`; and a last one, for crossings at a vertex, which leads nowhere.
-_ALONG_X, _ALONG_Y, _DIAGONAL, _VERTEX = range(4)
-_TO_SECOND = np.array([*STEPS, (0, 0)], np.int32)
-
-# Slopes in all directions to what is wanted of them: arrays without an axis for the direction, or with one in front.
-Summary = Callable[[Float[jax.Array, "k *at"]], jax.Array]
+# Slopes in all directions, shape (k, *at), and what is given `Besides`, to what is wanted of them: arrays without an axis for
+# the direction, or with one in front.
+Summary = Callable[..., jax.Array]
 
 
-class _Crossings(eqx.Module):
-    """Crossings of one direction with the edges of a grid, from a vertex outwards; an entry each, those at a vertex once.
+class Besides(NamedTuple):
+    """What a summary takes besides the slopes.
 
     Attributes:
-      inverse: 1 / the horizontal distance, falling; 0 at entries without a crossing.
-      share: how far along the edge; nan at such entries.
-      kind: of the edge.
-      x, y, x2, y2: from the vertex to the first and to the second vertex of the edge, cells.
+      shared: by all vertices.
+      at_vertices: a number or more for each vertex, arrays of shape (..., ny, nx); a summary gets them at its own.
     """
 
-    inverse: Float[jax.Array, " n"]
-    share: Float[jax.Array, " n"]
-    kind: Int[jax.Array, " n"]
-    x: Int[jax.Array, " n"]
-    y: Int[jax.Array, " n"]
-    x2: Int[jax.Array, " n"]
-    y2: Int[jax.Array, " n"]
-
-
-def even_azimuths(count: int) -> Float[np.ndarray, " k"]:
-    """Degrees clockwise from north, from 0 on."""
-    return np.arange(count) * (360 / count)
-
-
-def cell_directions(azimuths: Float[np.ndarray, " k"], dx: float, dy: float, dtype: Any) -> Float[np.ndarray, "k 2"]:
-    """Cells in x and in y for each unit of horizontal distance; exact along lines of the grid and along diagonals."""
-    turns = np.deg2rad(azimuths % 360)
-    unit = np.stack([np.sin(turns), np.cos(turns)], -1)
-    unit[np.abs(unit) < 1e-12] = 0
-    x, y = (unit / (dx, dy)).T
-    return np.stack([x, np.where(np.abs(x - y) < 1e-12 * np.abs(x), x, y)], -1).astype(dtype)
-
-
-def _crossings(shape: tuple[int, int], direction: Float[jax.Array, "2"]) -> _Crossings:
-    (ny, nx), dx, dy, dtype = shape, direction[0], direction[1], direction.dtype
-    rounding = 8 * float(jnp.finfo(dtype).eps)
-
-    def of_lines(most: int, rate: Scalar, moving: Scalar, kind: int) -> tuple[jax.Array, ...]:
-        """Of lines that the direction passes at `rate`, while it moves along them at `moving`, and their numbers."""
-        line, size = jnp.arange(1, most + 1, dtype=jnp.int32), jnp.abs(rate)
-        at = line.astype(dtype) * (moving / jnp.where(size > 0, size, 1))
-        at_vertex = jnp.abs(at - jnp.round(at)) <= rounding * jnp.maximum(jnp.abs(at), 1)
-        first = jnp.where(at_vertex, jnp.round(at), jnp.floor(at))
-        share = jnp.where(size > 0, jnp.where(at_vertex, 0, at - first), jnp.nan)
-        kinds = jnp.where(at_vertex, _VERTEX, kind).astype(jnp.int32)
-        return size / line.astype(dtype), share, kinds, first.astype(jnp.int32), jnp.where(rate < 0, -line, line)
-
-    *columns, columns_y, columns_x = of_lines(nx - 1, dx, dy, _ALONG_Y)
-    *rows, rows_x, rows_y = of_lines(ny - 1, dy, dx, _ALONG_X)
-    *diagonals, diagonals_x, number = of_lines(nx + ny - 2, dx - dy, dx, _DIAGONAL)  # of x - y
-    families = (*columns, columns_x, columns_y), (*rows, rows_x, rows_y), (*diagonals, diagonals_x, diagonals_x - number)
-    entries = [jnp.concatenate(parts) for parts in zip(*families, strict=True)]
-    order = jnp.argsort(-entries[0])
-    inverse, share, kind, x, y = (values[order] for values in entries)
-    again = (kind[1:] == _VERTEX) & (kind[:-1] == _VERTEX) & (x[1:] == x[:-1]) & (y[1:] == y[:-1])
-    inverse = jnp.where(jnp.pad(again, (1, 0)), 0, inverse)
-    order, missing = jnp.argsort(-inverse), -inverse.size % _TOGETHER
-    inverse, share, kind, x, y = (jnp.pad(values[order], (0, missing)) for values in (inverse, share, kind, x, y))
-    share = jnp.where(inverse > 0, share, jnp.nan)
-    second = jnp.asarray(_TO_SECOND)[kind]
-    return _Crossings(inverse, share, kind, x, y, x + second[:, 0], y + second[:, 1])
+    shared: Any
+    at_vertices: Any
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def over_horizon(
-    summary: Summary, mesh: Mesh, z: Float[jax.Array, "ny nx"], directions: Float[jax.Array, "k 2"], lowest: Scalar
+    summary: Summary,
+    mesh: Mesh,
+    z: Float[jax.Array, "ny nx"],
+    directions: Float[jax.Array, "k 2"],
+    lowest: Scalar,
+    besides: Besides | None = None,
 ) -> jax.Array:
     """A summary of the slopes of the horizon at each vertex: of each direction, the largest that any point of the surface has.
 
     A slope is (height of the point - height of the vertex) / horizontal distance, with the surface as the renderer has it. It
-    has a derivative in the heights, that of the slope to the point that was found, none in the other arguments.
+    has a derivative in the heights, that of the slope to the point that was found; what is returned has one in `besides`, too,
+    none in the other arguments.
 
     Args:
-      summary: of the slopes, shape (k, ...), what is returned for places of shape (...); elementwise in these.
+      summary: of the slopes, shape (k, ...), and of `besides`, what is returned for places of shape (...); elementwise in
+        these.
       mesh: the devices among which tiles are dealt out.
       z: heights, nan in holes; a vertex that is a hole gives nan.
       directions: cells in x and in y for each unit of horizontal distance.
       lowest: the slope where nothing rises higher; may be -inf.
+      besides: what else the summary takes; None: nothing.
     """
-    return _searched(summary, mesh, z, directions, lowest, False)[0]
+    return _searched(summary, mesh, z, directions, lowest, False, besides)[0]
 
 
 @over_horizon.defjvp
 def _over_horizon_jvp(summary: Summary, mesh: Mesh, primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]):
-    z, directions, lowest = lax.stop_gradient(primals)
+    z, directions, lowest, besides = lax.stop_gradient(primals)
     slopes, found = _searched(lambda slopes: slopes, mesh, z, directions, lowest, True)
     ny, nx = z.shape
     iy, ix = (at.astype(jnp.int32) for at in jnp.indices(z.shape))
@@ -131,20 +84,31 @@ def _over_horizon_jvp(summary: Summary, mesh: Mesh, primals: tuple[jax.Array, ..
     def change(of_one: tuple[jax.Array, jax.Array]) -> jax.Array:
         """Of the slopes in one direction."""
         direction, found = of_one
-        on = jax.tree.map(lambda values: values[jnp.maximum(found, 0)], _crossings((ny, nx), direction))
+        on = jax.tree.map(lambda values: values[jnp.maximum(found, 0)], crossings_of((ny, nx), direction))
         low, high = tangents[0][iy + on.y, ix + on.x], tangents[0][iy + on.y2, ix + on.x2]
         raised = ((low - tangents[0]) + on.share * (high - low)) * on.inverse
         return jnp.where(found >= 0, raised, 0)
 
-    return jax.jvp(summary, (slopes,), (lax.map(change, (directions, found)),))
+    changes = lax.map(change, (directions, found)), tangents[3]
+    return jax.jvp(functools.partial(_summarised, summary), (slopes, besides), changes)
+
+
+def _summarised(summary: Summary, slopes: Float[jax.Array, "k *at"], besides: Besides | None) -> jax.Array:
+    return summary(slopes) if besides is None else summary(slopes, *besides)
 
 
 def _searched(
-    summary: Summary, mesh: Mesh, z: jax.Array, directions: jax.Array, lowest: Scalar, numbered: bool
+    summary: Summary,
+    mesh: Mesh,
+    z: jax.Array,
+    directions: jax.Array,
+    lowest: Scalar,
+    numbered: bool,
+    besides: Besides | None = None,
 ) -> tuple[jax.Array, Int[jax.Array, "k ny nx"] | None]:
-    """The summary, and if they are to be numbered, the entries of `_crossings` that were found; -1 for none."""
+    """The summary, and if they are to be numbered, the entries of `crossings_of` that were found; -1 for none."""
     view = HorizonView.of(z, directions)
-    tiles = over_tiles(summary, mesh, view, lowest, jnp.arange(tile_count(z.shape), dtype=jnp.int32), numbered)
+    tiles = over_tiles(summary, mesh, view, lowest, jnp.arange(tile_count(z.shape), dtype=jnp.int32), numbered, besides)
     result, found = jax.tree.map(lambda values: assemble(values, z.shape), tiles)
     return jnp.where(jnp.broadcast_to(jnp.isnan(z), result.shape), jnp.nan, result), found
 
@@ -161,18 +125,29 @@ def over_tiles(
     lowest: Scalar,
     numbers: Int[Any, " tiles"],
     numbered: bool = False,
+    besides: Besides | None = None,
 ) -> tuple[jax.Array, jax.Array | None]:
     """As `over_horizon`, for some of the tiles, without a derivative; also in holes. Besides, the entries that were found."""
     columns = math.ceil((view.heights.shape[1] - 2 * _MARGIN - TILE) / TILE)
 
-    def one_tile(shared: tuple["HorizonView", Scalar], number: Index) -> tuple[jax.Array, jax.Array | None]:
-        view, lowest = shared
+    def one_tile(shared: tuple["HorizonView", Scalar, Besides | None], number: Index) -> tuple[jax.Array, jax.Array | None]:
+        view, lowest, besides = shared
         x, y = (number % columns) * TILE, (number // columns) * TILE
         ways = jnp.arange(view.end.shape[0], dtype=jnp.int32)
         slopes, found = lax.map(lambda way: _from_tile(view, way, x, y, lowest, numbered), ways)
-        return summary(slopes), found
+        if besides is not None:
+            besides = besides._replace(at_vertices=jax.tree.map(lambda values: _tile_of(values, x, y), besides.at_vertices))
+        return _summarised(summary, slopes, besides), found
 
-    return map_over(mesh, one_tile, (view, lowest), numbers)
+    return map_over(mesh, one_tile, (view, lowest, besides), numbers)
+
+
+def _tile_of(values: Float[jax.Array, "*rest ny nx"], x: Index, y: Index) -> Float[jax.Array, "*rest tile tile"]:
+    """Those of the tile that begins at (x, y); beyond the grid those of its border."""
+    rows, columns = (
+        jnp.minimum(at + jnp.arange(TILE, dtype=jnp.int32), n - 1) for at, n in zip((y, x), values.shape[-2:], strict=True)
+    )
+    return values[..., rows[:, None], columns[None, :]]
 
 
 def assemble(tiles: Any, shape: tuple[int, ...]) -> Any:
@@ -203,7 +178,7 @@ class HorizonView(eqx.Module):
     edges: Float[jax.Array, "4 rows columns"]
     windows: Float[jax.Array, "window_rows window_columns"]
     holed: Bool[jax.Array, "window_rows window_columns"]
-    crossings: Any  # a `_Crossings` with a leading axis
+    crossings: Any  # a `Crossings` with a leading axis
     bounds: Float[jax.Array, "k bounds"]
     begins: Int[jax.Array, "k bounds"]
     end: Float[jax.Array, " k"]
@@ -215,15 +190,15 @@ class HorizonView(eqx.Module):
         count = math.ceil((max(nx, ny) - 1) / _STRETCH)
         margin = ((_MARGIN, _MARGIN + TILE), (_MARGIN, _MARGIN + TILE))
 
-        def along(direction: jax.Array) -> tuple[_Crossings, jax.Array, jax.Array, jax.Array, jax.Array]:
-            crossings, size = _crossings((ny, nx), direction), jnp.abs(direction)
+        def along(direction: jax.Array) -> tuple[Crossings, jax.Array, jax.Array, jax.Array, jax.Array]:
+            crossings, size = crossings_of((ny, nx), direction), jnp.abs(direction)
             even = jnp.arange(count, dtype=dtype) * (_STRETCH / jnp.max(size))
             end = jnp.min(jnp.array([nx - 1, ny - 1], dtype) / jnp.maximum(size, jnp.finfo(dtype).tiny))
             beyond = jnp.searchsorted(-crossings.inverse, -1 / even, side="right").astype(jnp.int32)
             last = jnp.sum(crossings.inverse * end > 0.999, dtype=jnp.int32)
-            groups = (last + _TOGETHER - 1) // _TOGETHER
-            begins = jnp.append(jnp.where(beyond < last, beyond // _TOGETHER, groups), groups)
-            first = jnp.minimum(begins * _TOGETHER, crossings.inverse.size - 1)
+            groups = (last + TOGETHER - 1) // TOGETHER
+            begins = jnp.append(jnp.where(beyond < last, beyond // TOGETHER, groups), groups)
+            first = jnp.minimum(begins * TOGETHER, crossings.inverse.size - 1)
             bounds = jnp.minimum(1 / crossings.inverse[first], end)
             ends = jnp.outer(bounds, direction)
             # One cell less: a hole beside an edge takes a cell from it.
@@ -268,8 +243,8 @@ def _from_tile(
 
     def look(holed: bool, group: Index, carry: tuple[jax.Array, jax.Array | None]) -> tuple[jax.Array, jax.Array | None]:
         slopes, found = carry
-        for k in range(_TOGETHER):
-            n = group * _TOGETHER + k
+        for k in range(TOGETHER):
+            n = group * TOGETHER + k
             at = way, n
             # Else from one array in place of five, whose memory pages are more than the processor keeps at hand.
             from_x, from_y = crossings.x[at], crossings.y[at]
@@ -310,7 +285,7 @@ def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
 
 def _reach() -> int:
     """Windows side by side that a tile moves over within a stretch, wherever between their beginnings it begins."""
-    return math.ceil((TILE + _STRETCH + _TOGETHER + 4) / _GRAIN) + 1
+    return math.ceil((TILE + _STRETCH + TOGETHER + 4) / _GRAIN) + 1
 
 
 def _windows(values: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "window_rows window_columns"]:

@@ -15,7 +15,8 @@ from ..trace.grid import Grid
 from ..trace.hit import hit_of_closed_form
 from ..trace.skyline import skyline_slope
 from ..xla.devices import local_mesh
-from .horizon import cell_directions, even_azimuths, over_horizon
+from .crossings import cell_directions, even_azimuths
+from .horizon import over_horizon
 
 
 def sky_vector(slopes: Float[jax.Array, "k *at"]) -> Float[jax.Array, "3 *at"]:

@@ -34,7 +34,7 @@ def sun(time: Any, latitude: Any, longitude: Any, *, refraction: bool = False) -
     Raises:
       ValueError: a `datetime` has no time zone, or the place is not on the globe.
     """
-    days = _days("sun", time)
+    days = (utc("sun", "time", time) - _J2000) / np.timedelta64(1, "D")
     latitude, longitude = np.asarray(latitude, np.float64), np.asarray(longitude, np.float64)
     for name, value, most in (("latitude", latitude, 90), ("longitude", longitude, 360)):
         require("sun", name, value, NUMBERS)
@@ -54,18 +54,18 @@ def sun(time: Any, latitude: Any, longitude: Any, *, refraction: bool = False) -
     return (float(azimuth), float(altitude)) if whole else (azimuth, altitude)
 
 
-def _days(owner: str, time: Any) -> Any:
-    """Since noon of 1 January 2000, UTC."""
+def utc(owner: str, name: str, time: Any) -> Any:
+    """A `datetime` with its zone, or datetime64s, as datetime64 in UTC; else an ArgumentError of the `owner`'s argument."""
     if isinstance(time, datetime.datetime):
         if time.tzinfo is None:
-            raise ArgumentError(owner, "time", f"must have a time zone, as 2026-06-21T12:00:00Z has, it is {time.isoformat()}")
+            raise ArgumentError(owner, name, f"must have a time zone, as 2026-06-21T12:00:00Z has, it is {time.isoformat()}")
         time = np.datetime64(time.astimezone(datetime.UTC).replace(tzinfo=None), "us")
     instants = np.asarray(time)
     if instants.dtype.kind != "M":
-        raise ArgumentError(owner, "time", f"must be a datetime or datetime64, it is {type(time).__name__}")
+        raise ArgumentError(owner, name, f"must be a datetime or datetime64, it is {type(time).__name__}")
     if np.isnat(instants).any():
-        raise ArgumentError(owner, "time", "must be a time, it is NaT")
-    return (instants.astype("datetime64[us]") - _J2000) / np.timedelta64(1, "D")
+        raise ArgumentError(owner, name, "must be a time, it is NaT")
+    return instants.astype("datetime64[us]")
 
 
 def _equatorial(days: Any) -> tuple[Any, Any, Any, Any]:

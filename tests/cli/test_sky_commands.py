@@ -1,4 +1,4 @@
-"""`jaxhf skyview` and `jaxhf horizon`: the values of the functions of those names, where the terrain lies."""
+"""`jaxhf skyview`, `horizon`, `insolation`, `viewshed`: the values of the functions of those names, where the terrain lies."""
 
 import errno
 import sys
@@ -97,6 +97,48 @@ def test_a_full_disk_leaves_none_of_several_maps(run, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["terrain.npz"]
     assert run("horizon", "out.tif", "--azimuths", "4")[0] == 0
     assert sorted(path.name for path in tmp_path.glob("out*")) == [f"out_{turn}.tif" for turn in ("000", "090", "180", "270")]
+
+
+def test_insolation(run, tmp_path):
+    """Of a day from midnight to midnight of mean solar time, 48 minutes before Greenwich's; and between two times."""
+    begin, place = np.datetime64("2026-06-20T23:12"), (47.0, 12.0)
+    options = {"azimuths": 8, "dx": 2.0, "dy": 3.0, "progress": lambda done, total: None}
+    found = jaxhf.insolation(Z, begin, begin + np.timedelta64(1, "D"), place, **options)
+    where = "--latitude", "47", "--longitude", "12", "--azimuths", "8"
+    code, said = run("insolation", "day.npy", "--begin", "2026-06-21", "--end", "2026-06-22", *where)
+    assert code == 0, said
+    assert f": energy {np.nanmin(found):.4g} .. {np.nanmax(found):.4g} kWh/m², 8 azimuths, " in said
+    np.testing.assert_array_equal(np.load(tmp_path / "day.npy"), found)
+    times = "--begin", "2026-06-21T11:00+02:00", "--end", "2026-06-21T10:00Z"
+    code, said = run("insolation", "hour.npy", *times, "--wanted", "hours", *where)
+    assert code == 0, said
+    hour = np.datetime64("2026-06-21T09:00"), np.datetime64("2026-06-21T10:00")
+    found = jaxhf.insolation(Z, *hour, place, wanted="hours", **options)
+    np.testing.assert_array_equal(np.load(tmp_path / "hour.npy"), found)
+    assert 0 < np.nanmax(found) < 1.001
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (("--begin", "2026-06-21", "--end", "2026-06-22"), "insolation: times need --latitude and --longitude for "),
+        (
+            ("--begin", "2026-06-21T10:00", "--end", "2026-06-22"),
+            "--begin must be a date, as 2026-06-21, or a time with its offset",
+        ),
+        (("--begin", "2026-06-22", "--end", "2026-06-21", "--latitude", "4", "--longitude", "4"), "end must come after begin"),
+        (("--begin", "2026-06-21", "--end", "2026-06-22", "--latitude", "4"), "insolation: --latitude and --longitude belong"),
+        (
+            ("--begin", "2026-06-21", "--end", "2026-06-22", "--wanted", "hours", "--turbidity", "2"),
+            "--turbidity would change nothing: hours of sun are the same in any air",
+        ),
+        (("--begin", "2026-06-21"), "required: --end"),
+    ],
+)
+def test_wrong_times_are_refused(run, options, expected):
+    code, said = run("insolation", "sun.npy", *options)
+    assert code == 2
+    assert expected in " ".join(said.split())
 
 
 def test_viewshed(run, tmp_path):

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ...core.errors import UserError
+from ...core.errors import ArgumentError, UserError
 from ...io.errors import FileError
 from ...io.terrain.load import read_terrain
 from ...io.terrain.rasters import require_writable_raster, save_raster
@@ -84,3 +84,17 @@ def read_in_metres(options: argparse.Namespace) -> tuple[Terrain, Terrain]:
         return stored, stored.in_metres(**arguments.given(options, "dx", "dy"))
     except FileError as error:
         raise FileError(f"{options.terrain}: {error}") from error
+
+
+def place_of(name: str, options: argparse.Namespace, terrain: Terrain) -> tuple[float, float]:
+    """The latitude and longitude that a command was given, or those of the terrain's middle, degrees."""
+    place = options.latitude, options.longitude
+    if place == (None, None):
+        try:
+            return terrain.place
+        except ArgumentError as error:
+            why = error.rule.rpartition(", ")[2]
+            raise UserError(f"{name}: times need --latitude and --longitude for {options.terrain}: {why}") from error
+    if None in place:
+        raise UserError(f"{name}: --latitude and --longitude belong together, one is missing")
+    return place

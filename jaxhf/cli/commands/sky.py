@@ -1,6 +1,7 @@
-"""`jaxhf skyview` and `jaxhf horizon`: how much of the sky the terrain leaves to see, and how high it stands."""
+"""`jaxhf skyview`, `horizon` and `insolation`: how much of the sky and of the sun the terrain leaves to see."""
 
 import argparse
+import datetime
 import time
 from pathlib import Path
 
@@ -10,21 +11,24 @@ from ...core.errors import counted
 from ...io.files import replacing_all, write_npy
 from ...io.terrain.rasters import geotiff, require_writable_raster, save_raster
 from ...io.terrain.terrain import Terrain
+from ...maps.insolation import insolation
 from ...maps.skyview import horizon, sky_view
-from ...preparation.horizon import even_azimuths
+from ...preparation.crossings import even_azimuths
 from .. import arguments, limits
 from ..progress import compiled_bar
-from .maps import read_in_metres, require_numbers
+from .maps import place_of, read_in_metres, require_numbers
 
 
 def run(options: argparse.Namespace) -> None:
-    make = {"skyview": _skyview, "horizon": _horizon}[options.command.name]
-    if make is _horizon:
-        require_numbers(options.output, "angles")
-        if options.azimuth is not None:
-            arguments.refuse(options, "azimuths", because="--azimuth asks for one")
+    make = {"skyview": _skyview, "horizon": _horizon, "insolation": _insolation}[options.command.name]
+    if make is not _skyview:
+        require_numbers(options.output, "angles" if make is _horizon else options.wanted)
+    if make is _horizon and options.azimuth is not None:
+        arguments.refuse(options, "azimuths", because="--azimuth asks for one")
+    if make is _insolation and options.wanted == "hours":
+        arguments.refuse(options, "turbidity", because="hours of sun are the same in any air")
     path = require_writable_raster(options.output)
-    options.azimuths = 32 if options.azimuths is None else options.azimuths
+    options.azimuths = options.azimuths or (64 if make is _insolation else 32)
     stored, terrain = read_in_metres(options)
     limits.set_up_jax(options)
     begin = time.perf_counter()
@@ -65,6 +69,25 @@ def _horizon(options: argparse.Namespace, path: Path, stored: Terrain, terrain: 
         if maps:
             write_npy(temporaries[0], maps[0] if one else np.stack(maps))
     return f"horizon angles up to {highest:.2f} degrees", len(azimuths)
+
+
+def _insolation(options: argparse.Namespace, path: Path, stored: Terrain, terrain: Terrain) -> tuple[str, int]:
+    """The same for the energy that arrives, or the hours of sun."""
+    latitude, longitude = place_of("insolation", options, stored)
+    begin, end = (_instant(time, longitude) for time in (options.begin, options.end))
+    chosen = arguments.given(options, "wanted", "turbidity", "azimuths")
+    with compiled_bar(unit=" heights", unit_scale=True) as advance:
+        values = np.asarray(insolation(terrain, begin, end, (latitude, longitude), **chosen, progress=advance))
+    save_raster(path, values, stored, nodata=np.nan)
+    unit, kind = ("hours", "sun") if options.wanted == "hours" else ("kWh/m²", options.wanted)
+    return f"{kind} {np.nanmin(values):.4g} .. {np.nanmax(values):.4g} {unit}", options.azimuths
+
+
+def _instant(time: datetime.date, longitude: float) -> np.datetime64:
+    """In UTC; a date begins at midnight of the place's mean solar time."""
+    if isinstance(time, datetime.datetime):
+        return np.datetime64(time.astimezone(datetime.UTC).replace(tzinfo=None), "us")
+    return np.datetime64(time, "us") - np.timedelta64(round(longitude * 240e6), "us")
 
 
 def _of(path: Path, azimuth: float) -> Path:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.errors import ArgumentError, UserError
+from ...core.errors import UserError
 from ...io.pictures.films import FILMS, require_writable_film, writing_film
 from ...io.pictures.images import PICTURES, linear_from_srgb, require_writable, save_image, srgb_from_linear
 from ...io.terrain.drape import load_drape
@@ -28,6 +28,7 @@ from ..block import Look, block, exaggeration, lights, photograph, with_water
 from ..catalogue import PRESETS
 from ..overwriting import require_no_input
 from ..progress import bar
+from .maps import place_of
 
 _TALLEST = 100  # times its length: beyond, a terrain is a needle that no pixel shows
 
@@ -42,14 +43,7 @@ def _sun_path(options: argparse.Namespace, terrain: Terrain) -> np.ndarray | Non
         if place != (None, None):
             raise UserError("view: --latitude and --longitude stand with times, as in --sun-from 2026-06-21T06:00:00Z")
         return None if first is None else np.linspace(first, last, options.frames)
-    if place == (None, None):
-        try:
-            place = terrain.place
-        except ArgumentError as error:
-            why = error.rule.rpartition(", ")[2]
-            raise UserError(f"view: times need --latitude and --longitude for {options.terrain}: {why}") from error
-    elif None in place:
-        raise UserError("view: --latitude and --longitude belong together, one is missing")
+    place = place_of("view", options, terrain)
     start, end = (np.datetime64(t.astimezone(datetime.UTC).replace(tzinfo=None), "us") for t in (first, last))
     instants = start + (end - start) * np.arange(options.frames) // (options.frames - 1)
     azimuth, altitude = sun(instants, *place)
