@@ -135,6 +135,11 @@ def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None and value is not False}
 
 
+def reading(options: argparse.Namespace) -> dict[str, Any]:
+    """What `load_heights` takes of a terrain's options."""
+    return {name: getattr(options, name) for name in ("z_scale", "nodata", "band", "bbox")}
+
+
 def refuse(options: argparse.Namespace, *names: str, because: str) -> None:
     """UserError where one of these options was given that would change nothing."""
     for name in given(options, *names):

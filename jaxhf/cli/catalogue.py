@@ -52,7 +52,16 @@ _TERRAIN = ".tif and others that GDAL reads, .npz, .npy, .asc, .hgt, .png (grey)
 _IN = option("terrain", metavar="IN", help=f"heights: {_TERRAIN}")
 _SCENE = option("scene", metavar="SCENE", help="a .toml or .pbrt scene")
 _NODATA = number("--nodata", "V", "a stored value that means no height [as the file says]")
-_RASTER = {"heights as they are stored": (number("--z-scale", "S", "heights are multiplied by it [1]", default=1.0), _NODATA)}
+_BBOX = "only heights within, in the file's coordinates [all]"
+_PART = (
+    whole("--band", "N", "of a raster, the band of heights, from 1 [its only one]", least=1),
+    option("--bbox", nargs=4, type=real_number, metavar=("WEST", "SOUTH", "EAST", "NORTH"), help=_BBOX),
+)
+_RASTER = {
+    "heights as they are stored": (
+        number("--z-scale", "S", "heights are multiplied by it [1]", default=1.0), _NODATA, *_PART
+    )
+}  # fmt: skip
 _MACHINE = {
     "machine": (
         whole("--devices", "N", "cores that share the work, each with a copy [all, at most 16, fewer for a small picture]"),
@@ -74,7 +83,7 @@ def _output(help: str) -> Option:
 
 
 def _files(written: str, *more: Option) -> dict[str, Sequence[Option]]:
-    return {"": (_IN, _output(f"the map: {written}"), _NODATA, *more)}
+    return {"": (_IN, _output(f"the map: {written}"), _NODATA, *_PART, *more)}
 
 
 _BYTES = ".tif (8 bits, keeps its place), .png (and a world file) or .npy"

@@ -51,6 +51,63 @@ def test_rasters_may_start_in_any_corner(tmp_path, dx, dy):
             assert terrain.heights[iy, ix] == next(dataset.sample([(x, y)]))[0]
 
 
+@pytest.mark.parametrize("dx", [30, -30])
+@pytest.mark.parametrize("dy", [20, -20])
+def test_a_part_of_a_band(tmp_path, dx, dy):
+    """As of all of it, from whatever corner it starts; also of arrays that lie elsewhere than in their file."""
+    rng = np.random.default_rng(0)
+    bands = rng.uniform(size=(2, 9, 7)).astype(np.float32)
+    with rasterio.open(write(tmp_path / "x.tif", bands, (dx, 0, 5e5, 0, dy, 4e6)), "r+") as dataset:
+        dataset.write_mask(bands[0] < 0.9)
+    whole = load_heights(tmp_path / "x.tif", band=2)
+    (ny, nx), (west, south) = whole.heights.shape, (whole.x0, whole.y0)
+    assert np.isnan(whole.heights).sum() == (bands[0] >= 0.9).sum()
+    box = west + 30, south + 20, west + 4 * 30 + 29, south + 5 * 20
+    part = load_heights(tmp_path / "x.tif", band=2, bbox=box)
+    np.testing.assert_array_equal(part.heights, whole.heights[1:6, 1:5])
+    assert (part.x0, part.y0, part.dx, part.dy) == (west + 30, south + 20, 30, 20)
+    all_of_it = load_heights(tmp_path / "x.tif", band=2, bbox=(-1e9, -1e9, 1e9, 1e9))
+    np.testing.assert_array_equal(all_of_it.heights, whole.heights)
+    np.testing.assert_array_equal(whole.within(box).heights, part.heights)
+    save_heights(tmp_path / "y.npz", whole)
+    other = load_heights(tmp_path / "y.npz", bbox=box)
+    np.testing.assert_array_equal(other.heights, part.heights)
+    assert other.in_file == part.in_file
+    assert (ny, nx) == (9, 7)
+
+
+def test_a_part_of_a_terrain_in_degrees(tmp_path):
+    """Its box is in degrees, and so it lies where it did."""
+    path = write(tmp_path / "d.tif", VALUES, (0.1, 0, 7.0, 0, -0.1, 46.0), crs="EPSG:4326")
+    part = load_heights(path, bbox=(7.1, 45.7, 7.3, 45.9))
+    np.testing.assert_array_equal(part.heights, VALUES[::-1][:2, 1:3])
+    np.testing.assert_allclose(part.in_file, (0.1, 0.1, 7.15, 45.75))
+    np.testing.assert_allclose(part.place, (45.8, 7.2))
+
+
+@pytest.mark.parametrize(
+    ("options", "rule"),
+    [
+        ({"band": 3}, "it has no band 3, it has 1"),
+        ({"band": 0}, "band must be a whole number from 1 on, it is 0"),
+        ({"bbox": (0, 0, 1)}, "bbox must be west, south, east and north"),
+        ({"bbox": (5e5, 4e6, 5e5, 5e6)}, "bbox must be west, south, east and north, finite and in this order"),
+        (
+            {"bbox": (5e5, 4e6 - 60, 5e5 + 30, 4e6)},
+            "must be heights, 2 x 2 at least; they stand at x from 500015 to 500105",
+        ),
+    ],
+)
+def test_wrong_parts_are_refused(tmp_path, utm, options, rule):
+    assert utm.heights.shape == (3, 4)
+    with pytest.raises(ValueError, match=rule):
+        load_heights(tmp_path / "utm.tif", **options)
+    np.save(tmp_path / "z.npy", VALUES)
+    if options == {"band": 3}:
+        with pytest.raises(ValueError, match="it has no bands, band must be left out; it is 3"):
+            load_heights(tmp_path / "z.npy", **options)
+
+
 @pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
 def test_masks_are_holes_and_ground_control_points_are_refused(tmp_path, capfd):
     with rasterio.open(write(tmp_path / "m.tif", VALUES), "r+") as dataset:

@@ -9,6 +9,7 @@ from ...core.errors import UserError
 from ...io.terrain.load import load_heights
 from ...io.terrain.meshes import MESHES, require_writable_mesh, save_mesh
 from ...io.terrain.save import HEIGHTS, require_writable_heights, save_heights
+from .. import arguments
 from ..describe import heightfield_line
 
 
@@ -24,7 +25,7 @@ def run(options: argparse.Namespace) -> None:
     with warnings.catch_warnings():
         if not in_metres:
             warnings.filterwarnings("ignore", "degrees from latitude")
-        terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+        terrain = load_heights(options.terrain, **arguments.reading(options))
     if in_metres:
         save_mesh(options.output, terrain, base=options.base)
     else:

@@ -81,7 +81,7 @@ def _output(options: argparse.Namespace) -> tuple[Path, bool]:
 def run(options: argparse.Namespace) -> None:
     output, film = _output(options)
     begin = time.perf_counter()
-    terrain = load_heights(options.terrain, z_scale=options.z_scale, nodata=options.nodata)
+    terrain = load_heights(options.terrain, **arguments.reading(options))
     if terrain.nodata.all():
         raise UserError(f"view: {options.terrain} holds no height")
     options.frames = options.frames or 72

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...core.extras import import_extra
+from ...core.rules import Whole, require
 from ..errors import FileError
 from ..files import PathLike, by_ending, read_npy, reading, require_file
 from ..gdal import DRIVERS
@@ -23,7 +24,7 @@ from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, 
 from .grids import read_asc, read_hgt, read_mujoco
 from .rasters import read_raster
 from .sidecars import by_world_file
-from .terrain import Nodata, Terrain, heights_of
+from .terrain import Box, Nodata, Terrain, heights_of
 
 
 def load_heights(
@@ -35,6 +36,8 @@ def load_heights(
     y0: float | None = None,
     z_scale: float = 1.0,
     nodata: float | None = None,
+    band: int | None = None,
+    bbox: Box | None = None,
 ) -> Terrain:
     """Reads heights from a file.
 
@@ -46,7 +49,7 @@ def load_heights(
     - .asc (ESRI ASCII grid, its reference system in a .prj beside it), .hgt (a tile of SRTM, placed by its name).
     - .hfield, .bin (MuJoCo's binary height field): row 0 in the south, spacing 1; a height is the stored number.
     - .tif, .tiff and other rasters that GDAL reads (.img, .dt2, .bil, .flt, .dem, .grd, .jp2, .nc, .vrt, .xyz; needs rasterio):
-      one band of numbers, placed by its geotransform. A height stands at its pixel's centre: half a pixel inside the
+      a band of numbers, placed by its geotransform. A height stands at its pixel's centre: half a pixel inside the
       raster's corner. The file's scale and offset are applied.
 
     Degrees become metres at the mean latitude, with vertex (0, 0) at the origin: on the ellipsoid that the file's
@@ -57,19 +60,29 @@ def load_heights(
       dx, dy, x0, y0: overrule what the file says.
       z_scale: heights are multiplied by it.
       nodata: a stored value, before any scale, that means that there is no height; overrules the file.
+      band: of a raster, which one, from 1; None: it has but one.
+      bbox: west, south, east and north in the coordinates of the file, which may be degrees: only the heights that stand within
+        are taken, of a raster only these are read. None: all.
 
     Raises:
       FileNotFoundError: no file is there.
       ValueError: the ending is not known, the file is not a whole grid of heights, or its degrees are on a globe of unknown
         size and dx or dy is not given.
     """
-    terrain = read_terrain(path, z_scale, nodata)
+    terrain = read_terrain(path, z_scale, nodata, band=band, bbox=bbox)
     given = {"dx": dx, "dy": dy, "x0": x0, "y0": y0}
     with reading(Path(path)):
         return terrain.in_metres(**{name: value for name, value in given.items() if value is not None})
 
 
-def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = None, nodata_overrules: bool = True) -> Terrain:
+def read_terrain(
+    path: PathLike,
+    z_scale: float = 1.0,
+    nodata: float | None = None,
+    nodata_overrules: bool = True,
+    band: int | None = None,
+    bbox: Box | None = None,
+) -> Terrain:
     """As `load_heights`, but in the file's own coordinates, which may be degrees.
 
     Without `nodata_overrules`, `nodata` counts only where the file names no such value.
@@ -83,7 +96,15 @@ def read_terrain(path: PathLike, z_scale: float = 1.0, nodata: float | None = No
     with reading(path):
         if not math.isfinite(z_scale) or z_scale == 0:
             raise FileError(f"z_scale must be finite and not zero, it is {z_scale}")
-        terrain = stored = reader(path, chosen)
+        if band is not None:
+            require("load_heights", "band", band, Whole(1))
+        if reader is read_raster:
+            terrain = read_raster(path, chosen, band, bbox)
+        elif band is not None:
+            raise FileError(f"it has no bands, band must be left out; it is {band}")
+        else:
+            terrain = reader(path, chosen).within(bbox)
+        stored = terrain
         if z_scale != 1:
             with np.errstate(over="ignore", invalid="ignore"):
                 scaled = terrain.heights * terrain.heights.dtype.type(z_scale)

@@ -17,25 +17,36 @@ from ..gdal import opened
 from ..pictures.codecs import write_png
 from .georeference import Georeference, coordinate_system
 from .sidecars import beside
-from .terrain import Nodata, Terrain, heights_of
+from .terrain import Box, Nodata, Terrain, heights_of, places_within
 
 
-def read_raster(path: Path, nodata: Nodata) -> Terrain:
-    """The heights in a raster, in its own coordinates."""
+def read_raster(path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None) -> Terrain:
+    """The heights in a raster, in its own coordinates; of a band, from 1, and of a part, see `load_heights`."""
     with opened(path) as dataset:
-        if dataset.count != 1:
-            raise FileError(f"heights must be one band, it has {dataset.count}")
-        (scale,), (offset,) = dataset.scales, dataset.offsets
+        if band is None and dataset.count != 1:
+            raise FileError(f"heights must be one band, it has {dataset.count}: band must say which")
+        number = 1 if band is None else band
+        if number > dataset.count:
+            raise FileError(f"it has no band {number}, it has {dataset.count}")
+        scale, offset = dataset.scales[number - 1], dataset.offsets[number - 1]
         if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
             raise FileError(f"its scale and offset must be finite, the scale not zero; they are {scale} and {offset}")
-        used = nodata(dataset.nodata)
-        heights = heights_of(dataset.read(1), used, scale, offset)
-        if any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[0]):
-            heights[dataset.dataset_mask() == 0] = np.nan
+        used, place = nodata(dataset.nodatavals[number - 1]), _placed(np.zeros((2, 2), np.float32), dataset, None)
+        dx, dy, x0, y0 = place.dx, place.dy, place.x0, place.y0
+        rows, columns = places_within(box, (dataset.height, dataset.width), (x0, y0), (dx, dy))
+        a, e = dataset.transform.a, dataset.transform.e
+        # From the order of `Terrain` to that of the file.
+        top = rows.start if e > 0 else dataset.height - rows.stop
+        left = columns.start if a > 0 else dataset.width - columns.stop
+        window = (top, top + rows.stop - rows.start), (left, left + columns.stop - columns.start)
+        heights = heights_of(dataset.read(number, window=window), used, scale, offset)
+        if any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[number - 1]):
+            heights[dataset.dataset_mask(window=window) == 0] = np.nan
         terrain = _placed(heights, dataset, used)
+        terrain = dataclasses.replace(terrain, x0=x0 + columns.start * dx, y0=y0 + rows.start * dy)
         if terrain.georeference is None:
             return terrain
-        named = terrain.georeference._replace(z_unit=dataset.units[0] or "")
+        named = terrain.georeference._replace(z_unit=dataset.units[number - 1] or "")
         return dataclasses.replace(terrain, georeference=named)
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from .georeference import (
 if TYPE_CHECKING:
     from ...scene.heightfield import Heightfield
 
+Box = Sequence[float]  # west, south, east, north
 Nodata = Callable[[float | None], float | None]  # what means no height, where a file names this value, or none, for it
 
 
@@ -174,6 +175,13 @@ class Terrain:
         heights = self.heights if dtype is None else fitted(self.heights, dtype)
         return Heightfield(heights, self.dx, self.dy, self.x0, self.y0)
 
+    def within(self, box: Box | None) -> "Terrain":
+        """The heights that stand within west, south, east and north, in the coordinates of its file."""
+        dx, dy, x0, y0 = self.in_file
+        rows, columns = places_within(box, self.heights.shape, (x0, y0), (dx, dy))
+        corner = self.x0 + columns.start * self.dx, self.y0 + rows.start * self.dy
+        return dataclasses.replace(self, heights=self.heights[rows, columns], x0=corner[0], y0=corner[1])
+
     def in_metres(self, **given: float) -> "Terrain":
         """The terrain with degrees turned into metres from vertex (0, 0), and then with `given` for its dx, dy, x0 and y0."""
         crs, grid = self.crs, {"dx": self.dx, "dy": self.dy, "x0": self.x0, "y0": self.y0}
@@ -252,3 +260,29 @@ def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, off
         scaled = heights.astype(np.float64) * scale + offset
         heights = scaled if rounding(scaled, heights.dtype) > WORTH_A_WARNING else scaled.astype(heights.dtype)
     return heights
+
+
+def places_within(
+    box: Box | None, shape: tuple[int, ...], corner: tuple[float, float], steps: tuple[float, float]
+) -> tuple[slice, slice]:
+    """Rows and columns of the heights that stand within west, south, east and north; None: all.
+
+    Args:
+      shape: of the grid, whose rows begin in the south.
+      corner: x and y of its first height.
+      steps: from column to column, from row to row.
+    """
+    if box is None:
+        return slice(0, shape[0]), slice(0, shape[1])
+    if np.shape(box) != (4,) or not np.isfinite(box).all() or not (box[0] < box[2] and box[1] < box[3]):
+        raise FileError(f"bbox must be west, south, east and north, finite and in this order, it is {box}")
+    found = []
+    for low, high, first, step, count in zip(box[1::-1], box[:1:-1], corner[::-1], steps[::-1], shape, strict=True):
+        begin, end = ((at - first) / step for at in (low, high))
+        # What stands on the side is within, however the division rounds.
+        found.append(slice(max(0, math.ceil(begin - 1e-6)), max(0, min(count, math.floor(end + 1e-6) + 1))))
+    if min(part.stop - part.start for part in found) < 2:
+        ends = [(first, first + step * (count - 1)) for first, step, count in zip(corner, steps, shape[::-1], strict=True)]
+        span = " and ".join(f"{name} from {low:.10g} to {high:.10g}" for name, (low, high) in zip("xy", ends, strict=True))
+        raise FileError(f"within bbox, {tuple(box)}, there must be heights, 2 x 2 at least; they stand at {span}")
+    return found[0], found[1]
