@@ -249,7 +249,7 @@ _MAPS = (
             azimuths=64,
         ),
         module="sky",
-        about="The sky is cloudless. Mountains cast their shadows and hide the sky, exact and without a search radius.",
+        about="The sky is cloudless. Mountains cast their shadows and hide the sky, by exact horizons in K directions.",
     ),
     _VIEWSHED,
 )

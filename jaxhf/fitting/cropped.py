@@ -21,8 +21,6 @@ from ..scene.scene import Object, Scene
 from ..scene.texture import ImageTexture
 
 _MARGIN = 2  # cells from the rim, where normals lack their neighbours; and pixels that a moving rim may come to
-REACH = 3.0
-"""Deviations by which heights may differ from what is known of them."""
 _LEAST_SIDE = 16  # of a picture, pixels
 
 ndimage: Any = scipy.ndimage  # whose stubs miss much
@@ -96,8 +94,8 @@ def surroundings(scenes: Sequence[Scene], heights: tuple[float, float], windows:
 def _ends_of_rays(
     scene: Scene, starts: Float[np.ndarray, "n 2"], low: float, high: float
 ) -> Iterator[Float[np.ndarray, "n 2"]]:
-    """Where rays from places at the lowest height, y and x, come above the highest on their way to each light and to the
-    camera, in the terrain's frame; infinitely far off where they never do."""
+    """Where rays from places at the lowest height come above the highest on their way to each light and to the camera;
+    infinitely far off where they never do. Places are y and x from the terrain's first height on, in its own frame."""
     local = localise(scene)
     world = local.objects[scene.first_heightfield].world_from_object
     to_object = np.linalg.inv(np.eye(4) if world is None else np.asarray(world, np.float64))
@@ -128,20 +126,21 @@ def cropped(
     targets: Sequence[np.ndarray],
     weights: Sequence[np.ndarray],
     terrain: Float[np.ndarray, "my mx"],
-    deviation: float,
+    off: float,
     window: Window,
     around: Window,
 ) -> list[Seen]:
     """What the pictures show of a window of a terrain.
 
     Scenes, targets and weights are those of the whole terrain, a weight for each value; `terrain`: its heights as far as they
-    are known; `deviation`: the largest standard deviation of these; `around`: see `surroundings`.
+    are known; `off`: by how much they may be off there; `around`: see `surroundings`.
     """
-    whole = Window(0, 0, *terrain.shape)
-    field = scenes[0].heightfields[0]
-    parts = [_with_surroundings(scene, *_fields(field, terrain, window, around), window, around) for scene in scenes]
-    everything = [_with_surroundings(scene, *_fields(field, terrain, window, whole), window, whole) for scene in scenes]
-    places = [_in_sight(scene, terrain[window.place], REACH * deviation) for scene in parts]
+    field, whole = scenes[0].heightfields[0], Window(0, 0, *terrain.shape)
+    parts, everything = (
+        [_with_surroundings(scene, *fields, window, place) for scene in scenes]
+        for place, fields in ((place, _fields(field, terrain, window, place)) for place in (around, whole))
+    )
+    places = [_in_sight(scene, terrain[window.place], off) for scene in parts]
     # Pictures of one size share a program, those of this window and of the next ones.
     height, width = (max([1, *(place[1][axis] - place[0][axis] for place in places if place is not None)]) for axis in (0, 1))
     found = []

@@ -17,7 +17,7 @@ from ..core.settings import Settings
 from ..io.checkpoint import load_arrays, load_facts_of, save_checkpoint
 from ..preparation.localise import localise
 from ..scene.scene import Scene
-from .cropped import REACH, Seen, Window, cropped, surroundings
+from .cropped import Seen, Window, cropped, surroundings
 from .fit import fit
 from .given import Checkpoint, Prior
 from .history import Draws, Step
@@ -28,6 +28,7 @@ from .solve.state import digest
 from .trust.judge import Fit
 
 _LEAST_WINDOW, _LEAST_OVERLAP = 32, 8  # heights: the outermost four or so of a window are hardly told by its pictures
+_REACH = 3.0  # deviations by which heights may differ from what is known of them
 _ARRAYS = ("heights", "std", "seen")  # of a terrain while it is found: float64, and a mask
 
 
@@ -132,8 +133,9 @@ def fit_windows(
     terrain = Mosaic(with_seam(field, np.where(std > 0, begin, mean)), std.copy(), np.zeros(shape, bool), ())
     order = divided(shape, window, overlap)
     options = {**options, "settings": _settings(scenes, options.get("settings") or Settings(), len(order))}
-    off = REACH * float(std.max())
-    around = surroundings(scenes, (float(terrain.heights.min()) - off, float(terrain.heights.max()) + off), order)
+    known_heights = np.stack([terrain.heights, np.where(std > 0, mean, terrain.heights)])
+    off = _REACH * float(std.max())
+    around = surroundings(scenes, (float(known_heights.min()) - off, float(known_heights.max()) + off), order)
     path = None if checkpoint is None else Path(checkpoint.path)
     values = scenes, targets, weights, mean, std, begin, noise
     choices = prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)
@@ -142,8 +144,9 @@ def fit_windows(
         terrain = _load(path, terrain, name)
     for number in range(len(terrain.windows), len(order)):
         place = order[number]
-        deviation = float(std[place.place].max())
-        seen = cropped(scenes, targets, weights, terrain.heights, deviation, place, around[number])
+        here = place.place
+        off = _REACH * std[here] + np.where(std[here] > 0, np.abs(mean[here] - terrain.heights[here]), 0)
+        seen = cropped(scenes, targets, weights, terrain.heights, float(off.max()), place, around[number])
         tell = None if progress is None else lambda done, number=number: progress(number, len(order), done)
         found = _fit(seen, terrain, known, place, noise, tell or False, options) if seen else None
         done = Fitted(*place, len(seen))

@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh
+from jaxtyping import Float
 
 from ..core.errors import ArgumentError, require_progress
+from ..core.types import AnyArray
 from ..preparation.crossings import cell_directions
 from ..preparation.horizon import (
     Besides,
@@ -24,6 +26,7 @@ from ..preparation.horizon import (
 )
 from ..preparation.sky import sky_vector
 from ..scene.heightfield import Heightfield
+from ..trace.normals import vertex_normals
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, on_every_device
 from .sunlight import received
@@ -111,3 +114,10 @@ def field_of(owner: str, terrain: Any, dx: float | None, dy: float | None) -> He
         if value is not None:
             raise ArgumentError(owner, name, "must stand without a Heightfield, which has its own cell size")
     return terrain
+
+
+def unit_normals(heights: Float[AnyArray, "ny nx"], dx: float, dy: float) -> Float[jax.Array, "ny nx 3"]:
+    """Upward normals at the vertices, by area."""
+    normals = vertex_normals(heights, dx, dy, "six")
+    normals = normals / lax.stop_gradient(jnp.max(jnp.abs(normals), -1, keepdims=True))  # whose squares are numbers
+    return normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)

@@ -1,13 +1,12 @@
 """How much sunlight arrives at a terrain in a day, a month or a year."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
@@ -18,16 +17,14 @@ from ..io.terrain.georeference import coordinate_system
 from ..io.terrain.terrain import Terrain
 from ..preparation.crossings import even_azimuths
 from ..preparation.horizon import Besides
-from ..scene.sun import utc
-from ..trace.normals import vertex_normals
-from ..xla.compilation import compiled
+from ..scene.sun import require_place, utc
+from ..xla.compilation import compiled, is_traced
 from ..xla.devices import takes_numbers
 from .choices import SUNLIGHT
-from .horizons import field_of, map_over_horizons
+from .horizons import field_of, map_over_horizons, unit_normals
 from .sunlight import Suns, suns_of, through_air
 
 _MOST_YEARS = 10
-_MOST_TURBIDITY = 10.0
 
 
 @takes_numbers
@@ -49,9 +46,10 @@ def insolation(
 
     The terrain casts its shadows and hides the sky. Horizons are exact, as those of `horizon`, in so many azimuths; a sun
     between two of them counts with both. What is on its way through the air is after the European Solar Radiation Atlas
-    (Rigollier, Bauer and Wald, On the clear sky model of the ESRA, Solar Energy 68(1), 2000), the sky is equally bright
-    everywhere, and light that the terrain sends on to itself does not count. One place stands for the whole terrain. Where
-    suns follow each other by a minute, or by a 2¹⁸th of long times, docs/measurements/maps.md has errors and times.
+    (Rigollier, Bauer and Wald, On the clear sky model of the ESRA, Solar Energy 68(1), 2000), of five heights, between which it
+    is linear. The sky is equally bright everywhere, and light that the terrain sends on to itself does not count. One place
+    stands for the whole terrain. Suns follow each other by a minute, in more than half a year by a 2¹⁸th of the time. Errors
+    and times: docs/measurements/maps.md.
 
     Args:
       terrain: see `horizon`. Heights and cells in metres: the air is that above the sea.
@@ -71,12 +69,17 @@ def insolation(
       ValueError: an argument has a value that it cannot have; a terrain does not say where it lies.
     """
     field = field_of("insolation", terrain, dx, dy)
+    if not is_traced() and not np.isfinite(field.heights).any():
+        raise ArgumentError("insolation", "heights", "must hold a finite one, all of them are nan or infinite")
     require("insolation", "wanted", wanted, OneOf(SUNLIGHT))
     require("insolation", "azimuths", azimuths, Whole(4))
-    if not 1 <= turbidity <= _MOST_TURBIDITY:
-        raise ArgumentError("insolation", "turbidity", f"must be from 1 to {_MOST_TURBIDITY:g}, it is {turbidity}")
-    first, last = (utc("insolation", name, time) for name, time in (("begin", begin), ("end", end)))
-    if first.shape or last.shape or not np.timedelta64(0) < last - first <= _MOST_YEARS * np.timedelta64(366, "D"):
+    require("insolation", "turbidity", turbidity, _turbidity)
+    times = {name: utc("insolation", name, time) for name, time in (("begin", begin), ("end", end))}
+    for name, time in times.items():
+        if time.shape:
+            raise ArgumentError("insolation", name, f"must be one time, its shape is {time.shape}")
+    first, last = times.values()
+    if not np.timedelta64(0) < last - first <= _MOST_YEARS * np.timedelta64(366, "D"):
         raise ArgumentError("insolation", "end", f"must come after begin, {begin}, by ten years at most, it is {end}")
     suns = suns_of(
         first[()], last[()], _place_of(terrain, place), _turned(terrain), float(turbidity), int(azimuths), wanted,
@@ -92,23 +95,26 @@ def _besides(heights: Float[AnyArray, "ny nx"], suns: Suns, turbidity: ScalarLea
     """What `received` takes besides the horizons."""
     there = jnp.isfinite(heights)
     lowest, highest = jnp.min(jnp.where(there, heights, jnp.inf)), jnp.max(jnp.where(there, heights, -jnp.inf))
-    normals = vertex_normals(heights, dx, dy, "six")
-    normals = normals / lax.stop_gradient(jnp.max(jnp.abs(normals), -1, keepdims=True))  # whose squares are numbers
-    normals = normals / jnp.linalg.norm(normals, axis=-1, keepdims=True)
     share = jnp.where(there, heights - lowest, 0) / jnp.where(highest > lowest, highest - lowest, 1)
-    light = through_air(suns, jnp.stack([lowest, highest]), turbidity)
+    light, normals = through_air(suns, lowest, highest, turbidity), unit_normals(heights, dx, dy)
     return Besides(light, (jnp.moveaxis(normals, -1, 0), share))
 
 
+def _turbidity(value: Any) -> str | None:
+    holds = isinstance(value, int | float | np.number) and not isinstance(value, bool) and 1 <= value <= 10
+    return None if holds else f"must be a number from 1 to 10, it is {value!r}"
+
+
 def _place_of(terrain: Any, place: tuple[float, float] | None) -> tuple[float, float]:
-    if place is None:
-        if not isinstance(terrain, Terrain):
-            raise ArgumentError("insolation", "place", "must be latitude and longitude, unless a Terrain says where it lies")
+    if place is None and isinstance(terrain, Terrain):
         return terrain.place
-    if np.shape(place) != (2,):
-        raise ArgumentError("insolation", "place", f"must be latitude and longitude, degrees, it is {place!r}")
-    latitude, longitude = place
-    return latitude, longitude
+    angles = list(place) if isinstance(place, Sequence | np.ndarray) else []
+    if len(angles) != 2 or not all(isinstance(angle, int | float | np.number) for angle in angles):
+        given = "unless a Terrain says where it lies" if place is None else f"degrees, it is {place!r}"
+        raise ArgumentError("insolation", "place", f"must be latitude and longitude, {given}")
+    latitude, longitude = angles
+    require_place("insolation", latitude, longitude)
+    return float(latitude), float(longitude)
 
 
 def _turned(terrain: Any) -> float:

@@ -6,17 +6,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..core.rules import OneOf, Whole, require
 from ..preparation.crossings import even_azimuths
-from ..trace.normals import vertex_normals
 from ..xla.devices import takes_numbers
 from .choices import WEIGHTINGS
-from .horizons import field_of, map_over_horizons
+from .horizons import field_of, map_over_horizons, unit_normals
 
 
 @takes_numbers
@@ -100,7 +98,4 @@ def sky_view(
     found = map_over_horizons("sky_view", weighting, field, even_azimuths(int(azimuths)), 0.0, progress, mesh)
     if weighting != "slope":
         return found
-    normals = vertex_normals(jnp.asarray(field.heights), field.dx, field.dy, "six")
-    normals = normals / lax.stop_gradient(jnp.max(jnp.abs(normals), -1, keepdims=True))  # whose squares are numbers
-    received = jnp.sum(jnp.moveaxis(found, 0, -1) * normals, -1) / jnp.linalg.norm(normals, axis=-1)
-    return jnp.maximum(received, 0)
+    return jnp.maximum(jnp.sum(found * jnp.moveaxis(unit_normals(jnp.asarray(field.heights), field.dx, field.dy), -1, 0), 0), 0)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.types import AnyArray, ScalarLeaf
 from ..core.vector import greater
@@ -16,6 +16,7 @@ from ..scene.sun import sun
 from .clear_sky import above_the_air, beam, diffuse
 
 _ALTITUDES = 360  # steps of the tables from the horizontal to the zenith
+_HEIGHTS = 5  # of which tables are made; between two light is linear
 _MOST_SUNS = 2**18  # two minutes of a year from one to the next
 _LEAST_STEP = np.timedelta64(60, "s")
 
@@ -83,29 +84,29 @@ def suns_of(
 
 
 class Sunlight(eqx.Module):
-    """What arrives in a time, on two heights between which all others lie.
+    """What arrives in a time, on heights at even steps.
 
     Attributes:
-      suns: see `Suns`: by sector and altitude, the sum over the suns that stand higher, those of one step of altitudes being
-        spread evenly over it; shape (2, c, k, altitudes + 1).
+      suns: see `Suns`: for each of these heights, and by sector and altitude, the sum over the suns that stand higher, those of
+        one step of altitudes being spread evenly over it; shape (c, heights, k, altitudes + 1).
       sky: as there.
     """
 
-    suns: Float[jax.Array, "2 c k altitudes"] | None
+    suns: Float[jax.Array, "c heights k altitudes"] | None
     sky: ScalarLeaf | None
 
 
-def through_air(suns: Suns, heights: Float[jax.Array, "2"], turbidity: ScalarLeaf) -> Sunlight:
-    """What is left of them on two heights, metres above the sea."""
+def through_air(suns: Suns, lowest: ScalarLeaf, highest: ScalarLeaf, turbidity: ScalarLeaf) -> Sunlight:
+    """What is left of them on heights from the lowest to the highest, metres above the sea."""
     if suns.light is None:
         return Sunlight(None, suns.sky)
-    light = jnp.asarray(suns.light)
+    light = jnp.asarray(suns.light)[:, None]
     if light.shape[0] == 3:
-        middles = (np.arange(_ALTITUDES) + 0.5) * (90 / _ALTITUDES)
-        shares = jnp.stack([beam(jnp.asarray(middles, light.dtype), height, turbidity) for height in heights])
-        light = light[None] * shares[:, None, None]
+        middles = jnp.asarray((np.arange(_ALTITUDES) + 0.5) * (90 / _ALTITUDES), light.dtype)
+        heights = lowest + (highest - lowest) * jnp.linspace(0, 1, _HEIGHTS, dtype=light.dtype)
+        light = light * jnp.stack([beam(middles, height, turbidity) for height in heights])[None, :, None]
     else:
-        light = jnp.stack([light, light])
+        light = jnp.repeat(light, _HEIGHTS, axis=1)
     return Sunlight(jnp.pad(jnp.cumsum(light[..., ::-1], axis=-1)[..., ::-1], ((0, 0),) * 3 + ((0, 1),)), suns.sky)
 
 
@@ -114,9 +115,10 @@ def received(
     light: Sunlight,
     ground: tuple[Float[jax.Array, "3 *at"], Float[jax.Array, "*at"]],
 ) -> Float[jax.Array, "*at"]:
-    """What arrives at places with these horizons, at least horizontal, and their own surface; of azimuths even from north on.
+    """What arrives at places by their horizons' slopes, in azimuths at even steps from north on, and by their own slope.
 
     Args:
+      slopes: at least 0; nan counts as that.
       light: see `through_air`.
       ground: the upward unit normals, and how far each height is from the lowest to the highest, 0 to 1.
     """
@@ -129,21 +131,27 @@ def received(
     slopes = greater(jnp.where(jnp.isnan(slopes), 0, slopes), own)
     total = jnp.zeros(share.shape, dtype)
     if light.sky is not None:
-        seen = jnp.sum(sky_vector(slopes) * normal, 0)
-        total = total + light.sky * seen
-    if light.suns is not None:
-        at = jnp.arctan(slopes) * (2 / np.pi * _ALTITUDES)
-        level = jnp.clip(at.astype(jnp.int32), 0, _ALTITUDES - 1)
-        beyond, sector = at - level.astype(dtype), jnp.arange(k, dtype=jnp.int32).reshape(turns.shape)
-        level = level + sector * (_ALTITUDES + 1)  # in a row of all sectors
-        weights = normal if light.suns.shape[1] == 3 else jnp.ones((1, *share.shape), dtype)
-        tables = light.suns.reshape(*light.suns.shape[:2], -1)
-        for component, weight in enumerate(weights):
-            low, high = (_between(table[component], level, beyond) for table in tables)
-            total = total + weight * jnp.sum(low + share[None] * (high - low), 0)
-    return jnp.maximum(total, 0)
+        total = total + light.sky * jnp.maximum(jnp.sum(sky_vector(slopes) * normal, 0), 0)
+    if light.suns is None:
+        return total
+    altitude, beyond = _step(jnp.arctan(slopes) * (2 / np.pi), _ALTITUDES)
+    height, above = _step(share, _HEIGHTS - 1)
+    sector = jnp.arange(k, dtype=jnp.int32).reshape(turns.shape)
+    first = (height[None] * k + sector) * (_ALTITUDES + 1) + altitude  # in a row of all
+    direct = jnp.zeros_like(total)
+    for table, weight in zip(light.suns, normal if len(light.suns) == 3 else jnp.ones((1, *share.shape), dtype), strict=True):
+        row = table.reshape(-1)
+        low, high = (_between(row, first + further * k * (_ALTITUDES + 1), beyond) for further in (0, 1))
+        direct = direct + weight * jnp.sum(low + above[None] * (high - low), 0)
+    return total + jnp.maximum(direct, 0)
 
 
-def _between(table: Float[jax.Array, " n"], level: Any, beyond: Float[jax.Array, "k *at"]) -> Float[jax.Array, "k *at"]:
-    first, second = (table.at[place].get(mode="promise_in_bounds") for place in (level, level + 1))
-    return first + beyond * (second - first)
+def _step(share: Float[jax.Array, "*at"], count: int) -> tuple[Int[jax.Array, "*at"], Float[jax.Array, "*at"]]:
+    """Which of so many even steps a share of 0 to 1 lies in, and how far along it."""
+    number = jnp.clip((share * count).astype(jnp.int32), 0, count - 1)
+    return number, share * count - number.astype(share.dtype)
+
+
+def _between(row: Float[jax.Array, " n"], first: Int[jax.Array, "k *at"], beyond: Float[jax.Array, "k *at"]) -> jax.Array:
+    here, there = (row.at[place].get(mode="promise_in_bounds") for place in (first, first + 1))
+    return here + beyond * (there - here)

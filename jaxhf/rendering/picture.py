@@ -36,7 +36,7 @@ def picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key
         drawn = on_every_device(key, mesh) if world.settings.edge_samples else None  # else the settings draw nothing
         return trace_picture(world, camera, aovs, mesh, drawn)
     parts = [part for _, part in _parts(world, camera, aovs, mesh, _at_once(world.settings, mesh))]
-    if mesh.devices.size > 1:  # XLA ends the process where a device waits for another one's part for 40 s
+    if mesh.devices.size > 1:  # XLA ends the process where a device waits for another one's part for 60 s
         jax.block_until_ready(parts)
     return _assembled(parts, camera.width, camera.height, world.settings, mesh)
 

@@ -36,10 +36,7 @@ def sun(time: Any, latitude: Any, longitude: Any, *, refraction: bool = False) -
     """
     days = (utc("sun", "time", time) - _J2000) / np.timedelta64(1, "D")
     latitude, longitude = np.asarray(latitude, np.float64), np.asarray(longitude, np.float64)
-    for name, value, most in (("latitude", latitude, 90), ("longitude", longitude, 360)):
-        require("sun", name, value, NUMBERS)
-        if (np.abs(value) > most).any():
-            raise ArgumentError("sun", name, f"must lie between -{most} and {most} degrees, it is {value}")
+    require_place("sun", latitude, longitude)
     right_ascension, declination, sidereal, parallax = _equatorial(days)
     hour, phi = np.deg2rad(sidereal + longitude) - right_ascension, np.deg2rad(latitude)
     east = -np.cos(declination) * np.sin(hour)
@@ -54,12 +51,21 @@ def sun(time: Any, latitude: Any, longitude: Any, *, refraction: bool = False) -
     return (float(azimuth), float(altitude)) if whole else (azimuth, altitude)
 
 
+def require_place(owner: str, latitude: Any, longitude: Any) -> None:
+    """ArgumentError of the `owner` where these are no numbers of degrees on the globe."""
+    for name, value, most in (("latitude", latitude, 90), ("longitude", longitude, 360)):
+        require(owner, name, value, NUMBERS)
+        if not (np.abs(value) <= most).all():
+            raise ArgumentError(owner, name, f"must lie between -{most} and {most} degrees, it is {value}")
+
+
 def utc(owner: str, name: str, time: Any) -> Any:
     """A `datetime` with its zone, or datetime64s, as datetime64 in UTC; else an ArgumentError of the `owner`'s argument."""
     if isinstance(time, datetime.datetime):
         if time.tzinfo is None:
             raise ArgumentError(owner, name, f"must have a time zone, as 2026-06-21T12:00:00Z has, it is {time.isoformat()}")
-        time = np.datetime64(time.astimezone(datetime.UTC).replace(tzinfo=None), "us")
+        offset = time.utcoffset() or datetime.timedelta()
+        time = np.datetime64(time.replace(tzinfo=None), "us") - np.timedelta64(offset, "us")
     instants = np.asarray(time)
     if instants.dtype.kind != "M":
         raise ArgumentError(owner, name, f"must be a datetime or datetime64, it is {type(time).__name__}")

@@ -109,6 +109,10 @@ def test_insolation(run, tmp_path):
     assert code == 0, said
     assert f": energy {np.nanmin(found):.4g} .. {np.nanmax(found):.4g} kWh/m², 8 azimuths, " in said
     np.testing.assert_array_equal(np.load(tmp_path / "day.npy"), found)
+    west = [("--latitude", "47", "--longitude", longitude, "--azimuths", "8") for longitude in ("-10", "350")]
+    for name, there in zip(("a.npy", "b.npy"), west, strict=True):
+        assert run("insolation", name, "--begin", "2026-06-21", "--end", "2026-06-22", *there)[0] == 0
+    np.testing.assert_allclose(np.load(tmp_path / "a.npy"), np.load(tmp_path / "b.npy"), rtol=1e-6)
     times = "--begin", "2026-06-21T11:00+02:00", "--end", "2026-06-21T10:00Z"
     code, said = run("insolation", "hour.npy", *times, "--wanted", "hours", *where)
     assert code == 0, said

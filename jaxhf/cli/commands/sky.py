@@ -14,6 +14,7 @@ from ...io.terrain.terrain import Terrain
 from ...maps.insolation import insolation
 from ...maps.skyview import horizon, sky_view
 from ...preparation.crossings import even_azimuths
+from ...scene.sun import utc
 from .. import arguments, limits
 from ..progress import compiled_bar
 from .maps import place_of, read_in_metres, require_numbers
@@ -86,8 +87,9 @@ def _insolation(options: argparse.Namespace, path: Path, stored: Terrain, terrai
 def _instant(time: datetime.date, longitude: float) -> np.datetime64:
     """In UTC; a date begins at midnight of the place's mean solar time."""
     if isinstance(time, datetime.datetime):
-        return np.datetime64(time.astimezone(datetime.UTC).replace(tzinfo=None), "us")
-    return np.datetime64(time, "us") - np.timedelta64(round(longitude * 240e6), "us")
+        return utc("insolation", "time", time)
+    east = (longitude + 180) % 360 - 180
+    return np.datetime64(time, "us") - np.timedelta64(round(east * 240e6), "us")
 
 
 def _of(path: Path, azimuth: float) -> Path:

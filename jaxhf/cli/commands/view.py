@@ -21,7 +21,7 @@ from ...rendering.render import Prepared, prepare
 from ...scene.camera import Perspective
 from ...scene.heightfield import Heightfield
 from ...scene.material import SCATTERING
-from ...scene.sun import sun
+from ...scene.sun import sun, utc
 from ...xla.devices import local_mesh
 from .. import arguments, limits
 from ..block import Look, block, exaggeration, lights, photograph, with_water
@@ -44,7 +44,7 @@ def _sun_path(options: argparse.Namespace, terrain: Terrain) -> np.ndarray | Non
             raise UserError("view: --latitude and --longitude stand with times, as in --sun-from 2026-06-21T06:00:00Z")
         return None if first is None else np.linspace(first, last, options.frames)
     place = place_of("view", options, terrain)
-    start, end = (np.datetime64(t.astimezone(datetime.UTC).replace(tzinfo=None), "us") for t in (first, last))
+    start, end = (utc("view", "time", time) for time in (first, last))
     instants = start + (end - start) * np.arange(options.frames) // (options.frames - 1)
     azimuth, altitude = sun(instants, *place)
     if not (altitude > 0).all():

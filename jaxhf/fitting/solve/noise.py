@@ -20,7 +20,7 @@ _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
 _NO_WEIGHT = 1e-3  # of a value that is far off
 _LEAST_SHARE = 0.1  # of heights in values: of fewer heights noise would be told by 5 % too small at most
 _LEAST_FREE = 0.1  # of a picture's noise: where heights explain more, what is left does not tell the noise
-_SAID = 1.0  # modes by which what a prior is said to be off counts in an octave in which it is off by more
+_SAID = 1.0  # modes for which the prior's std counts, in an octave whose errors are larger
 OCTAVES = 6  # into which the prior's modes are divided, at most
 _ROUNDS = 8  # at most; three or four are usual
 _NOISE_CHANGE, _WIDTH_CHANGE = 1.02, 1.1  # by less in a round: it has converged
@@ -122,9 +122,8 @@ class Restricted:
             if problem.known:
                 told = np.mean([draw.told for draw in draws], axis=0)
                 squares, count = (np.tensordot(bands, part) for part in (modes**2, told))
-                said = _SAID * np.minimum(
-                    1 / (before * widths) ** 2, 1
-                )  # where errors are smaller than that, nothing holds them
+                # Octaves that are wider than was said are drawn towards that; nothing holds those that are narrower.
+                said = _SAID * np.minimum(1 / (before * widths) ** 2, 1)
                 growth = np.sqrt((squares + said) / (np.maximum(count, 0) + _SAID))
                 widths = widths * growth
             changes = [np.abs(np.log(part)).max() for part in (noise / noise_before, growth)]
