@@ -88,9 +88,7 @@ def sunlight(run: benchmark.Run) -> None:
             row = {"mean, %": off.mean(), "99th percentile, %": np.percentile(off, 99), "largest, %": off.max()}
             run.row(f"sunlight of a {name}, {azimuths} azimuths", row | {"seconds": min(times)})
             if azimuths == 64:
-                run.claim(
-                    row["99th percentile, %"] < 0.12, f"64 azimuths: 99 % of a {name}'s errors are below 0.12 %"
-                )
+                run.claim(row["99th percentile, %"] < 0.12, f"64 azimuths: 99 % of a {name}'s errors are below 0.12 %")
 
 
 def main() -> None:

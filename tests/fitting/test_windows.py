@@ -208,6 +208,19 @@ def test_windows_go_over_into_one_another(tmp_path, monkeypatch):
         fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=again, **options)
 
 
+def test_what_is_around_a_window_may_rise_to_its_prior(monkeypatch):
+    """Also where the scenes, and so the start, are flat: as much is around it as of a start from the prior."""
+    sizes = []
+    for start, mean in ((TRUTH, TRUTH), (0 * TRUTH, TRUTH), (0 * TRUTH, 0 * TRUTH)):
+        fits = Fits()
+        monkeypatch.setattr(_windows, "fit", fits)
+        prior = jaxhf.Prior(mean, np.full(TRUTH.shape, 1e-3))
+        fit_windows(scenes(start, ABOVE), [np.zeros((48, 48), np.float32)] * 3, **OPTIONS | {"prior": prior, "noise": 0.1})
+        sizes.append(fits.given[0][0][0].objects[-1].shape.heights.shape)
+    assert sizes[0] == sizes[1]
+    assert sizes[2] < sizes[1] < (SIDE, SIDE)
+
+
 @pytest.mark.parametrize(
     ("wrong", "text"),
     [
