@@ -20,12 +20,12 @@ _SCALE_HEIGHT = 8434.5  # metres over which the air's pressure falls to 1 / e
 _LEAST_DIFFUSE = 2e-3  # below which the model's diffuse light of a sun on the horizon becomes too small
 
 
-def beam(altitude: Float[AnyArray, " n"], height: ScalarLeaf, turbidity: ScalarLeaf) -> Float[jax.Array, " n"]:
+def beam(altitude: Float[AnyArray, " n"], height: Float[AnyArray, "..."], turbidity: ScalarLeaf) -> Float[jax.Array, " n"]:
     """The share of the sun's light that comes straight through, on a surface across it (equations 3 to 12).
 
     Args:
       altitude: of the sun as it is seen, with refraction, degrees, above 0.
-      height: above the sea, metres.
+      height: above the sea, metres; one, or one for each sun.
       turbidity: Linke's, for an air mass of 2.
     """
     pressure = jnp.exp(-height / _SCALE_HEIGHT)

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..core.types import AnyArray, ScalarLeaf
-from ..core.vector import greater
 from ..preparation.crossings import even_azimuths
 from ..preparation.sky import sky_vector
 from ..scene.sun import sun
@@ -118,7 +117,7 @@ def received(
     """What arrives at places by their horizons' slopes, in azimuths at even steps from north on, and by their own slope.
 
     Args:
-      slopes: at least 0; nan counts as that.
+      slopes: at least 0; where they are nan what is returned means nothing.
       light: see `through_air`.
       ground: the upward unit normals, and how far each height is from the lowest to the highest, 0 to 1.
     """
@@ -128,7 +127,7 @@ def received(
     east, north = (jnp.asarray(f(turns), dtype) for f in (np.sin, np.cos))
     own = -(normal[0][None] * east + normal[1][None] * north) / normal[2][None]
     # One choice for both: at the border they are often the same, and XLA rounds them anew wherever it compares them.
-    slopes = greater(jnp.where(jnp.isnan(slopes), 0, slopes), own)
+    slopes = jnp.where(slopes > own, slopes, own)  # own where they are nan
     total = jnp.zeros(share.shape, dtype)
     if light.sky is not None:
         total = total + light.sky * jnp.maximum(jnp.sum(sky_vector(slopes) * normal, 0), 0)

@@ -75,7 +75,7 @@ def over_horizon(
 
 
 @over_horizon.defjvp
-def _over_horizon_jvp(summary: Summary, mesh: Mesh, primals: tuple[jax.Array, ...], tangents: tuple[jax.Array, ...]):
+def _over_horizon_jvp(summary: Summary, mesh: Mesh, primals: tuple[Any, ...], tangents: tuple[Any, ...]):
     z, directions, lowest, besides = lax.stop_gradient(primals)
     slopes, found = _searched(lambda slopes: slopes, mesh, z, directions, lowest, True)
     ny, nx = z.shape

@@ -139,7 +139,7 @@ def test_the_air_above_each_height(turbidity, day):
 def test_y_may_point_aside_of_north():
     """Then the whole sky is turned; a quarter of a turn changes places of the azimuths alone."""
     (north, sky), (east, other) = (
-        suns_of(BEGIN, BEGIN + DAY, PLACE, turned, 3.0, 8, "energy", np.float64) for turned in (0, 90)
+        suns_of(BEGIN, BEGIN + DAY, PLACE, turned, 3.0, 8, "energy", np.float64) for turned in (0.0, 90.0)
     )
     assert north is not None
     assert east is not None

@@ -4,6 +4,7 @@ import argparse
 import datetime
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -84,7 +85,7 @@ def _insolation(options: argparse.Namespace, path: Path, stored: Terrain, terrai
     return f"{kind} {np.nanmin(values):.4g} .. {np.nanmax(values):.4g} {unit}", options.azimuths
 
 
-def _instant(time: datetime.date, longitude: float) -> np.datetime64:
+def _instant(time: datetime.date, longitude: float) -> Any:
     """In UTC; a date begins at midnight of the place's mean solar time."""
     if isinstance(time, datetime.datetime):
         return utc("insolation", "time", time)
