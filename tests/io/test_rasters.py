@@ -98,6 +98,7 @@ def test_a_part_of_a_terrain_in_degrees(tmp_path):
         ),
     ],
 )
+@pytest.mark.usefixtures("as_users_call_it")
 def test_wrong_parts_are_refused(tmp_path, utm, options, rule):
     assert utm.heights.shape == (3, 4)
     with pytest.raises(ValueError, match=rule):
