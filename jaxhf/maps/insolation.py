@@ -79,7 +79,7 @@ def insolation(
         if time.shape:
             raise ArgumentError("insolation", name, f"must be one time, its shape is {time.shape}")
     first, last = times.values()
-    if not np.timedelta64(0) < last - first <= _MOST_YEARS * np.timedelta64(366, "D"):
+    if not first < last <= first + _MOST_YEARS * np.timedelta64(366, "D"):
         raise ArgumentError("insolation", "end", f"must come after begin, {begin}, by ten years at most, it is {end}")
     suns = suns_of(
         first[()], last[()], _place_of(terrain, place), _turned(terrain), float(turbidity), int(azimuths), wanted,
