@@ -45,7 +45,7 @@ def edge_sets(world: World) -> tuple[EdgeSet, ...]:
     found, first = [], 0
     casting = [number for number, _ in sharp_lights(world)] if world.settings.shadows else []
     for k, grid, _ in world.grids:
-        for light in (*(() if grid.still else (-1,)), *casting):
+        for light in casting if grid.still else (-1, *casting):
             found.append(EdgeSet(k, light, first, *grid.shape))
             first = found[-1].end
     return tuple(found)

@@ -87,9 +87,7 @@ def sun(text: str) -> tuple[float, float] | datetime.datetime:
         if "," in text:
             azimuth, altitude = text.split(",")
             return float(azimuth), float(altitude)
-        time = datetime.datetime.fromisoformat(text)
-        if time.tzinfo is not None:
-            return time
+        return _time(text)
     rule = "must be an azimuth and an altitude, as 90,10, or a time with its offset from UTC, as 2026-06-21T07:00-05:00"
     raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
 
@@ -99,11 +97,17 @@ def moment(text: str) -> datetime.date:
     with contextlib.suppress(ValueError):
         return datetime.date.fromisoformat(text)
     with contextlib.suppress(ValueError):
-        time = datetime.datetime.fromisoformat(text)
-        if time.tzinfo is not None:
-            return time
+        return _time(text)
     rule = "must be a date, as 2026-06-21, or a time with its offset from UTC, as 2026-06-21T07:00-05:00"
     raise argparse.ArgumentTypeError(f"{rule}; it is {text!r}")
+
+
+def _time(text: str) -> datetime.datetime:
+    """A time with its offset from UTC; ValueError of other text."""
+    time = datetime.datetime.fromisoformat(text)
+    if time.tzinfo is None:
+        raise ValueError
+    return time
 
 
 def names(text: str) -> tuple[str, ...]:
@@ -136,8 +140,8 @@ def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def reading(options: argparse.Namespace) -> dict[str, Any]:
-    """What `load_heights` takes of a terrain's options."""
-    return {name: getattr(options, name) for name in ("z_scale", "nodata", "band", "bbox")}
+    """Those of a command's options that say how its terrain is read."""
+    return {name: getattr(options, name) for name in ("z_scale", "nodata", "band", "bbox") if name in options}
 
 
 def refuse(options: argparse.Namespace, *names: str, because: str) -> None:

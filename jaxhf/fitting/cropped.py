@@ -136,10 +136,12 @@ def cropped(
     are known; `off`: by how much they may be off there; `around`: see `surroundings`.
     """
     field, whole = scenes[0].heightfields[0], Window(0, 0, *terrain.shape)
-    parts, everything = (
-        [_with_surroundings(scene, *fields, window, place) for scene in scenes]
-        for place, fields in ((place, _fields(field, terrain, window, place)) for place in (around, whole))
-    )
+
+    def within(place: Window) -> list[Scene]:
+        fields = _fields(field, terrain, window, place)
+        return [_with_surroundings(scene, *fields, window, place) for scene in scenes]
+
+    parts, everything = within(around), within(whole)
     places = [_in_sight(scene, terrain[window.place], off) for scene in parts]
     # Pictures of one size share a program, those of this window and of the next ones.
     height, width = (max([1, *(place[1][axis] - place[0][axis] for place in places if place is not None)]) for axis in (0, 1))

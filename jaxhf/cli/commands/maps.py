@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> None:
     function, nodata = _chosen(options)
     path = require_writable_raster(options.output)
     begin = time.perf_counter()
-    terrain = read_terrain(options.terrain, nodata=options.nodata, band=options.band, bbox=options.bbox)
+    terrain = read_terrain(options.terrain, **arguments.reading(options))
     names = inspect.signature(function).parameters.keys() & vars(options).keys()
     values = function(terrain, **arguments.given(options, *names))
     if "dx" in names and options.scale is None:
@@ -75,7 +75,7 @@ def report_spacing(options: argparse.Namespace, terrain: Terrain) -> None:
 
 def read_in_metres(options: argparse.Namespace) -> tuple[Terrain, Terrain]:
     """The terrain of a file as it is stored, in the precision that was asked for, and with lengths in metres."""
-    stored = read_terrain(options.terrain, options.z_scale, options.nodata, band=options.band, bbox=options.bbox)
+    stored = read_terrain(options.terrain, **arguments.reading(options))
     if stored.nodata.all():
         raise UserError(f"{options.terrain}: there is no height in it")
     stored = dataclasses.replace(stored, heights=stored.heights.astype(options.precision))
