@@ -1,4 +1,4 @@
-"""Rays on MuJoCo's height fields beside MuJoCo's own: what they meet, how many a second, and how that moves.
+"""Rays on MuJoCo's geoms beside MuJoCo's own: what they meet, how many a second, and how that moves.
 
 Without a part all but mjx are run. Times are of the machine as it is: MuJoCo's and ours alternate, and the best of each counts.
 """
@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxhf
-from jaxhf.mujoco import HField, grid_pattern, height_scan, ray
+from jaxhf.mujoco import Geoms, HField, grid_pattern, height_scan, lidar, lidar_pattern, ray
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 hfields: Any = importlib.import_module("hfields") if benchmark.have("mujoco") else None  # `main` says so
 
-PARTS = ("parity", "speed", "gradient", "mjx")
+PARTS = ("parity", "speed", "gradient", "geoms", "mjx")
 # Rows, columns, size, and where: geom and body. The last two took no part while `ray` was made.
 CASES = {
     "square": (64, 64, (4, 4, 1, 0.5), "", ""),
@@ -39,7 +39,7 @@ CASES = {
 
 def parity(run: benchmark.Run, count: int) -> None:
     """Differences of distances, over the half diagonal of the footprint, and of normals."""
-    every = *hfields.KINDS, *hfields.HELD_OUT
+    every = *hfields.KINDS, *hfields.MORE_KINDS
     for name, (nrow, ncol, size, geom, body) in CASES.items():
         data, extent = hfields.heights(nrow, ncol, seed=nrow), np.array(size, np.float64)
         reference = hfields.Reference(data, extent, geom, body)
@@ -52,8 +52,8 @@ def parity(run: benchmark.Run, count: int) -> None:
         t, n = reference(o, d)
         length, unit = np.linalg.norm(d, axis=1), np.hypot(*size[:2])
         for dtype, tolerance in ((np.float64, 1e-10), (np.float32, 1e-5)):
-            ours, normals = ray(HField(np.asarray(field.data, dtype), field.size, field.pos, field.quat), o, d)
-            ours, normals = np.asarray(ours, np.float64), np.asarray(normals, np.float64)
+            scan = ray(HField(np.asarray(field.data, dtype), field.size, field.pos, field.quat), o, d)
+            ours, normals = np.asarray(scan.dist, np.float64), np.asarray(scan.n, np.float64)
             flips = (ours < 0) != (t < 0)
             off = np.where(flips, np.inf, np.abs(ours - t) * length / unit)
             across = np.where(flips, np.inf, np.abs(ours - t) * np.abs((d * n).sum(1)) / unit)
@@ -104,7 +104,7 @@ def closed_forms(run: benchmark.Run, count: int) -> None:
         "at vertices": (HField(low.astype(np.float64), size), hfields.Reference(low, size), vertices),
     }
     for name, (ours, theirs, (o, d, t)) in sets.items():
-        wrong = [np.abs(found - t) > 1e-9 for found in (np.asarray(ray(ours, o, d)[0]), theirs(o, d)[0])]
+        wrong = [np.abs(found - t) > 1e-9 for found in (np.asarray(ray(ours, o, d).dist), theirs(o, d)[0])]
         run.row(f"closed form, {name}", {"rays": count, "ours misses": wrong[0].sum(), "MuJoCo's": wrong[1].sum()})
         run.claim(not wrong[0].any(), f"closed form, {name}: ours misses {wrong[0].sum()} rays of {count}, none")
 
@@ -238,9 +238,46 @@ def gradient(run: benchmark.Run) -> None:
             run.claim(right, f"{align}, {name}: off by {error:.1e} and {both:.1e}, at most 1e-7 and 1e-10")
 
 
+def geoms(run: benchmark.Run, count: int, cores: int = 2) -> None:
+    """Rays from anywhere to anywhere among three height fields and ten primitives of random models, in single precision."""
+    apart, others, misses, largest, rates = 0, 0, 0, 0.0, {}
+    models = 10
+    for seed in range(models):
+        model, data = hfields.model_of(np.random.default_rng([30, seed]), 3, 10)
+        start, end = np.random.default_rng([31, seed]).uniform(-4, 4, (2, count // models, 3)).astype(np.float32)
+        o, d = start.astype(np.float64), (end - start).astype(np.float64)
+        begin = time.perf_counter()
+        t, n, geom = hfields.mujocos_rays(model, data, o, d)
+        seconds = time.perf_counter() - begin
+        room = Geoms.from_model(model).at(data)
+        found = jax.tree.map(np.asarray, ray(room, o, d))
+        off = np.abs(found.dist - t) * np.abs((d * n).sum(1))  # by the part that leads away from the surface
+        wrong = (found.geom != geom) | (off > 1e-5)
+        apart, misses = apart + wrong.sum(), misses + (t < 0).sum()
+        largest = max(largest, off[~wrong].max())
+        for place in np.flatnonzero(wrong):
+            beside = np.random.default_rng(1).normal(size=(200, 3)) * 1e-5
+            near = hfields.mujocos_rays(model, data, o[place] + beside, np.tile(d[place], (200, 1)))[2]
+            others += found.geom[place] not in near
+        if seed == 0:
+            rays = [jnp.asarray(value, jnp.float32) for value in (o, d)]
+            works = {
+                name: functools.partial(ray, given, *rays) for name, given in (("ray", room), ("prepared", room.prepared()))
+            }
+            rates = {"mj_ray, one thread": len(o) / seconds}
+            rates |= {name: len(o) / min(benchmark.seconds(work, 5)) for name, work in works.items()}
+    total = models * (count // models)
+    numbers = {"rays": total, "of these misses": misses, "largest difference across": largest, "apart": apart}
+    run.row(f"{models} models of 3 height fields and 10 primitives", numbers | {"not past an edge": others})
+    run.claim(apart <= total // 2000, f"{apart} rays of {total} meet something else, at most {total // 2000}")
+    run.claim(not others, f"of these {others} do not meet what a ray a hair beside meets in MuJoCo, none")
+    for name, value in rates.items():
+        run.row(name, {"million rays a second": value / 1e6, "times mj_ray's": value / rates["mj_ray, one thread"]})
+
+
 @functools.cache
-def _mjx_model(path: str | None, side: int):
-    """A ball that rolls over a terrain."""
+def _mjx_model(path: str | None, side: int, more: str = ""):
+    """A ball that rolls over a terrain, and `more` geoms beside it."""
     mjx: Any = importlib.import_module("mujoco.mjx")
     if path is None:
         random = np.random.default_rng(0)
@@ -255,7 +292,7 @@ def _mjx_model(path: str | None, side: int):
     model = hfields.mujoco.MjModel.from_xml_string(
         f"""<mujoco><option timestep="0.004" iterations="4" ls_iterations="6"/>
         <asset><hfield name="h" nrow="{nrow}" ncol="{ncol}" size="10 10 {height} 1"/></asset>
-        <worldbody><geom name="ground" type="hfield" hfield="h"/>
+        <worldbody><geom name="ground" type="hfield" hfield="h"/>{more}
         <body pos="0 0 {height + 0.3}"><freejoint/><geom type="sphere" size="0.15"/></body></worldbody></mujoco>"""
     )
     model.hfield_data[:] = terrain.astype(np.float32).ravel()
@@ -298,6 +335,34 @@ def in_mjx(run: benchmark.Run, path: str | None, steps: int, robots: int) -> Non
     run.row(f"{robots} balls, {steps} steps, terrain {ground.data.shape}", rates | ends)
     near = above.min() > 0.1 and above.max() < 0.25
     run.claim(near, f"balls of 0.15 m end {above.min():.3f} to {above.max():.3f} m above what scans say, within 0.1 and 0.25")
+    among_geoms(run, path)
+
+
+def among_geoms(run: benchmark.Run, path: str | None, balls: int = 16) -> None:
+    """Lidars above rolling balls, beside a box, in MJX's program of a step: what MuJoCo's rays meet, to 1e-3."""
+    model, mjx = _mjx_model(path, 32, '<geom type="box" size="1 1 1" pos="3 3 1"/>')
+    on_device, room, pattern = mjx.put_model(model), Geoms.from_model(model), lidar_pattern(8, (-60.0, 10.0), resolution=10.0)
+    places = jnp.asarray(np.random.default_rng(1).uniform(-6, 6, (balls, 2)), jnp.float32)
+
+    @jax.jit
+    def rolled(places):
+        made = mjx.make_data(model)
+        data = jax.vmap(lambda place: made.replace(qpos=made.qpos.at[:2].set(place)))(places)
+        data = jax.lax.scan(lambda data, _: (jax.vmap(mjx.step, (None, 0))(on_device, data), None), data, None, 20)[0]
+        above = data.qpos[:, :3] + jnp.array([0, 0, 1.0])[None]
+        return data, above, lidar(room.at(data), above, data.qpos[:, 3:7], pattern)
+
+    data, above, scan = jax.tree.map(np.asarray, rolled(places))
+    apart = 0
+    for k in range(balls):
+        state = hfields.mujoco.MjData(model)
+        hfields.mujoco.mj_forward(model, state)
+        state.geom_xpos[:], state.geom_xmat[:] = data.geom_xpos[k], data.geom_xmat[k].reshape(-1, 9)
+        d = pattern @ hfields.matrix(data.qpos[k, 3:7]).T
+        t, _, geom = hfields.mujocos_rays(model, state, np.tile(above[k].astype(np.float64), (len(d), 1)), d)
+        apart += np.sum((scan.geom[k] != geom) | (np.abs(scan.dist[k] - t) > 1e-3))
+    met = len(np.unique(scan.geom))
+    run.claim(apart <= 2 and met > 2, f"{apart} of {scan.dist.size} rays of lidars in MJX are not MuJoCo's, at most 2")
 
 
 def main() -> None:
@@ -308,7 +373,7 @@ def main() -> None:
         "20 times as fast as mj_ray, that other heights compile nothing, derivatives are right, and balls stay on the ground",
     )
     parser = run.parser
-    parser.add_argument("parts", nargs="*", default=[*PARTS[:3]], choices=PARTS)
+    parser.add_argument("parts", nargs="*", default=[*PARTS[:-1]], choices=PARTS)
     parser.add_argument("--rays", type=int, default=100_000, help="of each case of parity")
     parser.add_argument("--robots", type=int, default=4096, help="of speed")
     parser.add_argument("--steps", type=int, default=100, help="of mjx")
@@ -325,6 +390,8 @@ def main() -> None:
             speed(run, given.robots)
         elif part == "gradient":
             gradient(run)
+        elif part == "geoms":
+            geoms(run, given.rays)
         else:
             in_mjx(run, given.terrain, given.steps, given.balls)
     run.end()

@@ -9,6 +9,7 @@ mujoco: Any = importlib.import_module("mujoco")  # its functions are unknown to 
 
 SIZE = np.array([3.0, 5.0, 0.7, 0.2])
 KINDS = ("outside", "inside", "below", "vertical", "grazing", "walls", "edges")
+MORE_KINDS = ("buried", "beneath")  # for benchmarks alone
 
 
 def heights(nrow: int, ncol: int, seed: int = 0) -> np.ndarray:
@@ -88,7 +89,47 @@ class Reference:
         return o @ rotation.T + self.data.geom_xpos[1], d @ rotation.T
 
     def __call__(self, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        t, n = np.empty(len(o)), np.empty((len(o), 3))
-        for k in range(len(o)):
-            t[k] = mujoco.mj_ray(self.model, self.data, o[k], d[k], None, True, -1, None, n[k])
-        return t, n
+        return mujocos_rays(self.model, self.data, o, d)[:2]
+
+
+def mujocos_rays(model: Any, data: Any, o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances, normals and geoms' numbers by `mj_ray`."""
+    t, n, geom, number = np.empty(len(o)), np.empty((len(o), 3)), np.empty(len(o), int), np.zeros(1, np.int32)
+    for k in range(len(o)):
+        t[k] = mujoco.mj_ray(model, data, o[k], d[k], None, True, -1, number, n[k])
+        geom[k] = number[0]
+    return t, n, geom
+
+
+PRIMITIVES = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box")
+
+
+def model_of(random: np.random.Generator, hfields: int, primitives: int) -> tuple[Any, Any]:
+    """A model of height fields and primitives anywhere in a room, some of which joints move, and its data after a move.
+
+    Of the height fields the first stands still; there is a primitive of each kind where there are enough.
+    """
+
+    def placed() -> str:
+        pos, quat = random.uniform(-3, 3, 3), random.normal(size=4)
+        return f'pos="{" ".join(map(str, pos))}" quat="{" ".join(map(str, quat))}"'
+
+    assets, bodies = "", ""
+    for k in range(hfields):
+        (nrow, ncol), size = random.integers(2, 20, 2), random.uniform([0.5, 0.5, 0.2, 0.05], [3, 3, 1, 0.5])
+        assets += f'<hfield name="h{k}" nrow="{nrow}" ncol="{ncol}" size="{" ".join(map(str, size))}"/>'
+        geom = f'<geom type="hfield" hfield="h{k}" mass="1" {placed()}/>'
+        bodies += f"<body {placed()}><freejoint/>{geom}</body>" if k else geom
+    kinds = [*PRIMITIVES, *random.choice(PRIMITIVES, max(0, primitives - len(PRIMITIVES)))][:primitives]
+    for kind in kinds:
+        size = random.uniform(0.2, 1.2, 3) * (random.choice([0, 3], 3) if kind == "plane" else 1)
+        geom = f'<geom type="{kind}" size="{size[0]} {size[1]} {max(size[2], 0.1)}" {placed()}/>'
+        bodies += geom if kind == "plane" else f'<body {placed()}><joint type="hinge"/>{geom}</body>'
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><asset>{assets}</asset><worldbody>{bodies}</worldbody></mujoco>")
+    for k in range(hfields):
+        first, (nrow, ncol) = model.hfield_adr[k], (model.hfield_nrow[k], model.hfield_ncol[k])
+        model.hfield_data[first : first + nrow * ncol] = heights(nrow, ncol, k).ravel()
+    data = mujoco.MjData(model)
+    data.qpos += 0.3 * random.normal(size=model.nq)
+    mujoco.mj_forward(model, data)
+    return model, data

@@ -16,6 +16,7 @@ from ..core.settings import Settings
 from ..core.types import NUMBERS, AnyArray, Number, array_leaf, float_leaf, height_leaf
 from ..rendering.render import heightfield_grids
 from ..trace.grid import Grid
+from .model import geom_number, geom_pose, geom_type, hfield_numbers
 
 SEARCHED = Settings(shading="flat")  # for grids in which a triangle is searched for, cells by cells by data
 
@@ -80,6 +81,11 @@ class HField(eqx.Module):
         return (np if isinstance(leaf, np.ndarray) else jnp).broadcast_to(leaf, wanted)
 
     @property
+    def dtype(self) -> Any:
+        """The precision of rays."""
+        return self.data.dtype
+
+    @property
     def batch(self) -> tuple[int, ...]:
         """The leading axes of a batch; () for one."""
         return self.data.shape[:-2]
@@ -105,27 +111,10 @@ class HField(eqx.Module):
         Raises:
           ValueError: the geom is no height field.
         """
-        name = geom
-        if isinstance(geom, str):
-            try:
-                geom = int(model.geom(geom).id)
-            except (KeyError, AttributeError) as error:  # MJX's model has no names
-                rule = f"must be a geom's number, or its name in a mujoco.MjModel; no geom there is named {name!r}"
-                raise ArgumentError("HField.from_model", "geom", rule) from error
-        if not 0 <= geom < model.ngeom:
-            raise ArgumentError("HField.from_model", "geom", f"must be a number from 0 to {model.ngeom - 1}, it is {name!r}")
-        if int(model.geom_type[geom]) != _MJGEOM_HFIELD:
-            raise ArgumentError("HField.from_model", "geom", f"must be a height field, {name!r} is none")
-        number = int(model.geom_dataid[geom])
-        nrow, ncol, first = (int(array[number]) for array in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
-        data = np.array(model.hfield_data[first : first + nrow * ncol]).reshape(nrow, ncol)
-        pos, quat = np.array(model.geom_pos[geom], np.float64), np.array(model.geom_quat[geom], np.float64)
-        body = int(model.geom_bodyid[geom])
-        while body:
-            parent = np.array(model.body_quat[body], np.float64)
-            pos, quat = np.array(model.body_pos[body]) + _rotated(parent, pos), _product(parent, quat)
-            body = int(model.body_parentid[body])
-        return cls(data, np.array(model.hfield_size[number], np.float64), pos, quat)
+        number = geom_number("HField.from_model", "geom", model, geom)
+        if geom_type(model, number) != "hfield":
+            raise ArgumentError("HField.from_model", "geom", f"must be a height field, {geom!r} is none")
+        return cls(*hfield_numbers(model, number), *geom_pose(model, number))
 
 
 def as_numbers(owner: str, name: str, value: Any, dtype: Any) -> jax.Array:
@@ -150,15 +139,3 @@ def number_pair(owner: str, name: str, value: Any) -> tuple[float, float]:
     """Two numbers that are known and finite."""
     first, second = known_numbers(owner, name, value, Number(shape=(2,), shape_words="be two numbers"))
     return float(first), float(second)
-
-
-_MJGEOM_HFIELD = 1  # mjtGeom's number of a height field
-
-
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The quaternion of `b` followed by `a`."""
-    return np.r_[a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])]
-
-
-def _rotated(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
-    return v + 2 * np.cross(quat[1:], np.cross(quat[1:], v) + quat[0] * v)

@@ -29,6 +29,24 @@ def _normalised(quat: Quaternion) -> Quaternion:
     return unit(jnp.where(short, jnp.array([1, 0, 0, 0], quat.dtype), quat))
 
 
+def quaternion(matrix: Float[jax.Array, "3 3"]) -> Quaternion:
+    """The quaternion of a rotation, of a length from 2 to 4.
+
+    Of four multiples of it, each without a root or a quotient, the longest (Shepperd, "Quaternion from Rotation Matrix",
+    Journal of Guidance and Control, 1978).
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
+    turns, sums = [zy - yz, xz - zx, yx - xy], [yz + zy, zx + xz, xy + yx]
+    squares = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz]
+    ways = [
+        [squares[0], turns[0], turns[1], turns[2]],
+        [turns[0], squares[1], sums[2], sums[1]],
+        [turns[1], sums[2], squares[2], sums[0]],
+        [turns[2], sums[1], sums[0], squares[3]],
+    ]
+    return jnp.stack([jnp.stack(way) for way in ways])[jnp.argmax(jnp.stack(squares))]
+
+
 def pose(pos: Vector, quat: Quaternion) -> Affine:
     """world_from_local."""
     return Affine(rotation(quat), pos)

@@ -1,83 +1,52 @@
-"""Where rays meet MuJoCo's height field, as `mj_ray` has it."""
+"""Rays among MuJoCo's geoms, as `mj_ray` has them."""
 
-import math
+import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from ..core.affine import Affine
-from ..core.autodiff import stored
 from ..core.errors import ArgumentError, require_kind
-from ..core.ray import Ray
-from ..core.types import Flag, Index, Scalar
-from ..core.vector import finite, quotient, unit
-from ..rendering.chunks import trace_batch
-from ..scene.heightfield import Heightfield
-from ..trace.grid import Grid, joined, make_grid
-from ..trace.hit import Status
-from ..trace.intersect import plane_distance, ray_in_grid
-from ..trace.search import first_triangle
-from ..trace.triangle import plane_through, triangle_corners
-from ..trace.walk import WalkResult
+from ..core.types import POSITIVE, AnyArray, Scalar
 from ..xla.compilation import compiled
 from ..xla.devices import takes_numbers
-from ..xla.materialise import materialise
-from .hfield import SEARCHED, HField, as_numbers
-from .pose import pose
-from .solid import Ground, Side, base_faces, column, ground_of, wall
-
-CHUNK = 1024  # rays traced together
-
-
-class Scan(eqx.Module):
-    """What the rays of a scan met, with the scan's axes: of the robots, then of the pattern.
-
-    Attributes:
-      p: where in the world; the ray's start where it met nothing.
-      n: unit normals; zero where nothing was met.
-      dist: distances from the rays' starts, in units of their directions' length; -1 where nothing was met.
-      mask: where something was met.
-    """
-
-    p: Float[jax.Array, "*rays 3"]
-    n: Float[jax.Array, "*rays 3"]
-    dist: Float[jax.Array, "*rays"]
-    mask: Bool[jax.Array, "*rays"]
-
-    @property
-    def heights(self) -> Float[jax.Array, "*rays"]:
-        """z of what was met, in the world; of the ray's start where nothing was, see `mask`."""
-        return self.p[..., 2]
+from .geoms import Geoms
+from .hfield import HField, as_numbers, known_numbers
+from .primitives import meet_primitives
+from .surface import Scan, meet_hfield
 
 
 @takes_numbers
-def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], Float[jax.Array, "*rays 3"]]:
-    """The distances at which rays pnt + x vec, x >= 0, first meet a height field, in units of |vec|, and the normals there.
+def ray(geoms: HField | Geoms, pnt: Any, vec: Any, *, max_range: Any = None) -> Scan:
+    """What rays pnt + x vec, x >= 0, meet first; `dist` is x, in units of |vec|.
 
-    What `mujoco.mj_ray` and `mj_rayHfield` return: -1 and a zero normal for a ray that meets nothing; a ray that starts below
-    the surface meets the base and the walls from within; the normal is the triangle's own, upwards, or points out of the
-    solid, from whichever side the ray came. Unlike there no ray slips through between two triangles or two walls; one that
-    starts on the surface, to the last bit, leaves it; and a `vec` that is zero or not finite meets nothing. Both results
-    are differentiable in all numbers of the height field and of the rays; at a miss the derivative is zero.
+    What `mujoco.mj_ray` returns: -1 and a zero normal for a ray that meets nothing. A plane is met from above alone, other
+    geoms from within too. A ray that starts below the surface of a height field meets the base and the walls from within; the
+    normal is the triangle's own, upwards, or points out of the solid, from whichever side the ray came. Unlike there no ray
+    slips through between two triangles or two walls; one that starts on a height field's surface, to the last bit, leaves it;
+    and a `vec` that is zero or not finite meets nothing. Results are differentiable in all numbers of the geoms and of the
+    rays; at a miss the derivative is zero.
 
     Args:
-      hfield: one height field, or a batch.
-      pnt, vec: origins and directions, world frame, shapes (..., 3), broadcast against each other. For a batch of height
-        fields they begin with its axes: each has rays of its own.
+      geoms: a height field, or a batch of them; or several geoms.
+      pnt, vec: origins and directions, world frame, shapes (..., 3), broadcast against each other. For a batch they begin with
+        its axes: each has rays of its own.
+      max_range: how far rays reach, in units of length; None: without end.
 
     Returns:
-      Distances (...) and normals (..., 3).
+      A `Scan` with the axes of the rays.
 
     Raises:
-      ValueError: `pnt` or `vec` does not end in an axis of length 3, or does not begin with the axes of the batch.
+      ValueError: `pnt` or `vec` does not end in an axis of length 3, or does not begin with the axes of the batch; a range
+        that is not positive.
     """
-    require_kind("ray", "hfield", hfield, HField, "a jaxhf.mujoco.HField")
-    dtype = hfield.data.dtype
+    require_kind("ray", "geoms", geoms, HField | Geoms, "a jaxhf.mujoco.HField or Geoms")
+    dtype = geoms.dtype
     pnt, vec = as_numbers("ray", "pnt", pnt, dtype), as_numbers("ray", "vec", vec, dtype)
     for name, value in (("pnt", pnt), ("vec", vec)):
         if value.shape[-1:] != (3,):
@@ -86,121 +55,68 @@ def ray(hfield: HField, pnt: Any, vec: Any) -> tuple[Float[jax.Array, "*rays"], 
         shape = np.broadcast_shapes(pnt.shape, vec.shape)
     except ValueError as error:
         raise ArgumentError("ray", "vec", f"must fit pnt of shape {pnt.shape}, its shape is {vec.shape}") from error
-    if shape[: len(hfield.batch)] != hfield.batch or len(shape) <= len(hfield.batch):
-        rule = f"must begin with the axes {hfield.batch} of the height fields, the rays have shape {shape}"
+    if shape[: len(geoms.batch)] != geoms.batch or (geoms.batch and len(shape) <= len(geoms.batch)) or len(shape) < 1:
+        rule = f"must begin with the axes {geoms.batch} of the geoms, the rays have shape {shape}"
         raise ArgumentError("ray", "pnt", rule)
-    met = first_met(hfield, jnp.broadcast_to(pnt, shape), jnp.broadcast_to(vec, shape))
-    return met.dist, met.n
+    return first_met(geoms, jnp.broadcast_to(pnt, shape), jnp.broadcast_to(vec, shape), reach("ray", max_range))
 
 
-def first_met(hfield: HField, o: Float[jax.Array, "*rays 3"], d: Float[jax.Array, "*rays 3"]) -> Scan:
-    """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them."""
-    return _first_met(hfield.data, hfield.size, hfield.pos, hfield.quat, hfield._grid, o, d)
+def reach(owner: str, max_range: Any) -> Any:
+    """A range that is known to be positive or is traced, or None."""
+    return None if max_range is None else known_numbers(owner, "max_range", max_range, POSITIVE)
+
+
+def first_met(
+    geoms: HField | Geoms,
+    o: Float[jax.Array, "*rays 3"],
+    d: Float[jax.Array, "*rays 3"],
+    max_range: Any = None,
+    of_field: Callable[[HField], Scan] | None = None,
+) -> Scan:
+    """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them.
+
+    Args:
+      geoms, max_range: see `ray`.
+      o, d: origins and directions.
+      of_field: what these rays meet of one height field, where that can be told without a search of each.
+    """
+    of_field = of_field or (lambda field: meet_hfield(field, o, d))
+    if isinstance(geoms, HField):
+        scan = of_field(geoms)
+    else:
+        parts = [of_field(field) for field in geoms.hfields]
+        ids = np.array(geoms.ids, np.int32)
+        if geoms.kinds:
+            size, pos, quat = (jnp.asarray(leaf, geoms.dtype) for leaf in (geoms.size, geoms.pos, geoms.quat))
+            parts.append(meet_primitives(size, pos, quat, ids[len(geoms.hfields) :], o, d, kinds=geoms.kinds))
+        scan = _nearest_scan(tuple(parts), ids[: len(geoms.hfields)])
+    return scan if max_range is None else _reached(scan, o, d, jnp.asarray(max_range, o.dtype))
 
 
 @compiled
-def _first_met(
-    data: jax.Array, size: jax.Array, pos: jax.Array, quat: jax.Array, grid: Grid | None, o: jax.Array, d: jax.Array
-) -> Scan:
-    """From the numbers alone: whether they stand upright makes no other program."""
-    hfield = eqx.tree_at(lambda hfield: hfield._grid, HField(data, size, pos, quat), grid, is_leaf=lambda leaf: leaf is None)
-    axes, fields = o.shape[:-1], one_axis(hfield)
-    count = len(fields.data)
-    rays = o.reshape(count, -1, 3), d.reshape(count, -1, 3)
-    met = trace_batch(_searchable, _joined, lambda ground, ray: _one(ground, Ray(ray[0], ray[1])), fields, rays, CHUNK)
-    return jax.tree.map(lambda leaf: leaf.reshape(*axes, *leaf.shape[2:]), met)
+def _nearest_scan(parts: tuple[Scan, ...], ids: Int[AnyArray, " fields"]) -> Scan:
+    """The nearest of what the height fields, by their numbers, and behind them the primitives were met at."""
+    numbered = [
+        dataclasses.replace(part, geom=jnp.where(part.mask, jnp.asarray(ids)[k], -1)) if part.geom is None else part
+        for k, part in enumerate(parts)
+    ]
+
+    def nearer(best: Scan, part: Scan) -> Scan:
+        return _chosen(part.mask & (~best.mask | (part.dist < best.dist)), part, best)
+
+    return functools.reduce(nearer, numbered)
 
 
-def one_axis(hfield: HField) -> HField:
-    """A batch, or a single one, as a batch with one axis, its numbers in the precision of the heights."""
-    axes, count = len(hfield.batch), math.prod(hfield.batch)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, hfield.data.dtype).reshape(count, *leaf.shape[axes:]), hfield)
+@compiled
+def _reached(scan: Scan, o: jax.Array, d: jax.Array, max_range: Scalar) -> Scan:
+    near = scan.mask & (scan.dist * jnp.linalg.norm(lax.stop_gradient(d), axis=-1) <= max_range)
+    nothing = jax.tree.map(lambda leaf: jnp.full_like(leaf, -1), scan)
+    nothing = dataclasses.replace(nothing, p=jnp.broadcast_to(o, scan.p.shape), n=0 * scan.n, mask=jnp.zeros_like(scan.mask))
+    return _chosen(near, scan, nothing)
 
 
-def _searchable(hfield: HField) -> Ground:
-    field = lax.stop_gradient(hfield)
-    return ground_of(hfield, field._grid or make_grid(Heightfield(field.data, 1.0, 1.0), None, SEARCHED))
+def _chosen(first: Bool[jax.Array, "*rays"], one: Scan, other: Scan) -> Scan:
+    def chosen(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(first.reshape(*first.shape, *(1,) * (a.ndim - first.ndim)), a, b)
 
-
-def _joined(grounds: Ground) -> tuple[Ground, Ground]:
-    """See `trace_batch`: what is `joined` of the grids is in common, and so are the data."""
-
-    def with_parts(grounds: Ground, rows: jax.Array | None, grid: Grid) -> Ground:
-        return eqx.tree_at(lambda all: (all.rows, all.grid), grounds, (rows, grid), is_leaf=lambda leaf: leaf is None)
-
-    assert grounds.grid is not None
-    shared, own = joined(grounds.grid)
-    nothing = jax.tree.map(lambda _: None, grounds)
-    return with_parts(nothing, grounds.rows.reshape(-1), shared), with_parts(grounds, None, own)
-
-
-def _one(ground: Ground, ray: Ray) -> Scan:
-    """What one ray in the world's frame meets, after a walk over the surface."""
-    grid, frame = ground.grid, pose(ground.pos, ground.quat)
-    assert grid is not None
-    local = in_hfield(frame, ray)
-    within = column(ground, local)
-    faces = base_faces(ground, local, within)
-    limit = lax.stop_gradient(jnp.where(faces[0].met, faces[0].t, jnp.where(faces[1].met, faces[1].t, jnp.inf)))
-    scaled, scale = ray_in_grid(grid, in_cells(ground, local))
-    found = first_triangle(grid, scaled, t_max=limit * scale)
-    found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (found.t_near / scale, found.t_far / scale))
-    found = stored(materialise(found))
-    walls = (wall(ground, local, side, found.side < 0) for side in within)
-    return nearest(ground, local, frame, found, [*faces, *walls])
-
-
-def in_hfield(frame: Affine, ray: Ray) -> Ray:
-    """A ray of the world's in the height field's frame; one that is not finite gets a direction of zero."""
-    valid = finite(ray.o) & finite(ray.d)
-    o, d = jnp.where(valid, ray.o, frame.offset), jnp.where(valid, ray.d, 0)
-    return Ray(frame.covector(o - frame.offset), frame.covector(d))
-
-
-def in_cells(ground: Ground, local: Ray) -> Ray:
-    """A ray of the height field's frame in cells by cells by data, such that the border is at whole numbers to the last bit."""
-    nrow, ncol = ground.shape
-    half = jnp.array([(ncol - 1) / 2, (nrow - 1) / 2, 1], local.o.dtype)
-    centre = jnp.array([1, 1, 0], local.o.dtype)
-    size = ground.size[:3]
-    return Ray((quotient(local.o, size) + centre) * half, quotient(local.d, size) * half)
-
-
-def triangle_heights(ground: Ground, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
-    """The data at the vertices of a triangle, see `triangle_corners`."""
-    # XLA on the CPU fuses a gather into its only user; one with several users becomes a loop over its elements, some twenty
-    # times as slow.
-    rows, first, ix, iy, upper = materialise((ground.rows, ground.first, ix, iy, upper))
-    return materialise(triangle_corners(rows, ground.shape[1], ix, iy, upper, first))
-
-
-def nearest(ground: Ground, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Scan:
-    """The nearest of the triangle that a search found and of the solid's sides; of two at the same distance the first side.
-
-    Args:
-      ground: the height field.
-      local: the ray in its frame.
-      frame: world from that frame.
-      found: the triangle; t counts as the ray's does. Of a ray straight down only its cell is used, as it is over one place
-        wherever on it the search began.
-      solid: the sides.
-    """
-    nrow, ncol = ground.shape
-    plane = a, b, c = plane_through(triangle_heights(ground, found.ix, found.iy, found.upper), found.upper)
-    down = (local.d[0] == 0) & (local.d[1] == 0)
-    near, far = jnp.where(down, 0, found.t_near), jnp.where(down, jnp.inf, found.t_far)
-    found = eqx.tree_at(lambda found: (found.t_near, found.t_far), found, (near, far))
-    cells = in_cells(ground, local)
-    t = plane_distance(plane, cells, found)
-    at, size = cells(t), ground.size
-    u, v = at[0] - found.ix.astype(t.dtype), at[1] - found.iy.astype(t.dtype)
-    per_x, per_y = quotient(a * size[2] * ((ncol - 1) / 2), size[0]), quotient(b * size[2] * ((nrow - 1) / 2), size[1])
-    surface = Side(t, found.status == int(Status.HIT), unit(jnp.stack([-per_x, -per_y, jnp.ones_like(a)])))
-    best = Side(jnp.full_like(t, jnp.inf), jnp.zeros((), bool), jnp.zeros_like(surface.n))
-    for side in (*solid, surface):
-        closer = side.met & (side.t < best.t)
-        best = Side(jnp.where(closer, side.t, best.t), best.met | side.met, jnp.where(closer, side.n, best.n))
-    t = jnp.where(best.met, best.t, 0)
-    p = local(t)
-    z = jnp.where(surface.met & (surface.t == best.t), (c + a * u + b * v) * size[2], p[2])  # free of the ray's own rounding
-    return Scan(frame.point(jnp.stack([p[0], p[1], z])), frame.vector(best.n), jnp.where(best.met, t, -1), best.met)
+    return jax.tree.map(chosen, one, other)

@@ -22,10 +22,12 @@ from ..trace.walk import WalkResult
 from ..xla.compilation import compiled
 from ..xla.devices import takes_numbers
 from ..xla.materialise import materialise
+from .geoms import Geoms
 from .hfield import HField, as_numbers, known_numbers, number_pair
 from .pose import Quaternion, pose, rotation, yaw
-from .ray import Scan, first_met, in_hfield, nearest, one_axis, triangle_heights
+from .ray import first_met, reach
 from .solid import base_faces, column, ground_of
+from .surface import Scan, in_frame, meet_hfield, nearest, one_axis, triangle_heights
 
 Align = Literal["yaw", "base", "world"]
 
@@ -49,7 +51,16 @@ def grid_pattern(size: tuple[float, float] = (1.6, 1.0), resolution: float = 0.1
 
 
 @takes_numbers
-def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, offset: Any = 20.0, align: str = "yaw") -> Scan:
+def height_scan(
+    geoms: HField | Geoms,
+    pos: Any,
+    quat: Any,
+    pattern: Any = None,
+    *,
+    offset: Any = 20.0,
+    align: str = "yaw",
+    max_range: Any = None,
+) -> Scan:
     """What rays meet that start above each place of a pattern, which moves and turns with a robot, and go down.
 
     Straight down over a height field that is upright (see `HField`) there is nothing to search: the triangle is looked up, by
@@ -59,40 +70,50 @@ def height_scan(hfields: HField, pos: Any, quat: Any, pattern: Any = None, *, of
     and results a look-up needs about 60 bytes a ray, in single precision.
 
     Args:
-      hfields: one height field, or a batch.
-      pos, quat: the robots' positions and orientations (w, x, y, z), shapes (..., 3) and (..., 4). For a batch of
-        height fields they begin with its axes: each has robots of its own.
+      geoms: a height field, or a batch of them; or several geoms.
+      pos, quat: the robots' positions and orientations (w, x, y, z), shapes (..., 3) and (..., 4). For a batch they begin with
+        its axes: each has robots of its own.
       pattern: places (n, 2) in the robot's frame; None: `grid_pattern()`.
       offset: how far above the robot rays start; rays that start below the surface meet the base from within.
       align: yaw: the pattern follows the robot's heading, and rays go straight down; base: the pattern and the rays are
         tilted with the robot; world: neither turns.
+      max_range: how far rays reach from where they start; None: without end.
 
     Returns:
       A `Scan` with the axes (..., n).
 
     Raises:
-      ValueError: shapes that do not fit, an unknown `align`, an `offset` that is not finite.
+      ValueError: shapes that do not fit, an unknown `align`, an `offset` that is not finite, a range that is not positive.
     """
     owner = "height_scan"
-    pos, quat, places = on_sensors(owner, hfields, pos, quat, grid_pattern() if pattern is None else pattern, 2)
+    pos, quat, places = on_sensors(owner, geoms, pos, quat, grid_pattern() if pattern is None else pattern, 2)
     require(owner, "align", align, OneOf(Align))
     offset = known_numbers(owner, "offset", offset, FINITE)
     starts = _starts(pos, quat, jnp.asarray(offset, pos.dtype), align=align)
-    if hfields.upright and align != "base":
-        return _look_up(hfields, starts, places)
-    return first_met(hfields, *_rays(starts, places))
+
+    def looked_up(field: HField) -> Scan:
+        return _look_up(field, starts, places)
+
+    if align != "base" and isinstance(geoms, HField) and geoms.upright and max_range is None:
+        return looked_up(geoms)
+    o, d = _rays(starts, places)
+
+    def met(field: HField) -> Scan:
+        return looked_up(field) if align != "base" and field.upright else meet_hfield(field, o, d)
+
+    return first_met(geoms, o, d, reach(owner, max_range), met)
 
 
 def on_sensors(
-    owner: str, hfields: HField, pos: Any, quat: Any, pattern: Any, columns: int
+    owner: str, geoms: HField | Geoms, pos: Any, quat: Any, pattern: Any, columns: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """What robots or sensors are given, in the precision of the height fields.
+    """What robots or sensors are given, in the precision of the geoms.
 
     Returns:
-      Positions (..., 3) and orientations (..., 4), which begin with the axes of the height fields; the pattern (n, columns).
+      Positions (..., 3) and orientations (..., 4), which begin with the axes of the geoms' batch; the pattern (n, columns).
     """
-    require_kind(owner, "hfields", hfields, HField, "a jaxhf.mujoco.HField")
-    given, dtype, batch = quat, hfields.data.dtype, hfields.batch
+    require_kind(owner, "geoms", geoms, HField | Geoms, "a jaxhf.mujoco.HField or Geoms")
+    given, dtype, batch = quat, geoms.dtype, geoms.batch
     pos, quat = as_numbers(owner, "pos", pos, dtype), as_numbers(owner, "quat", quat, dtype)
     if not isinstance(given, jax.Array) and not isinstance(quat, Tracer) and not np.any(given, axis=-1).all():
         raise ArgumentError(owner, "quat", "must not be zero, one is (0, 0, 0, 0)")
@@ -187,6 +208,6 @@ def _under(hfield: HField, start: _Start, place: Point2) -> Scan:
     zero = jnp.zeros_like(x)
     found = WalkResult(status, ix, iy, upper, jnp.ones_like(ix), zero, zero, None)
     frame, ready = pose(hfield.pos, hfield.quat), ground_of(hfield)
-    local = in_hfield(frame, Ray(start.o + place[0] * start.along_x + place[1] * start.along_y, start.d))
+    local = in_frame(frame, Ray(start.o + place[0] * start.along_x + place[1] * start.along_y, start.d))
     met = nearest(ready, local, frame, found, base_faces(ready, local, column(ready, local)))
     return Scan(with_tangent(value.p, met.p), with_tangent(value.n, met.n), with_tangent(value.dist, met.dist), valid)

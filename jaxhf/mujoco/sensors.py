@@ -1,22 +1,26 @@
 """Depth cameras and lidars: rays that start at one point and turn with it."""
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
 from ..core.rules import Whole, require
-from ..core.types import ANGLE_OF_VIEW, POSITIVE
+from ..core.types import ANGLE_OF_VIEW, POSITIVE, Scalar
 from ..scene.camera import require_size
 from ..xla.compilation import compiled
 from ..xla.devices import takes_numbers
+from .geoms import Geoms
 from .hfield import HField, known_numbers, number_pair
 from .pose import rotation
-from .ray import Scan, first_met
+from .ray import first_met, reach
 from .scan import on_sensors
+from .surface import Scan
 
 
 def lidar_pattern(
@@ -54,46 +58,72 @@ def lidar_pattern(
 
 
 @takes_numbers
-def lidar(hfields: HField, pos: Any, quat: Any, pattern: Any = None) -> Scan:
+def lidar(
+    geoms: HField | Geoms,
+    pos: Any,
+    quat: Any,
+    pattern: Any = None,
+    *,
+    max_range: Any = None,
+    noise: Any = None,
+    key: jax.Array | None = None,
+) -> Scan:
     """What rays from a sensor meet, in directions that turn with it; `dist` is in units of a direction's length.
 
     Args:
-      hfields: one height field, or a batch.
+      geoms: a height field, or a batch of them; or several geoms.
       pos, quat: the sensors' positions and orientations, as in `height_scan`.
       pattern: directions (n, 3) in the sensor's frame; None: `lidar_pattern()`.
+      max_range: how far rays reach; None: without end.
+      noise: the standard deviation of a measured range, in units of length, by which `dist` and `p` are off along the rays;
+        normal, independent of ray to ray. None: exact ranges.
+      key: of JAX's random numbers, where there is noise.
 
     Returns:
       A `Scan` with the axes (..., n).
 
     Raises:
-      ValueError: shapes that do not fit.
+      ValueError: shapes that do not fit, a range or noise that is not positive, noise without a key.
     """
-    directions = lidar_pattern() if pattern is None else pattern
-    return first_met(hfields, *_turned(*on_sensors("lidar", hfields, pos, quat, directions, 3)))
+    noise = _noise("lidar", noise, key)
+    o, d = _turned(*on_sensors("lidar", geoms, pos, quat, lidar_pattern() if pattern is None else pattern, 3))
+    scan = first_met(geoms, o, d, reach("lidar", max_range))
+    return scan if noise is None else _blurred(scan, d, jnp.asarray(noise, scan.dist.dtype), key)
 
 
 @takes_numbers
 def depth_image(
-    hfields: HField, pos: Any, quat: Any, width: int, height: int, *, fovy: float = 45.0, intrinsics: Any = None
+    geoms: HField | Geoms,
+    pos: Any,
+    quat: Any,
+    width: int,
+    height: int,
+    *,
+    fovy: float = 45.0,
+    intrinsics: Any = None,
+    max_range: Any = None,
+    noise: Any = None,
+    key: jax.Array | None = None,
 ) -> tuple[Float[jax.Array, "*cameras h w"], Float[jax.Array, "*cameras h w"]]:
     """Depths along the optical axis and distances along the rays through the pixels' centres, -1 where nothing is met.
 
     Cameras are MuJoCo's: they look along -z, with x to the right and y up. Differentiable in all numbers but the intrinsics.
 
     Args:
-      hfields: one height field, or a batch.
+      geoms: a height field, or a batch of them; or several geoms.
       pos, quat: the cameras' positions and orientations, as in `height_scan`.
       width, height: pixels.
       fovy: vertical field of view, degrees.
       intrinsics: (fx, fy, cx, cy) in pixels, (cx, cy) from the upper left corner of the picture, or the matrix
         [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]; None: from fovy, with square pixels and the axis in the middle.
+      max_range, noise, key: as in `lidar`.
 
     Returns:
       Depths and distances, top row first, shape (..., height, width).
 
     Raises:
-      ValueError: shapes that do not fit, a size below 1, a fovy that is not between 0 and 180, focal lengths that are not
-        positive.
+      ValueError: shapes that do not fit, a size below 1, a fovy that is not between 0 and 180, focal lengths, a range or
+        noise that are not positive, noise without a key.
     """
     require("depth_image", "fovy", float(fovy), ANGLE_OF_VIEW)
     require_size("depth_image", width, height)
@@ -102,11 +132,30 @@ def depth_image(
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (cy - np.arange(height) - 0.5) / fy)
     # With 1 along the axis a ray's t is the depth itself.
     pixels = np.stack([x, y, -np.ones_like(x)], -1).reshape(-1, 3)
-    met = first_met(hfields, *_turned(*on_sensors("depth_image", hfields, pos, quat, pixels, 3)))
+    noise = _noise("depth_image", noise, key)
+    o, d = _turned(*on_sensors("depth_image", geoms, pos, quat, pixels, 3))
+    met = first_met(geoms, o, d, reach("depth_image", max_range))
+    if noise is not None:
+        met = _blurred(met, d, jnp.asarray(noise, met.dist.dtype), key)
     depth, lengths = met.dist, jnp.asarray(np.linalg.norm(pixels, axis=1), met.dist.dtype)
     dist = jnp.where(met.mask, depth * jnp.broadcast_to(lengths, depth.shape), -1)
     shape = *depth.shape[:-1], height, width
     return depth.reshape(shape), dist.reshape(shape)
+
+
+def _noise(owner: str, noise: Any, key: jax.Array | None) -> Any:
+    if noise is not None and key is None:
+        raise ArgumentError(owner, "key", "must be a key of jax.random, where there is noise")
+    return None if noise is None else known_numbers(owner, "noise", noise, POSITIVE)
+
+
+@compiled
+def _blurred(scan: Scan, d: Float[jax.Array, "*rays 3"], noise: Scalar, key: jax.Array) -> Scan:
+    """With ranges that are off along the rays; none ends behind its start."""
+    length = jnp.linalg.norm(lax.stop_gradient(d), axis=-1)
+    off = noise * jax.random.normal(key, scan.dist.shape, scan.dist.dtype) / jnp.where(length > 0, length, 1)
+    off = jnp.where(scan.mask, jnp.where(off > -scan.dist, off, -scan.dist), 0)
+    return dataclasses.replace(scan, p=scan.p + off[..., None] * d, dist=scan.dist + off)
 
 
 def _lens(intrinsics: Any) -> list[float]:

@@ -5,6 +5,8 @@ wall; between them it may meet the base's two horizontal faces. Whether it is ov
 of the very distances at which it meets the floor, so that no rounding opens an edge.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from jaxtyping import Float
 
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
-from ..core.vector import time_to
+from ..core.vector import greater, lesser, time_to
 from ..trace.grid import Grid
 from .hfield import HField
 
@@ -56,6 +58,28 @@ class Side(eqx.Module):
     n: Vector
 
 
+class Within(NamedTuple):
+    """The distances between which a ray is within a body; the first is the greater one where it never is."""
+
+    begin: Scalar
+    end: Scalar
+
+    def common(self, other: "Within") -> "Within":
+        return Within(greater(self.begin, other.begin), lesser(self.end, other.end))
+
+    def either(self, other: "Within") -> "Within":
+        """Of two bodies that together are convex."""
+        return Within(lesser(self.begin, other.begin), greater(self.end, other.end))
+
+
+def slab(o: Scalar, d: Scalar, half: Scalar) -> Within:
+    """Where a coordinate o + t d is within -half..half."""
+    ahead = jnp.where(d > 0, half, -half)
+    (begin, begins), (end, ends) = time_to(-ahead - o, d), time_to(ahead - o, d)
+    always = jnp.where(jnp.abs(o) <= half, jnp.inf, -jnp.inf)
+    return Within(jnp.where(begins, begin, -always), jnp.where(ends, end, always))
+
+
 def column(ground: Ground, ray: Ray) -> tuple[Side, Side]:
     """Where a ray (in the height field's frame) enters the column over the footprint, and where it leaves it.
 
@@ -63,13 +87,10 @@ def column(ground: Ground, ray: Ray) -> tuple[Side, Side]:
     """
     near, far = [], []
     for axis in (0, 1):
-        d, half = ray.d[axis], ground.size[axis]
-        inside, ahead = jnp.abs(ray.o[axis]) <= half, jnp.where(d > 0, 1, -1).astype(d.dtype)
-        always, never = jnp.where(inside, -jnp.inf, jnp.inf), jnp.where(inside, jnp.inf, -jnp.inf)
-        n = jnp.zeros(3, d.dtype).at[axis].set(ahead)
-        for planes, place, instead, normal in ((near, -half, always, -n), (far, half, never, n)):
-            t, ever = time_to(ahead * place - ray.o[axis], d)
-            planes.append((jnp.where(ever, t, instead), normal))
+        d, within = ray.d[axis], slab(ray.o[axis], ray.d[axis], ground.size[axis])
+        n = jnp.zeros(3, d.dtype).at[axis].set(jnp.where(d > 0, 1, -1).astype(d.dtype))
+        near.append((within.begin, -n))
+        far.append((within.end, n))
     (near_x, in_x), (near_y, in_y), (far_x, out_x), (far_y, out_y) = *near, *far
     first, last = near_x < near_y, far_x > far_y
     t_in, t_out = jnp.where(first, near_y, near_x), jnp.where(last, far_y, far_x)

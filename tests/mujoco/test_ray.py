@@ -33,7 +33,8 @@ def test_equals_mujoco(dtype, tolerance):
     field = HField(field.data.astype(dtype), field.size, field.pos, field.quat)
     o, d = (value.astype(dtype).astype(np.float64) for value in cases(TILTED, GROUND))
     t, n = TILTED(o, d)
-    ours, normals = (np.asarray(value) for value in ray(field, o, d))
+    scan = ray(field, o, d)
+    ours, normals = np.asarray(scan.dist), np.asarray(scan.n)
     # By the part of a difference that leads away from what was met: along a grazing ray roundings are drawn out.
     length = np.linalg.norm(d, axis=1)
     off = np.abs(ours - t) * (length if dtype == np.float64 else np.abs((d * n).sum(1))) / np.linalg.norm(SIZE[:2])
@@ -52,9 +53,9 @@ def test_rays_along_an_axis_meet_what_mujocos_do():
     reference = Reference(GROUND, SIZE)
     places = np.random.default_rng(4).uniform(-1.2, 1.2, (40, 3)) * [*SIZE[:2], SIZE[2:].max()]
     o, d = np.repeat(places.astype(np.float32).astype(float), 6, axis=0), np.tile(np.vstack([np.eye(3), -np.eye(3)]), (40, 1))
-    (ours, normals), (t, n) = ray(HField(GROUND, SIZE), o, d), reference(o, d)
-    np.testing.assert_allclose(ours, t, atol=1e-5)
-    np.testing.assert_allclose(normals, n, atol=1e-4)
+    scan, (t, n) = ray(HField(GROUND, SIZE), o, d), reference(o, d)
+    np.testing.assert_allclose(scan.dist, t, atol=1e-5)
+    np.testing.assert_allclose(scan.n, n, atol=1e-4)
     assert 0.2 < np.mean(t < 0) < 0.8
 
 
@@ -65,7 +66,7 @@ def test_no_ray_slips_through_where_mujoco_loses_some():
     end = o + d
     inside = (np.abs(end[:, :2]) < 0.99 * SIZE[:2]).all(1)
     o, d = end - d * [0.02, 0.02, 1], d * [0.02, 0.02, 1]
-    t = np.asarray(ray(HField(data, SIZE, quat=(2, 0, 0, 0)), o, d)[0])
+    t = np.asarray(ray(HField(data, SIZE, quat=(2, 0, 0, 0)), o, d).dist)
     np.testing.assert_allclose(t[inside], 1, atol=1e-5)  # a ray's own numbers are single ones
     lost = np.abs(Reference(data, SIZE)(o[inside], d[inside])[0] - 1) > 1e-9
     assert lost.sum() > 10  # else MuJoCo is mended, and the docstring of `ray` says too much
@@ -97,7 +98,11 @@ def test_derivatives_are_differences_of_mujocos_rays():
     assert smooth.sum() >= 26
 
     def both(numbers, tangents, weights):
-        found, forward = jax.linearize(lambda *numbers: jnp.column_stack(ray(HField(*numbers[:4]), *numbers[4:])), *numbers)
+        def cast(*numbers):
+            scan = ray(HField(*numbers[:4]), *numbers[4:])
+            return jnp.column_stack([scan.dist, scan.n])
+
+        found, forward = jax.linearize(cast, *numbers)
         return found, forward(*tangents), jax.linear_transpose(forward, *numbers)(weights)
 
     singles = [tuple(np.asarray(value, np.float32) for value in values) for values in (numbers, tangents)]
@@ -117,18 +122,18 @@ def test_derivatives_are_differences_of_mujocos_rays():
 @pytest.mark.optimised  # to the bit
 def test_bounds_at_hand_change_no_bit():
     rays, upright = cases(Reference(GROUND, SIZE), GROUND), HField(GROUND, SIZE)
-    np.testing.assert_array_equal(ray(upright.prepared(), *rays)[0], ray(upright, *rays)[0])
+    np.testing.assert_array_equal(ray(upright.prepared(), *rays).dist, ray(upright, *rays).dist)
 
 
 def test_prepared_and_replaced():
     """`dataclasses.replace` makes a height field anew; a quat of zero turns nothing."""
     o, d = cases(Reference(GROUND, SIZE), GROUND)
     upright = HField(GROUND, SIZE)
-    _, n = ray(upright, o, d)
+    n = ray(upright, o, d).n
     turned = dataclasses.replace(upright.prepared(), quat=(0, 0, 0, 1))
     assert turned._grid is None
     np.testing.assert_allclose(
-        ray(turned, o * [-1, -1, 1], d * [-1, -1, 1])[1], np.asarray(n) * np.array([-1, -1, 1], np.float32), atol=1e-5
+        ray(turned, o * [-1, -1, 1], d * [-1, -1, 1]).n, np.asarray(n) * np.array([-1, -1, 1], np.float32), atol=1e-5
     )
     np.testing.assert_array_equal(rotation(jnp.zeros(4)), np.eye(3))
     assert jnp.isfinite(jax.jacobian(rotation)(jnp.zeros(4))).all()

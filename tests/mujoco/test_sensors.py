@@ -95,7 +95,7 @@ def test_intrinsics_are_those_of_a_pinhole(intrinsics, message):
         (lambda: depth_image(FIELD, POS, QUAT, 0, 40), "depth_image: width must be a whole number of pixels from 1 on"),
         (lambda: depth_image(FIELD, POS, QUAT, 70, -4), "depth_image: height must be a whole number of pixels from 1 on"),
         (lambda: depth_image(FIELD, FIELD, FIELD, 70, 40), "depth_image: pos must be numbers, it is a HField"),
-        (lambda: lidar(cast("HField", POS), POS, QUAT), "lidar: hfields must be a jaxhf.mujoco.HField, it is"),
+        (lambda: lidar(cast("HField", POS), POS, QUAT), "lidar: geoms must be a jaxhf.mujoco.HField or Geoms, it is"),
         (lambda: lidar(FIELD, POS, "up"), "lidar: quat must be numbers, it is a str"),
         (lambda: lidar_pattern(0), "lidar_pattern: channels must be a whole number from 1 on, it is 0"),
         (lambda: lidar_pattern(resolution=0.0), "lidar_pattern: resolution must be positive and finite, it is 0.0"),
