@@ -13,7 +13,6 @@ from jaxtyping import Float
 from ..core.errors import ArgumentError
 from ..core.rules import OneOf, Whole, require
 from ..core.types import AnyArray, ScalarLeaf
-from ..io.terrain.georeference import coordinate_system
 from ..io.terrain.terrain import Terrain
 from ..preparation.crossings import even_azimuths
 from ..preparation.horizon import Besides
@@ -81,8 +80,9 @@ def insolation(
     first, last = times.values()
     if not first < last <= first + _MOST_YEARS * np.timedelta64(366, "D"):
         raise ArgumentError("insolation", "end", f"must come after begin, {begin}, by ten years at most, it is {end}")
+    turned = terrain.turned_from_north if isinstance(terrain, Terrain) else 0.0
     suns = suns_of(
-        first[()], last[()], _place_of(terrain, place), _turned(terrain), float(turbidity), int(azimuths), wanted,
+        first[()], last[()], _place_of(terrain, place), turned, float(turbidity), int(azimuths), wanted,
         field.heights.dtype,
     )  # fmt: skip
     ground = field.heights if isinstance(field.heights, jax.Array) else np.asarray(field.heights)
@@ -115,11 +115,3 @@ def _place_of(terrain: Any, place: tuple[float, float] | None) -> tuple[float, f
     latitude, longitude = angles
     require_place("insolation", latitude, longitude)
     return float(latitude), float(longitude)
-
-
-def _turned(terrain: Any) -> float:
-    """By how much y points clockwise of north, degrees; 0 where that is not known."""
-    wkt = terrain.georeference.wkt if isinstance(terrain, Terrain) and terrain.georeference else ""
-    if not wkt or coordinate_system(wkt).degrees:
-        return 0.0
-    return float(np.nan_to_num(terrain.convergence))

@@ -31,7 +31,7 @@ def lit(
     A vertex is dark where its ray to the light passes below the surface of two triangles a cell, next to it or far off. A
     bound from above and one from below settle most vertices in one sweep over the rows (see `_bounds`); the rays from the
     others walk from row to row, from one crossing with an edge to the next, until a bound settles them too. As between edges
-    ray and surface are straight, only crossings have to be looked at. Holes cast no shadow, terrain beside them does.
+    ray and surface are straight, only crossings have to be looked at. A cell at a hole has no surface, as for the renderer.
 
     The arguments are those of `hillshade`; `dx` and `dy` are in the unit of the heights.
     """
@@ -51,11 +51,33 @@ def lit(
     return found.T if columns else found
 
 
+class _Edges(NamedTuple):
+    """Which edges have a triangle beside them, shapes (rows, columns): each one counts for the vertex with its lowest numbers.
+
+    Attributes:
+      along, up, diagonal: from a vertex along its row, to the next row, and across the cell.
+      vertex: whether a triangle touches the vertex.
+    """
+
+    along: Bool[np.ndarray, "rows columns"]
+    up: Bool[np.ndarray, "rows columns"]
+    diagonal: Bool[np.ndarray, "rows columns"]
+    vertex: Bool[np.ndarray, "rows columns"]
+
+
+def _edges(z: Float[np.ndarray, "rows columns"]) -> _Edges:
+    there = np.isfinite(z)
+    cells = np.pad(there[1:, 1:] & there[1:, :-1] & there[:-1, 1:] & there[:-1, :-1], 1)  # with none round them
+    along, up = cells[:-1, 1:] | cells[1:, 1:], cells[1:, :-1] | cells[1:, 1:]
+    return _Edges(along, up, cells[1:, 1:], along | cells[:-1, :-1] | cells[1:, :-1])
+
+
 def _lit(z: Float[np.ndarray, "rows columns"], light: _Light) -> Bool[np.ndarray, "rows columns"]:
     (rows, columns), (across, rise, _) = z.shape, light
     rounding = 8 * np.finfo(float).eps * float(np.nanmax(np.abs(z)))
     starts = np.floor(across * np.arange(rows + 1) - _OFF).astype(np.int64)  # the first column that bin 0 touches
-    upper, lower = _bounds(z, light, starts)
+    edges = _edges(z)
+    upper, lower = _bounds(z, edges.along, light, starts)
     width = upper.shape[1]
     result = np.ones(z.shape, bool)
     open_rays = []
@@ -69,10 +91,11 @@ def _lit(z: Float[np.ndarray, "rows columns"], light: _Light) -> Bool[np.ndarray
     row, column = np.divmod(rays, columns)
     bins = column - np.ceil(across * row - _OFF).astype(np.int64) + _PAD
     padded = np.pad(z, ((0, 1), (0, 3)), constant_values=np.nan).ravel()
+    edges = _Edges(*(np.pad(edge, ((0, 1), (0, 3))).ravel() for edge in edges))
     at, height = row * (columns + 3) + column, z.ravel()[rays]
     step = 0
     while rays.size:
-        blocked = _crossing(padded, columns + 3, at, height + rounding, step, light)
+        blocked = _crossing(padded, edges, columns + 3, at, height + rounding, step, light)
         step += 1
         row = row + 1
         place = row * width + np.minimum(bins + starts[row], width - 1)
@@ -88,7 +111,10 @@ _PAD = 3  # columns before the first in which bins begin that still touch the gr
 
 
 def _bounds(
-    z: Float[np.ndarray, "rows columns"], light: _Light, starts: Int[np.ndarray, " rows+1"]
+    z: Float[np.ndarray, "rows columns"],
+    along: Bool[np.ndarray, "rows columns"],
+    light: _Light,
+    starts: Int[np.ndarray, " rows+1"],
 ) -> tuple[Float[np.ndarray, "rows bins"], Float[np.ndarray, "rows bins"]]:
     """How high on a row's line a ray is lit for certain, and below which height it is dark for certain.
 
@@ -96,7 +122,7 @@ def _bounds(
     b + starts[j] + _PAD. Both bounds fall by the light's rise from row to row, away from it (a max-plus sweep: Timonen and
     Westerholm, Scalable height field self-shadowing, Computer Graphics Forum 29(2), 2010). A ray that starts on the surface
     cannot be met by a triangle that faces the light, as it rises faster than that: from above counts the highest vertex of the
-    cells with another triangle, from below the lowest of the vertices round the bin.
+    cells with another triangle, from below the lowest of the vertices round the bin. `along` is that of `_Edges`.
     """
     (rows, columns), (across, rise, _) = z.shape, light
     nothing = -np.inf
@@ -104,9 +130,10 @@ def _bounds(
     lower = np.full_like(upper, nothing)
     for row in range(rows - 1, -1, -1):
         first, last = int(starts[row]), math.floor(across * row + 1 + _OFF)
-        ground = np.pad(z[row], (_PAD, 2 * _PAD), constant_values=np.nan)
+        lower_ends = np.where(along[row, :-1], np.minimum(z[row, :-1], z[row, 1:]), np.nan)
+        ground = np.pad(lower_ends, (_PAD, 2 * _PAD + 1), constant_values=np.nan)
         lowest = ground[: columns + 2 * _PAD]
-        for k in range(1, last - first + 2):
+        for k in range(1, last - first + 1):
             lowest = np.minimum(lowest, ground[k : k + columns + 2 * _PAD])  # nan where one is
         lowest = np.where(np.isnan(lowest), nothing, lowest)
         if row == rows - 1:
@@ -138,6 +165,7 @@ def _needed(
 
 def _crossing(
     z: Float[np.ndarray, " padded"],
+    there: _Edges,
     width: int,
     at: Int[np.ndarray, " n"],
     height: Float[np.ndarray, " n"],
@@ -149,7 +177,7 @@ def _crossing(
     All rays start at vertices, so that they meet edges at the same shares of them.
 
     Args:
-      z: heights, flat; nan beyond them.
+      z, there: heights, and which edges there are, flat; nan and none beyond them.
       width: of a row of `z`.
       at: places of the starts in `z`.
       height: of the starts.
@@ -160,24 +188,28 @@ def _crossing(
     place = math.floor(step * across)
     share = step * across - place
     near, far = at + (step * width + place), at + ((step + 1) * width + place)
-    edges = []  # when the row is crossed by this much: the ends of the edge, and how far from the first one
+    edges = []  # when the row is crossed by this much: the ends of the edge, how far from the first one, and if it is there
     if falling:
         time = (1 - share) / (1 + across)
-        edges.append((time, near + 1, far, time))
+        edges.append((time, near + 1, far, time, there.diagonal[near]))
         if share + across > 1:
             time = (2 - share) / (1 + across)
-            edges.append((time, near + 2, far + 1, time))
+            edges.append((time, near + 2, far + 1, time, there.diagonal[near + 1]))
     elif share + across < 1 and share > 0:
         time = share / (1 - across)
-        edges.append((time, near, far + 1, time))
+        edges.append((time, near, far + 1, time, there.diagonal[near]))
     if share + across > 1:
         time = (1 - share) / across
-        edges.append((time, near + 1, far + 1, time))
+        edges.append((time, near + 1, far + 1, time, there.up[near + 1]))
     end = share + across
-    edges.append((1.0, far + 1, far + 2, end - 1) if end >= 1 else (1.0, far, far + 1, end))
+    first, part = (far + 1, end - 1) if end >= 1 else (far, end)
+    edges.append((1.0, first, first + 1, part, there.along[first]))
     blocked = np.zeros(at.shape, bool)
-    for time, one, other, part in edges:
-        at_vertex = part < _OFF or part > 1 - _OFF  # beside which there may be no height, as at the border
-        ground = z[one if part < 0.5 else other] if at_vertex else z[one] * (1 - part) + z[other] * part
-        blocked |= ground > height + (step + time) * rise
+    for time, one, other, part, has_triangle in edges:
+        if part < _OFF or part > 1 - _OFF:  # beside which there may be no height, as at the border
+            place = one if part < 0.5 else other
+            ground, has_triangle = z[place], there.vertex[place]
+        else:
+            ground = z[one] * (1 - part) + z[other] * part
+        blocked |= has_triangle & (ground > height + (step + time) * rise)
     return blocked

@@ -66,6 +66,13 @@ def test_the_sun_moves_as_it_does_over_the_terrain(terrain):
     assert path is not None
     hours = np.datetime64("2026-06-21T05") + np.arange(13).astype("timedelta64[h]")
     np.testing.assert_allclose(path, np.stack(jaxhf.sun(hours, 46.5, 8.0), -1), atol=1e-6)
+    # On a map whose y axis points 1.1 degrees clockwise of north, the sun stands as much less clockwise of it.
+    wkt = pytest.importorskip("rasterio").crs.CRS.from_epsg(32632).to_wkt()
+    turned = dataclasses.replace(heights, dx=900.0, dy=900.0, georeference=Georeference(wkt, offset=(620_000.0, 5_150_000.0)))
+    options.latitude, options.longitude = 46.5, 8.0
+    east = _sun_path(options, turned)
+    assert 1.0 < turned.convergence < 1.4
+    np.testing.assert_allclose(east, path - [turned.convergence, 0], atol=1e-6)
     options.latitude, options.longitude = -33.0, 8.0
     with pytest.raises(UserError, match=r"its altitude is -18.44 degrees at 2026-06-21T05:00:00Z"):
         _sun_path(options, heights)

@@ -33,6 +33,22 @@ def test_shadows_are_those_of_every_crossing(kind, shape):
     assert 0.05 < min(seen) < 0.5 < max(seen)
 
 
+@pytest.mark.x64
+def test_a_cell_at_a_hole_has_no_surface():
+    """A vertex is lit where its horizon, which is exact on the triangles that there are, is below the light."""
+    random, shadowed = np.random.default_rng(1), 0
+    for share in (0.1, 0.4):
+        z = random.uniform(0, 30, (20, 20))
+        z[random.uniform(size=z.shape) < share] = np.nan
+        horizons = jaxhf.horizon(z, [float(azimuth) for azimuth, _ in DIRECTIONS], dx=3.0, dy=5.0)
+        for (azimuth, altitude), horizon in zip(DIRECTIONS, np.asarray(horizons), strict=True):
+            sure = np.isfinite(z) & (np.abs(horizon - altitude) > 1e-6)
+            found = lit(z, 3.0, 5.0, float(azimuth), float(altitude))
+            np.testing.assert_array_equal(found[sure], horizon[sure] < altitude, str((share, azimuth)))
+            shadowed += np.sum(~found)
+    assert shadowed > 500
+
+
 def test_a_wall_casts_a_shadow_of_its_height_over_the_tangent():
     heights = np.zeros((9, 80))
     heights[:, 60] = 10.0

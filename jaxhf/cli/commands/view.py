@@ -34,7 +34,7 @@ _TALLEST = 100  # times its length: beyond, a terrain is a needle that no pixel 
 
 
 def _sun_path(options: argparse.Namespace, terrain: Terrain) -> np.ndarray | None:
-    """The sun's azimuth and altitude in each frame of a film, shape (frames, 2); None where it stands still."""
+    """The sun's azimuth from the y axis and altitude in each frame of a film, shape (frames, 2); None where it stands still."""
     first, last, place = options.sun_from, options.sun_to, (options.latitude, options.longitude)
     times = isinstance(first, datetime.datetime)
     if times != isinstance(last, datetime.datetime):
@@ -51,7 +51,7 @@ def _sun_path(options: argparse.Namespace, terrain: Terrain) -> np.ndarray | Non
         low = int(np.argmin(altitude))
         when = instants[low].astype("datetime64[s]")
         raise UserError(f"view: the sun must be up all the time, its altitude is {altitude[low]:.2f} degrees at {when}Z (UTC)")
-    return np.stack([azimuth, altitude], -1)
+    return np.stack([azimuth - terrain.turned_from_north, altitude], -1)
 
 
 def _output(options: argparse.Namespace) -> tuple[Path, bool]:

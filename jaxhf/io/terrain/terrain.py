@@ -148,6 +148,14 @@ class Terrain:
         per_east, per_north = metres_per_degree(float(latitude.mean()))
         return math.degrees(math.atan2(east * per_east, (latitude[1] - latitude[0]) * per_north))
 
+    @property
+    def turned_from_north(self) -> float:
+        """`convergence`, and 0 where that is not known or y counts in degrees, to the north."""
+        wkt = self.georeference.wkt if self.georeference else ""
+        if not wkt or coordinate_system(wkt).degrees:
+            return 0.0
+        return float(np.nan_to_num(self.convergence))
+
     def geodetic(self, x: Any, y: Any, z: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Latitudes and longitudes of points in its x and y, degrees, and z in metres; needs rasterio.
 
