@@ -107,8 +107,10 @@ def coloured(ramp: Ramp, z: Float[np.ndarray, "k m"], entries: str) -> UInt8[np.
     return colours.astype(np.uint8)
 
 
-def as_ramp(ramp: str | PathLike | None, low: float, high: float) -> Ramp:
-    """The ramp that a file, a name or None (our own) means, for heights in this range."""
+def as_ramp(ramp: Ramp | str | PathLike | None, low: float, high: float) -> Ramp:
+    """The ramp that a file, a name or None (our own) means, for heights in this range; a ramp itself is it."""
+    if isinstance(ramp, Ramp):
+        return ramp
     if ramp is None:
         return hypsometric(low, high)
     if isinstance(ramp, str) and not Path(ramp).exists() and not any(mark in ramp for mark in "./\\"):

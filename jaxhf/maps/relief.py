@@ -10,20 +10,20 @@ from ..core.rules import OneOf, require
 from ..io.files import PathLike
 from .choices import ENTRIES
 from .hillshade import hillshade
-from .ramp import as_ramp, coloured
+from .ramp import Ramp, as_ramp, coloured
 from .surface import Heights, surface
 from .windows import shared
 
 
 def color_relief(
-    heights: Heights, ramp: str | PathLike | None = None, *, entries: str = "interpolate", alpha: bool = False
+    heights: Heights, ramp: Ramp | str | PathLike | None = None, *, entries: str = "interpolate", alpha: bool = False
 ) -> UInt8[np.ndarray, "ny nx bands"]:
     """Tints by height: shape (ny, nx, 3), red, green and blue, or 4 with opacity; uint8, as `gdaldem color-relief`'s.
 
     Args:
       heights: shape (ny, nx), row 0 in the south, nan where there is none; or a `Terrain`.
       ramp: a colour file as gdaldem reads it (a height, red, green and blue a line; see `load_colours`), the name of a colour
-        map of matplotlib's, or None: green lowlands to pale heights, and blue below 0.
+        map of matplotlib's, or None: green lowlands to pale heights, and blue below 0. Or what these come to for other heights.
       entries: "interpolate" between the ramp's heights, the "nearest", or the "exact" one only.
       alpha: adds opacity.
 
@@ -56,7 +56,7 @@ def relief(
     dx: float | None = None,
     dy: float | None = None,
     *,
-    ramp: str | PathLike | None = None,
+    ramp: Ramp | str | PathLike | None = None,
     entries: str = "interpolate",
     azimuth: float = 315.0,
     altitude: float = 45.0,

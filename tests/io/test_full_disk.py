@@ -17,16 +17,23 @@ from jaxhf import Terrain, save_heights, save_image
 from jaxhf.io.checkpoint import save_checkpoint
 from jaxhf.io.files import save_text
 from jaxhf.io.terrain.meshes import save_mesh
-from jaxhf.io.terrain.rasters import save_raster
+from jaxhf.io.terrain.rasters import save_raster, writing_strips
 
 folder = pathlib.Path(sys.argv[1])
 rng = np.random.default_rng(0)
 wrong = []
+def write_strips(path):
+    with writing_strips(path, terrain, None) as put:
+        for first in range(0, 100, 10):
+            put(slice(first, first + 10), terrain.heights[first : first + 10].astype("u2"))
+
+
 terrain, image = Terrain(rng.uniform(0, 60000, (100, 90)).astype("f4")), rng.random((100, 90, 3)).astype("f4")
 writers = {
     **{f"heights{e}": lambda path: save_heights(path, terrain) for e in (".npy", ".npz", ".tif", ".asc", ".png", ".exr")},
     **{f"image{e}": lambda path: save_image(path, image) for e in (".npy", ".png", ".exr", ".pfm")},
     **{f"map{e}": lambda path: save_raster(path, terrain.heights.astype("u2"), terrain) for e in (".npy", ".png", ".tif")},
+    **{f"strips{e}": lambda path: write_strips(path) for e in (".npy", ".tif")},
     **{f"mesh{e}": lambda path: save_mesh(path, terrain) for e in (".ply", ".obj", ".glb")},
     "fit.checkpoint": lambda path: save_checkpoint(path, {}, [terrain.heights]),
     "page.html": lambda path: save_text(path, "heights " * 9999),

@@ -40,6 +40,66 @@ def test_other_rasters_of_gdal(tmp_path, utm, name, driver):
         load_heights((tmp_path / name).rename(tmp_path / f"{name}.tif"))
 
 
+PDS = """PDS_VERSION_ID = PDS3
+RECORD_TYPE = FIXED_LENGTH
+RECORD_BYTES = {record}
+FILE_RECORDS = {records}
+LABEL_RECORDS = 1
+^IMAGE = {image}
+OBJECT = IMAGE
+  LINES = 3
+  LINE_SAMPLES = 4
+  SAMPLE_TYPE = PC_REAL
+  SAMPLE_BITS = 32
+  BANDS = 1
+  MISSING_CONSTANT = 16#FF7FFFFB#
+END_OBJECT = IMAGE
+OBJECT = IMAGE_MAP_PROJECTION
+  MAP_PROJECTION_TYPE = "EQUIRECTANGULAR"
+  A_AXIS_RADIUS = 3396.19 <KM>
+  B_AXIS_RADIUS = 3396.19 <KM>
+  C_AXIS_RADIUS = 3396.19 <KM>
+  CENTER_LATITUDE = 0.0 <DEG>
+  CENTER_LONGITUDE = 180.0 <DEG>
+  MAP_SCALE = 20.0 <METERS/PIXEL>
+  LINE_PROJECTION_OFFSET = 5000 <PIXEL>
+  SAMPLE_PROJECTION_OFFSET = -2000 <PIXEL>
+END_OBJECT = IMAGE_MAP_PROJECTION
+END
+"""
+
+
+@pytest.mark.parametrize("detached", [False, True])
+def test_what_nasas_planetary_data_system_keeps(tmp_path, detached):
+    """With its label before the heights, as those of HiRISE, or in a file of its own."""
+    values = VALUES.astype("<f4")
+    values[1, 2] = np.uint32(0xFF7FFFFB).view(np.float32)
+    if detached:
+        (tmp_path / "dtm.img").write_bytes(values.tobytes())
+        path = tmp_path / "dtm.lbl"
+        path.write_text(PDS.format(record=16, records=3, image='("dtm.img", 1)'))
+    else:
+        path = tmp_path / "DTM.IMG"
+        path.write_bytes(PDS.format(record=4096, records=4, image=2).encode().ljust(4096) + values.tobytes())
+    found = load_heights(path)
+    np.testing.assert_array_equal(found.heights, np.where(values < -1e30, np.nan, VALUES)[::-1])
+    assert (found.dx, found.dy) == (20, 20)
+    x, y = found.x0 + 1.5 * found.dx, found.y0 + found.dy
+    degree = np.pi / 180 * 3_396_190
+    np.testing.assert_allclose(found.place, (y / degree, x / degree - 180), atol=1e-6)
+    assert abs(found.place[0]) > 1.5
+
+
+def test_a_cube_of_isis(tmp_path):
+    mars = "+proj=eqc +lat_ts=0 +lon_0=0 +a=3396190 +b=3396190 +units=m"
+    path = write(tmp_path / "dtm.tif", VALUES, (20, 0, 4e4, 0, -20, 1e5), crs=mars)
+    pytest.importorskip("rasterio.shutil").copy(path, tmp_path / "dtm.cub", driver="ISIS3")
+    found, same = load_heights(tmp_path / "dtm.cub"), load_heights(path)
+    np.testing.assert_array_equal(found.heights, VALUES[::-1])
+    assert found.in_file == same.in_file
+    np.testing.assert_allclose(found.place, same.place, atol=1e-6)
+
+
 @pytest.mark.parametrize("dx", [30, -30])
 @pytest.mark.parametrize("dy", [20, -20])
 def test_rasters_may_start_in_any_corner(tmp_path, dx, dy):
@@ -74,6 +134,17 @@ def test_a_part_of_a_band(tmp_path, dx, dy):
     np.testing.assert_array_equal(other.heights, part.heights)
     assert other.in_file == part.in_file
     assert (ny, nx) == (9, 7)
+
+
+def test_a_part_of_a_raster_without_a_place(tmp_path):
+    """Whose file begins in the north, though its geotransform is none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        with rasterio.open(tmp_path / "x.tif", "w", driver="GTiff", width=7, height=9, count=1, dtype="float32") as dataset:
+            dataset.write(np.random.default_rng(0).uniform(size=(1, 9, 7)).astype(np.float32))
+    whole, part = load_heights(tmp_path / "x.tif"), load_heights(tmp_path / "x.tif", bbox=(2.0, 1.0, 4.0, 3.0))
+    np.testing.assert_array_equal(part.heights, whole.heights[1:4, 2:5])
+    assert (part.x0, part.y0) == (2, 1)
 
 
 def test_a_part_of_a_terrain_in_degrees(tmp_path):

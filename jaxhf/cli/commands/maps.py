@@ -10,14 +10,16 @@ from typing import Any
 
 from ...core.errors import ArgumentError, UserError
 from ...io.errors import FileError
-from ...io.terrain.load import read_terrain
-from ...io.terrain.rasters import require_writable_raster, save_raster
+from ...io.terrain.load import STRIP, read_terrain, rows_of, terrain_rows
+from ...io.terrain.rasters import require_writable_raster, save_raster, writing_strips
 from ...io.terrain.terrain import Terrain
 from ...maps.hillshade import hillshade
 from ...maps.relief import color_relief, relief
 from ...maps.ruggedness import ruggedness
 from ...maps.slope import NODATA, aspect, slope
+from ...maps.strips import by_strips
 from .. import arguments
+from ..progress import bar
 
 _LIGHT = ("azimuth", "altitude", "z_factor", "variant", "shadows", "algorithm", "scale", "dx", "dy")
 
@@ -26,13 +28,23 @@ def run(options: argparse.Namespace) -> None:
     function, nodata = _chosen(options)
     path = require_writable_raster(options.output)
     begin = time.perf_counter()
-    terrain = read_terrain(options.terrain, **arguments.reading(options))
     names = inspect.signature(function).parameters.keys() & vars(options).keys()
-    values = function(terrain, **arguments.given(options, *names))
-    if "dx" in names and options.scale is None:
-        report_spacing(options, terrain)
-    save_raster(path, values, terrain, nodata)
-    ny, nx = terrain.heights.shape
+    with terrain_rows(options.terrain, **arguments.reading(options)) as rows:
+        ny, nx = rows.place.heights.shape
+        strip = max(STRIP // nx, 64)
+        if ny > strip and (getattr(options, "shadows", False) or path.suffix.lower() == ".png"):
+            rows, strip = rows_of(rows.whole()), ny  # shadows need all of the terrain, and a .png all of the map
+        strips = by_strips(function, rows, strip, path.suffix.lower() != ".npy", arguments.given(options, *names))
+        if "dx" in names and options.scale is None:
+            report_spacing(options, rows.place)
+        if ny <= strip:
+            for _, values in strips:
+                save_raster(path, values, rows.place, nodata)
+        else:
+            with writing_strips(path, rows.place, nodata) as put, bar(total=ny, unit=" rows") as shown:
+                for part, values in strips:
+                    put(part, values)
+                    shown.update(len(values))
     kind = function.__name__.replace("_", " ")
     print(f"{path}: {kind}, {nx} x {ny} pixels, {time.perf_counter() - begin:.2f} s")
 

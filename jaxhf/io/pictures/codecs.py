@@ -112,6 +112,7 @@ def _read_npy(path: Path) -> np.ndarray:
 def _read_tiff(path: Path) -> np.ma.MaskedArray:
     """A GeoTIFF's first three bands, or its only one, or its palette's colours; masked where it says that there is nothing."""
     with opened(path) as dataset:
+        require_pixels(dataset.height, dataset.width)
         kinds, words = set(dataset.dtypes), [found.name for found in dataset.colorinterp]
         if len(kinds) > 1 or not kinds <= {"uint8", "uint16", "float32", "float64"}:
             raise FileError(f"a picture must be of uint8, uint16, float32 or float64, it is of {', '.join(sorted(kinds))}")

@@ -103,11 +103,11 @@ def coordinate_system(wkt: str) -> CoordinateSystem:
 
 
 def geographic(wkt: str, x: float, y: float) -> tuple[float, float]:
-    """The latitude and longitude of a point in a reference system, degrees; not finite where it has none."""
+    """The latitude and longitude of a point in a reference system, degrees, see `on_globe`; not finite where it has none."""
     if re.match(_GEOGRAPHIC, wkt):
         return y, x
-    (latitude,), (longitude,) = _transformed(wkt, "EPSG:4326", [x], [y])
-    return latitude, longitude
+    latitude, longitude = on_globe(wkt, np.array(x), np.array(y))
+    return float(latitude), float(longitude)
 
 
 def on_globe(wkt: str, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 Whatever the file's order, in memory row 0 is the southernmost: `heights[iy, ix]` has iy growing to the north.
 """
 
+import contextlib
 import dataclasses
 import math
 import re
@@ -22,7 +23,7 @@ from ..gdal import DRIVERS
 from ..pictures.codecs import read_grey
 from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
 from .grids import read_asc, read_hgt, read_mujoco
-from .rasters import read_raster
+from .rasters import Rows, raster_rows, read_raster
 from .sidecars import by_world_file
 from .terrain import Box, Nodata, Terrain, heights_of
 
@@ -48,7 +49,8 @@ def load_heights(
       the stored number. A .png has the place that a world file (.pgw) beside it gives.
     - .asc (ESRI ASCII grid, its reference system in a .prj beside it), .hgt (a tile of SRTM, placed by its name).
     - .hfield, .bin (MuJoCo's binary height field): row 0 in the south, spacing 1; a height is the stored number.
-    - .tif, .tiff and other rasters that GDAL reads (.img, .dt2, .bil, .flt, .dem, .grd, .jp2, .nc, .vrt, .xyz; needs rasterio):
+    - .tif, .tiff and other rasters that GDAL reads (.img, .dt2, .bil, .flt, .dem, .grd, .jp2, .nc, .vrt, .xyz, and .img, .lbl and
+      .cub of NASA's Planetary Data System and of ISIS; needs rasterio):
       a band of numbers, placed by its geotransform. A height stands at its pixel's centre: half a pixel inside the
       raster's corner. The file's scale and offset are applied.
 
@@ -112,9 +114,58 @@ def read_terrain(
                 raise FileError(f"heights times z_scale must fit into {scaled.dtype}, z_scale is {z_scale}")
             place = stored.georeference and stored.georeference._replace(z_unit="")  # they are in another unit now
             terrain = dataclasses.replace(terrain, heights=scaled, georeference=place)
-    for hint in _hints(stored, z_scale):
-        warnings.warn(f"{path}: {hint}", stacklevel=3)
+    _warn_of(path, stored, z_scale)
     return terrain
+
+
+def _warn_of(path: Path, terrain: Terrain, z_scale: float = 1.0) -> None:
+    for hint in _hints(terrain, z_scale):
+        warnings.warn(f"{path}: {hint}", stacklevel=4)
+
+
+STRIP = 2**24  # heights that are read at once, of a raster that holds more
+_LOOKED_AT = 2**22  # of these, for what is hardly meant
+
+
+@contextlib.contextmanager
+def terrain_rows(
+    path: PathLike, nodata: float | None = None, band: int | None = None, bbox: Box | None = None
+) -> Iterator[Rows]:
+    """As `read_terrain`, for what needs a few rows at once: of a raster of more than `STRIP` heights only these are read."""
+    path = require_file(path)
+    with contextlib.ExitStack() as stack:
+        if by_ending(_READERS, path, "read heights from") is read_raster:
+            with reading(path):
+                if band is not None:
+                    require("load_heights", "band", band, Whole(1))
+                stack.enter_context(import_extra("rasterio", f"reading {path.suffix} needs", "geo").Env(GDAL_CACHEMAX=_CACHE))
+                rows = stack.enter_context(raster_rows(path, lambda named: named if nodata is None else nodata, band, bbox))
+            (ny, nx), stored = rows.place.heights.shape, rows.read
+
+            def read(part: slice, step: int) -> Terrain:
+                with reading(path):
+                    return stored(part, step)
+
+            if ny * nx > STRIP:
+                step = math.ceil(math.sqrt(ny * nx / _LOOKED_AT))
+                _warn_of(path, read(slice(0, ny), step))
+                yield Rows(rows.place, read)
+                return
+        yield rows_of(read_terrain(path, nodata=nodata, band=band, bbox=bbox))
+
+
+_CACHE = 2**27  # bytes of GDAL's for blocks of a file, of which it else takes a share of the memory
+
+
+def rows_of(terrain: Terrain) -> Rows:
+    """The rows of a terrain in memory."""
+
+    def read(part: slice, step: int) -> Terrain:
+        return dataclasses.replace(
+            terrain, heights=terrain.heights[part][::step, ::step], y0=terrain.y0 + part.start * terrain.dy
+        )
+
+    return Rows(terrain, read)
 
 
 _UNDECLARED = (-999, -9999, -99999, -32767, -32768, 9999, 32767, 65535)  # what often means no height

@@ -1,18 +1,23 @@
 """GeoTIFF and the other rasters of GDAL, read and written through rasterio."""
 
+import contextlib
 import dataclasses
+import errno
 import math
+import os
 import warnings
+import zlib
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...core.errors import ArgumentError
 from ...core.extras import import_extra
 from ..errors import FileError
-from ..files import PathLike, reading, replacing, require_writable, write_npy
+from ..files import PathLike, reading, replacing, require_pixels, require_writable, utf8_name, write_npy
 from ..gdal import opened
 from ..pictures.codecs import write_png
 from .georeference import Georeference, coordinate_system
@@ -20,8 +25,33 @@ from .sidecars import beside
 from .terrain import Box, Nodata, Terrain, heights_of, places_within
 
 
+class Rows(NamedTuple):
+    """A terrain whose heights are read when they are needed.
+
+    Attributes:
+      place: the terrain with zeros for heights, which take no memory.
+      read: the heights of some rows, counted from the south, of each `step`-th row and column.
+    """
+
+    place: Terrain
+    read: Callable[[slice, int], Terrain]
+
+    def whole(self) -> Terrain:
+        """All of it; FileError where that is too much."""
+        ny, nx = self.place.heights.shape
+        require_pixels(ny, nx)
+        return self.read(slice(0, ny), 1)
+
+
 def read_raster(path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None) -> Terrain:
     """The heights in a raster, in its own coordinates; of a band, from 1, and of a part, see `load_heights`."""
+    with raster_rows(path, nodata, band, box) as rows:
+        return rows.whole()
+
+
+@contextlib.contextmanager
+def raster_rows(path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None) -> Iterator[Rows]:
+    """As `read_raster`, while the file is open."""
     with opened(path) as dataset:
         if band is None and dataset.count != 1:
             raise FileError(f"heights must be one band, it has {dataset.count}: band must say which")
@@ -31,50 +61,59 @@ def read_raster(path: Path, nodata: Nodata, band: int | None = None, box: Box | 
         scale, offset = dataset.scales[number - 1], dataset.offsets[number - 1]
         if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
             raise FileError(f"its scale and offset must be finite, the scale not zero; they are {scale} and {offset}")
-        used, place = nodata(dataset.nodatavals[number - 1]), _placed(np.zeros((2, 2), np.float32), dataset, None)
-        dx, dy, x0, y0 = place.dx, place.dy, place.x0, place.y0
-        rows, columns = places_within(box, (dataset.height, dataset.width), (x0, y0), (dx, dy))
-        a, e = dataset.transform.a, dataset.transform.e
-        # From the order of `Terrain` to that of the file.
-        top = rows.start if e > 0 else dataset.height - rows.stop
-        left = columns.start if a > 0 else dataset.width - columns.stop
-        window = (top, top + rows.stop - rows.start), (left, left + columns.stop - columns.start)
-        heights = heights_of(dataset.read(number, window=window), used, scale, offset)
-        if any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[number - 1]):
-            heights[dataset.dataset_mask(window=window) == 0] = np.nan
-        terrain = _placed(heights, dataset, used)
-        terrain = dataclasses.replace(terrain, x0=x0 + columns.start * dx, y0=y0 + rows.start * dy)
-        if terrain.georeference is None:
-            return terrain
-        named = terrain.georeference._replace(z_unit=dataset.units[number - 1] or "")
-        return dataclasses.replace(terrain, georeference=named)
+        used = nodata(dataset.nodatavals[number - 1])
+        whole, north_first, east_first = _place(dataset, used)
+        rows, columns = places_within(box, whole.heights.shape, (whole.x0, whole.y0), (whole.dx, whole.dy))
+        left = dataset.width - columns.stop if east_first else columns.start
+        masked = any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[number - 1])
+
+        def read(part: slice, step: int) -> Terrain:
+            first, last = rows.start + part.start, rows.start + part.stop
+            top = dataset.height - last if north_first else first
+            window = (top, top + last - first), (left, left + columns.stop - columns.start)
+            shape = tuple(-(-(end - start) // step) for start, end in window)
+            heights = heights_of(dataset.read(number, window=window, out_shape=shape), used, scale, offset)
+            if masked:
+                heights[dataset.dataset_mask(window=window, out_shape=shape) == 0] = np.nan
+            heights = heights[:: -1 if north_first else 1, :: -1 if east_first else 1]
+            return dataclasses.replace(place, heights=heights, y0=place.y0 + part.start * place.dy)
+
+        nothing = np.broadcast_to(np.float32(0), (rows.stop - rows.start, columns.stop - columns.start))
+        place = dataclasses.replace(
+            whole, heights=nothing, x0=whole.x0 + columns.start * whole.dx, y0=whole.y0 + rows.start * whole.dy
+        )
+        if place.georeference is not None:
+            named = place.georeference._replace(z_unit=dataset.units[number - 1] or "")
+            place = dataclasses.replace(place, georeference=named)
+        yield Rows(place, read)
 
 
 def placed_like(terrain: Terrain, like: Path) -> Terrain:
     """The heights of a terrain where a raster of their shape lies; FileError where it has another."""
     with reading(like), opened(like) as dataset:
-        place, shape = _placed(np.zeros((2, 2), np.float32), dataset, dataset.nodata), (dataset.height, dataset.width)
-        if shape != terrain.heights.shape:
-            raise FileError(f"it must have the shape of the heights, {terrain.heights.shape}; it has {shape}")
+        place, *_ = _place(dataset, dataset.nodata)
+    if place.heights.shape != terrain.heights.shape:
+        shape = place.heights.shape
+        raise FileError(f"{like}: it must have the shape of the heights, {terrain.heights.shape}; it has {shape}")
     return dataclasses.replace(place, heights=terrain.heights)
 
 
-def _placed(heights: np.ndarray, dataset: Any, nodata: float | None) -> Terrain:
-    """The heights, whose rows are in the file's order, where GDAL's geotransform puts the pixels' centres."""
+def _place(dataset: Any, nodata: float | None) -> tuple[Terrain, bool, bool]:
+    """A terrain of no heights where GDAL's geotransform puts the pixels' centres, and whether the file's rows begin in the
+    north and its columns in the east."""
     a, b, c, d, e, f = dataset.transform[:6]
     if b or d or not (a and e):
         raise FileError(f"its pixels must lie along x and y (gdalwarp makes it so), its geotransform is rotated: {b}, {d}")
     if dataset.gcps[0]:
         raise FileError("it must be placed by a geotransform, it has ground control points (gdalwarp makes it so)")
-    wkt = "" if dataset.crs is None else dataset.crs.to_wkt()
-    if dataset.transform.is_identity and not wkt:  # of a file without a place
-        return Terrain(heights[::-1])
     ny, nx = dataset.height, dataset.width
-    heights = heights[:: 1 if e > 0 else -1, :: 1 if a > 0 else -1]
+    nothing, wkt = np.broadcast_to(np.float32(0), (ny, nx)), "" if dataset.crs is None else dataset.crs.to_wkt()
+    if dataset.transform.is_identity:  # of a file without a place
+        return Terrain(nothing), True, False
     x0, y0 = c + (0.5 if a > 0 else nx - 0.5) * a, f + (0.5 if e > 0 else ny - 0.5) * e
     point = dataset.tags().get("AREA_OR_POINT") == "Point"
-    crs = coordinate_system(wkt)
-    return Terrain(heights, abs(a), abs(e), x0, y0, crs, Georeference(wkt, nodata=nodata, point=point))
+    place = Georeference(wkt, nodata=nodata, point=point)
+    return Terrain(nothing, abs(a), abs(e), x0, y0, coordinate_system(wkt), place), e < 0, a < 0
 
 
 require_writable_raster = partial(require_writable, "save_raster", "a map", (".npy", ".png", ".tif", ".tiff"))
@@ -117,23 +156,84 @@ def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None
             temporary.write_bytes(geotiff(values, like, nodata))
 
 
-def geotiff(values: np.ndarray, like: Terrain, nodata: float | None, unit: str = "") -> memoryview:
-    """The bytes of a GeoTIFF; see `save_raster`. In memory first, as GDAL does not always say that a disk is full."""
+@contextlib.contextmanager
+def writing_strips(path: Path, like: Terrain, nodata: float | None) -> Iterator[Callable[[slice, np.ndarray], None]]:
+    """As `save_raster`, for maps that memory may not hold: takes rows, counted from the south, and the values there.
+
+    A .tif takes them in any order; a .npy from the south on. Once a .tif is closed it is read again, as GDAL does not always
+    say that a disk is full.
+    """
+    with replacing(path) as temporary:
+        if path.suffix.lower() == ".npy":
+            with temporary.open("wb") as file:
+
+                def append(rows: slice, values: np.ndarray) -> None:
+                    if not rows.start:
+                        header = np.lib.format.header_data_from_array_1_0(values)
+                        shape = *like.heights.shape, *values.shape[2:]
+                        np.lib.format.write_array_header_1_0(file, header | {"shape": shape, "fortran_order": False})
+                    file.write(np.ascontiguousarray(values).data)
+
+                yield append
+            return
+        rasterio, sums = import_extra("rasterio", "writing .tif needs", "geo"), {}
+        with contextlib.ExitStack() as open_files:
+            name = open_files.enter_context(utf8_name(temporary))
+            datasets: list[Any] = []
+
+            def put(rows: slice, values: np.ndarray) -> None:
+                if not datasets:
+                    profile = _profile(like, values.dtype, 1 if values.ndim == 2 else values.shape[2], nodata)
+                    datasets.append(open_files.enter_context(rasterio.open(name, "w", **profile)))
+                    datasets[0].update_tags(AREA_OR_POINT=_area_or_point(like))
+                bands = np.ascontiguousarray(np.moveaxis(values[::-1].reshape(*values.shape[:2], -1), -1, 0))
+                top = len(like.heights) - rows.stop
+                window = (top, top + len(values)), (0, values.shape[1])
+                with _disk_full(rasterio):
+                    datasets[0].write(bands, window=window)
+                sums[window] = zlib.crc32(bands.data)
+
+            yield put
+            with _disk_full(rasterio):
+                open_files.pop_all().close()
+        with _disk_full(rasterio), utf8_name(temporary) as name, rasterio.open(name) as dataset:
+            if any(zlib.crc32(dataset.read(window=window).data) != found for window, found in sums.items()):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@contextlib.contextmanager
+def _disk_full(rasterio: Any) -> Iterator[None]:
+    """What GDAL says of a file that it writes is that of a full disk, as its place was looked at before."""
+    try:
+        yield
+    except rasterio.errors.RasterioError as error:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+
+
+def _profile(like: Terrain, dtype: Any, count: int, nodata: float | None) -> dict[str, Any]:
+    """How rasterio creates a GeoTIFF where a terrain lies."""
     rasterio = import_extra("rasterio", "writing .tif needs", "geo")
-    dx, dy, x0, y0 = like.in_file
-    place = like.georeference or Georeference(point=True)
-    bands = values[::-1, :, None] if values.ndim == 2 else values[::-1]
-    ny, nx, count = bands.shape
-    profile = {
-        "driver": "GTiff", "width": nx, "height": ny, "count": count, "dtype": values.dtype, "nodata": nodata,
-        "crs": rasterio.crs.CRS.from_wkt(place.wkt) if place.wkt else None,
+    (ny, nx), (dx, dy, x0, y0), place = like.heights.shape, like.in_file, like.georeference
+    return {
+        "driver": "GTiff", "width": nx, "height": ny, "count": count, "dtype": dtype, "nodata": nodata,
+        "crs": rasterio.crs.CRS.from_wkt(place.wkt) if place and place.wkt else None,
         "transform": rasterio.Affine(dx, 0, x0 - dx / 2, 0, -dy, y0 + (ny - 0.5) * dy),
         "photometric": "rgb" if count > 1 else "minisblack", "interleave": "pixel", "bigtiff": "if_safer",
     }  # fmt: skip
+
+
+def _area_or_point(like: Terrain) -> str:
+    return "Point" if like.georeference is None or like.georeference.point else "Area"
+
+
+def geotiff(values: np.ndarray, like: Terrain, nodata: float | None, unit: str = "") -> memoryview:
+    """The bytes of a GeoTIFF; see `save_raster`. In memory first, as GDAL does not always say that a disk is full."""
+    rasterio = import_extra("rasterio", "writing .tif needs", "geo")
+    bands = values[::-1, :, None] if values.ndim == 2 else values[::-1]
     with warnings.catch_warnings(), rasterio.io.MemoryFile() as memory:
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # pixels of 1 x 1 in a corner at 0, 0
-        with memory.open(**profile) as dataset:
-            dataset.update_tags(AREA_OR_POINT="Point" if place.point else "Area")
+        with memory.open(**_profile(like, values.dtype, bands.shape[2], nodata)) as dataset:
+            dataset.update_tags(AREA_OR_POINT=_area_or_point(like))
             dataset.write(np.moveaxis(bands, -1, 0))
             if unit:
                 dataset.units = (unit,)

@@ -1,0 +1,66 @@
+"""Maps of terrain that memory may not hold, strip after strip, with the bytes of the whole."""
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import ArgumentError
+from ..io.terrain.rasters import Rows
+from ..io.terrain.terrain import Terrain
+from .ramp import as_ramp
+
+
+def by_strips(
+    function: Callable[..., np.ndarray], rows: Rows, strip: int, from_north: bool, options: dict[str, Any]
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """A map of a terrain in strips of some rows: rows, counted from the south, and the values there.
+
+    Args:
+      function: that makes the map of a `Terrain`, from the eight neighbours of each vertex at most.
+      rows: the terrain.
+      strip: how many rows are read at once.
+      from_north: which strip comes first.
+      options: of the function, which besides its own are here for the whole terrain: cell sizes, a ramp of colours.
+    """
+    place = rows.place
+    ny = len(place.heights)
+    if ny <= strip:
+        yield slice(0, ny), function(rows.read(slice(0, ny), 1), **options)
+        return
+    parts = [slice(first, min(first + strip, ny)) for first in range(0, ny, strip)]
+    parts = parts[::-1] if from_north else parts
+    takes = inspect.signature(function).parameters
+    if "dx" in takes and options.get("scale") is None:
+        metres = place.in_metres(**{name: options[name] for name in ("dx", "dy") if name in options})
+        options = options | {"dx": metres.dx, "dy": metres.dy}
+    if "ramp" in takes:
+        ends = [_ends(rows.read(part, 1).heights) for part in parts]
+        options = options | {"ramp": as_ramp(options.get("ramp"), min(low for low, _ in ends), max(high for _, high in ends))}
+    found = False
+    for part in parts:
+        below, above = min(part.start, 1), min(ny - part.stop, 1)
+        terrain = rows.read(slice(part.start - below, part.stop + above), 1)
+        inside = slice(below, len(terrain.heights) - above)
+        found |= bool(np.isfinite(terrain.heights[inside]).any())
+        make = function if np.isfinite(terrain.heights).any() else _without_heights(function)
+        yield part, make(terrain, **options)[inside]
+    if not found:
+        raise ArgumentError(function.__name__, "heights", "must hold a finite one, all of them are nan or infinite")
+
+
+def _ends(heights: np.ndarray) -> tuple[float, float]:
+    there = heights[np.isfinite(heights)]
+    return float(there.min(initial=np.inf)), float(there.max(initial=-np.inf))
+
+
+def _without_heights(function: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    """The function for a strip of holes alone, which it refuses: beside a row of heights, whose values are left out."""
+
+    def make(terrain: Terrain, **options: Any) -> np.ndarray:
+        heights = np.concatenate([np.zeros_like(terrain.heights[:1]), terrain.heights])
+        return function(dataclasses.replace(terrain, heights=heights), **options)[1:]
+
+    return make
