@@ -49,10 +49,9 @@ def load_heights(
       the stored number. A .png has the place that a world file (.pgw) beside it gives.
     - .asc (ESRI ASCII grid, its reference system in a .prj beside it), .hgt (a tile of SRTM, placed by its name).
     - .hfield, .bin (MuJoCo's binary height field): row 0 in the south, spacing 1; a height is the stored number.
-    - .tif, .tiff and other rasters that GDAL reads (.img, .dt2, .bil, .flt, .dem, .grd, .jp2, .nc, .vrt, .xyz, and .img, .lbl and
-      .cub of NASA's Planetary Data System and of ISIS; needs rasterio):
-      a band of numbers, placed by its geotransform. A height stands at its pixel's centre: half a pixel inside the
-      raster's corner. The file's scale and offset are applied.
+    - .tif, .tiff and other rasters that GDAL reads (.img, .dt2, .bil, .flt, .dem, .grd, .jp2, .nc, .vrt, .xyz; .img, .lbl and
+      .cub of NASA's Planetary Data System and of ISIS; needs rasterio): a band of numbers, placed by its geotransform. A
+      height stands at its pixel's centre: half a pixel inside the raster's corner. The file's scale and offset are applied.
 
     Degrees become metres at the mean latitude, with vertex (0, 0) at the origin: on the ellipsoid that the file's
     reference system names. nan and inf are holes, as is what the file says means no data.
