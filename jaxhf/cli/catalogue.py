@@ -107,6 +107,13 @@ _LIGHT = {
         flag("--shadows", "what terrain keeps the light from is black: shadows as they fall"),
     )
 }
+_SHEET = {
+    "sheet": (
+        flag("--annotate", "with coordinates, a scale bar, north, and what the colours mean, as .png, .pdf or .svg"),
+        number("--contours", "STEP", "contour lines so far apart, in the unit of the heights [none]", rule=POSITIVE),
+        option("--title", metavar="TEXT", help="above the map [none]"),
+    )
+}
 _RAMP = "a colour file as gdaldem reads it, or a matplotlib colour map [green lowlands to pale heights, blue below 0]"
 _COLOURS = {
     "colours": (
@@ -203,8 +210,8 @@ _MAPS = (
     Command(
         "relief",
         "colour a terrain by height, and shade it",
-        examples=("terrain.tif -o relief.png", "terrain.tif -o relief.tif --ramp colours.txt --variant multidirectional"),
-        options={**_files(_COLOURED), **_COLOURS, **_LIGHT, "slopes": (_ALGORITHM,), **_SPACING},
+        examples=("terrain.tif -o relief.png", "terrain.tif -o map.pdf --annotate --contours 50 --variant multidirectional"),
+        options={**_files(_COLOURED), **_COLOURS, **_SHEET, **_LIGHT, "slopes": (_ALGORITHM,), **_SPACING},
         module="maps",
         about="Without shading the colours are those of gdaldem color-relief.",
     ),

@@ -5,6 +5,7 @@ import pytest
 
 import jaxhf
 import jaxhf.cli.commands.maps
+import jaxhf.io.files
 import jaxhf.io.terrain.load
 from jaxhf.io.terrain.georeference import WGS84_DEGREES, Georeference, coordinate_system
 

@@ -71,6 +71,7 @@ def test_the_sun_moves_as_it_does_over_the_terrain(terrain):
     turned = dataclasses.replace(heights, dx=900.0, dy=900.0, georeference=Georeference(wkt, offset=(620_000.0, 5_150_000.0)))
     options.latitude, options.longitude = 46.5, 8.0
     east = _sun_path(options, turned)
+    assert east is not None
     assert 1.0 < turned.convergence < 1.4
     np.testing.assert_allclose(east, path - [turned.convergence, 0], atol=1e-6)
     options.latitude, options.longitude = -33.0, 8.0

@@ -8,24 +8,33 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from ...core.errors import ArgumentError, UserError
+from ...core.extras import import_extra
 from ...io.errors import FileError
+from ...io.files import require_writable
 from ...io.terrain.load import STRIP, read_terrain, rows_of, terrain_rows
 from ...io.terrain.rasters import require_writable_raster, save_raster, writing_strips
 from ...io.terrain.terrain import Terrain
 from ...maps.hillshade import hillshade
+from ...maps.ramp import as_ramp
 from ...maps.relief import color_relief, relief
 from ...maps.ruggedness import ruggedness
 from ...maps.slope import NODATA, aspect, slope
 from ...maps.strips import by_strips
 from .. import arguments
 from ..progress import bar
+from ..sheet import SHEETS, save_sheet, sheet
 
 _LIGHT = ("azimuth", "altitude", "z_factor", "variant", "shadows", "algorithm", "scale", "dx", "dy")
 
 
 def run(options: argparse.Namespace) -> None:
     function, nodata = _chosen(options)
+    if getattr(options, "annotate", False):
+        _sheet(options, function)
+        return
     path = require_writable_raster(options.output)
     begin = time.perf_counter()
     names = inspect.signature(function).parameters.keys() & vars(options).keys()
@@ -35,8 +44,6 @@ def run(options: argparse.Namespace) -> None:
         if ny > strip and (getattr(options, "shadows", False) or path.suffix.lower() == ".png"):
             rows, strip = rows_of(rows.whole()), ny  # shadows need all of the terrain, and a .png all of the map
         strips = by_strips(function, rows, strip, path.suffix.lower() != ".npy", arguments.given(options, *names))
-        if "dx" in names and options.scale is None:
-            report_spacing(options, rows.place)
         if ny <= strip:
             for _, values in strips:
                 save_raster(path, values, rows.place, nodata)
@@ -45,13 +52,40 @@ def run(options: argparse.Namespace) -> None:
                 for part, values in strips:
                     put(part, values)
                     shown.update(len(values))
+        if "dx" in names and options.scale is None:
+            report_spacing(options, rows.place)
     kind = function.__name__.replace("_", " ")
     print(f"{path}: {kind}, {nx} x {ny} pixels, {time.perf_counter() - begin:.2f} s")
+
+
+def _sheet(options: argparse.Namespace, function: Callable[..., Any]) -> None:
+    """A relief with what is round it on a printed map."""
+    import_extra("matplotlib", "--annotate draws with", "plot")
+    path = require_writable("relief", "a sheet", SHEETS, options.output)
+    begin = time.perf_counter()
+    terrain = read_terrain(options.terrain, **arguments.reading(options))
+    names = inspect.signature(function).parameters.keys() & vars(options).keys()
+    given = arguments.given(options, *names)
+    image, said = function(terrain, **given | {"alpha": True}), []  # paper shows where there is no height
+    if "dx" in names:
+        report_spacing(options, terrain)
+        light = "light from {:g}°, {:g}° high".format(given.get("azimuth", 315.0), given.get("altitude", 45.0))
+        said += [light] if options.variant in (None, "regular", "combined") or options.shadows else []
+        said += ["with cast shadows"] if options.shadows else []
+        said += [f"shaded with heights x {given['z_factor']:g}"] if "z_factor" in given else []
+    said += [terrain.georeference.name] if terrain.georeference and terrain.georeference.name else []
+    ramp = as_ramp(options.ramp, float(np.nanmin(terrain.heights)), float(np.nanmax(terrain.heights)))
+    metres = terrain.in_metres(**arguments.given(options, "dx", "dy"))
+    save_sheet(path, sheet(image, terrain, metres, ramp, options.contours, options.title, "; ".join(said)))
+    ny, nx = terrain.heights.shape
+    print(f"{path}: a sheet of {nx} x {ny} heights, {time.perf_counter() - begin:.2f} s")
 
 
 def _chosen(options: argparse.Namespace) -> tuple[Callable[..., Any], float | None]:
     """The function that makes the map, of those options that it has parameters for, and the value there that means none."""
     name = options.command.name
+    if name == "relief" and not options.annotate:
+        arguments.refuse(options, "contours", "title", because="without --annotate there is no sheet")
     if name in ("slope", "aspect", "ruggedness"):
         require_numbers(options.output, name)
         if name == "ruggedness":

@@ -62,7 +62,7 @@ class Georeference(NamedTuple):
     def name(self) -> str:
         """That of the reference system, "" where it is not known."""
         found = re.search(r'"([^"]*)"', self.wkt)
-        return found[1] if found and found[1] != "unnamed" else ""
+        return found[1] if found and found[1] not in ("unnamed", "unknown") else ""
 
     @property
     def unit(self) -> str:
