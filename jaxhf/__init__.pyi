@@ -14,6 +14,7 @@ from .io.terrain.load import jacksboro as jacksboro, load_heights as load_height
 from .io.terrain.meshes import save_mesh as save_mesh
 from .io.terrain.save import save_heights as save_heights
 from .io.terrain.terrain import Terrain as Terrain
+from .maps.curvature import curvature as curvature
 from .maps.hillshade import hillshade as hillshade
 from .maps.insolation import insolation as insolation
 from .maps.relief import color_relief as color_relief, relief as relief

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ..core.settings import Settings
-from ..maps.choices import ALGORITHMS, ENTRIES, RUGGEDNESS, SUNLIGHT, VARIANTS, WEIGHTINGS
+from ..maps.choices import ALGORITHMS, CURVATURES, ENTRIES, QUADRATICS, RUGGEDNESS, SUNLIGHT, VARIANTS, WEIGHTINGS
 from .arguments import (
     FINITE,
     POSITIVE,
@@ -192,6 +192,22 @@ _MAPS = (
         options={**_files(_NUMBERS, *_DIRECTION), **_SLOPES},
         module="maps",
         about="Degrees clockwise from north in 32-bit floats, -9999 where flat, as gdaldem aspect.",
+    ),
+    Command(
+        "curvature",
+        "map how a terrain bends",
+        examples=("terrain.tif -o mean.tif", "terrain.tif -o profile.tif --kind profile"),
+        options={
+            **_files(
+                _NUMBERS,
+                choice("--kind", CURVATURES, "down the slope, across it, of the contour line, mean or Gaussian [mean]"),
+                choice("--quadratic", QUADRATICS, "nearest to nine heights, or through five [evans]"),
+                flag("--compute-edges", "also at the border and beside holes"),
+            ),
+            **_SPACING,
+        },
+        module="maps",
+        about="1/m (1/m² of Gaussian) in 32-bit floats, positive where the ground bulges, -9999 where there is no value.",
     ),
     Command(
         "ruggedness",

@@ -16,7 +16,7 @@ from jaxhf.cli.overwriting import require_no_input
 from jaxhf.cli.progress import bar, compiled_bar, quiet
 
 GROUPS = {
-    "terrain maps": "hillshade slope aspect ruggedness relief skyview horizon insolation viewshed",
+    "terrain maps": "hillshade slope aspect curvature ruggedness relief skyview horizon insolation viewshed",
     "pictures": "view render",
     "recovery": "fit tradeoff",
     "files": "convert info",

@@ -14,7 +14,8 @@ pytest.importorskip("rasterio")
 SHAPE = 300, 230  # in strips of 64 rows
 COMMANDS = [
     "hillshade", "hillshade --compute-edges --variant igor", "hillshade --shadows", "hillshade --scale 1e5", "slope --percent",
-    "slope --compute-edges", "aspect --zero-for-flat", "ruggedness", "ruggedness --measure tpi --compute-edges", "relief",
+    "slope --compute-edges", "aspect --zero-for-flat", "curvature --kind plan --compute-edges", "ruggedness",
+    "ruggedness --measure tpi --compute-edges", "relief",
     "relief --ramp viridis --alpha", "relief --no-shading", "slope --bbox 7.01 45.9 7.05 45.97",
 ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""`jaxhf hillshade`, `slope`, `aspect`, `ruggedness` and `relief`: maps that NumPy makes of a terrain file."""
+"""`jaxhf hillshade`, `slope`, `aspect`, `curvature`, `ruggedness` and `relief`: maps that NumPy makes of a terrain file."""
 
 import argparse
 import dataclasses
@@ -17,6 +17,7 @@ from ...io.files import require_writable
 from ...io.terrain.load import STRIP, read_terrain, rows_of, terrain_rows
 from ...io.terrain.rasters import require_writable_raster, save_raster, writing_strips
 from ...io.terrain.terrain import Terrain
+from ...maps.curvature import curvature
 from ...maps.hillshade import hillshade
 from ...maps.ramp import as_ramp
 from ...maps.relief import color_relief, relief
@@ -86,8 +87,10 @@ def _chosen(options: argparse.Namespace) -> tuple[Callable[..., Any], float | No
     name = options.command.name
     if name == "relief" and not options.annotate:
         arguments.refuse(options, "contours", "title", because="without --annotate there is no sheet")
-    if name in ("slope", "aspect", "ruggedness"):
+    if name in ("slope", "aspect", "ruggedness", "curvature"):
         require_numbers(options.output, name)
+        if name == "curvature":
+            return curvature, NODATA
         if name == "ruggedness":
             return ruggedness, NODATA
         return (slope, NODATA) if name == "slope" else (aspect, None if options.zero_for_flat else NODATA)
