@@ -13,6 +13,7 @@ from .cache import keep_programs
 # (docs/guides/devices.md). Less than that is asked for, so that what might fit is tried.
 _BYTES_A_HEIGHT = 45
 _BYTES_A_PIXEL = 40
+_BYTES_A_HEIGHT_OF_MAPS = 80  # 93 measured, of 4096 x 4096 heights (docs/measurements/maps.md)
 
 
 def set_up_jax(options: argparse.Namespace) -> None:
@@ -43,4 +44,14 @@ def require_memory(scene: Scene, devices: int) -> None:
             f"{width} x {height} pixels of {heights} heights take more than {needed / 1e9:.3g} GB of memory on "
             f"{counted(devices, 'device')}, {available / 1e9:.3g} GB are free; a smaller picture or terrain, or fewer "
             "--devices, take less"
+        )
+
+
+def require_memory_of_map(command: str, heights: int, precision: str) -> None:
+    """UserError where a map by JAX of so many heights certainly needs more memory than there is."""
+    needed = _BYTES_A_HEIGHT_OF_MAPS * heights * (2 if precision == "float64" else 1)
+    if needed > available_bytes():
+        free = f"{available_bytes() / 1e9:.3g} GB are free"
+        raise UserError(
+            f"{command}: {heights} heights take more than {needed / 1e9:.3g} GB of memory, {free}; --bbox takes a part"
         )
