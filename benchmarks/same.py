@@ -86,7 +86,7 @@ def rays() -> Named:
         yield from ((f"cast {name} {key}", getattr(hit, key)) for key in ("t", "p", "n", "ns", "uv", "cell", "status", "dn_du"))
     hfield = jaxhf.mujoco.HField(HEIGHTS, (1, 1, 0.2, 0.1))
     met = jaxhf.mujoco.ray(hfield, *RAYS)
-    met = met if isinstance(met, tuple) else (met.dist, met.n)  # a tuple until 27 November 2026
+    met = met if isinstance(met, tuple) else (met.dist, met.n)  # a tuple before b4482a0
     yield from zip(("mujoco distance", "mujoco normal"), met, strict=True)
     for align in ("yaw", "world"):
         scan = jaxhf.mujoco.height_scan(hfield, np.array([[0.1, 0.2, 0.5]]), np.array([[0.9, 0.1, 0.2, 0.3]]), align=align)

@@ -13,7 +13,7 @@ from .cache import keep_programs
 # (docs/guides/devices.md). Less than that is asked for, so that what might fit is tried.
 _BYTES_A_HEIGHT = 45
 _BYTES_A_PIXEL = 40
-_BYTES_A_HEIGHT_OF_MAPS = 80  # 93 measured, of 4096 x 4096 heights (docs/measurements/maps.md)
+_BYTES_A_HEIGHT_OF_MAPS = 90  # 93 measured, of 4096 x 4096 heights (docs/measurements/maps.md)
 
 
 def set_up_jax(options: argparse.Namespace) -> None:

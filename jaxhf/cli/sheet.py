@@ -9,11 +9,13 @@ from jaxtyping import UInt8
 
 from ..core.errors import UserError
 from ..io.files import replacing
+from ..io.terrain.georeference import Georeference, coordinate_system
 from ..io.terrain.terrain import Terrain
 from ..maps.ramp import Ramp, coloured
 
 SHEETS = (".png", ".pdf", ".svg")
 _LINES = 500  # contour lines at most
+_DRAWN = 2000  # of the heights along a side, in contour lines: more than are told apart on a page
 _INDEX = 5  # each so many of which one is thick and has its height
 
 
@@ -22,6 +24,7 @@ def sheet(
     terrain: Terrain,
     metres: Terrain,
     ramp: Ramp,
+    entries: str,
     contours: float | None,
     title: str | None,
     caption: str,
@@ -30,9 +33,9 @@ def sheet(
 
     Args:
       colours: of each vertex, row 0 in the south, with opacity.
-      terrain: as its file has it, maybe in degrees.
+      terrain: as its file has it, maybe in degrees; coordinates are those of the file that its heights are from.
       metres: the same with the lengths that count.
-      ramp: what colours the heights have.
+      ramp, entries: what colours the heights have, see `color_relief`.
       contours: how far apart contour lines are, in the unit of the heights; None: there are none.
       title: above it.
       caption: below it.
@@ -44,30 +47,34 @@ def sheet(
 
     ny, nx = terrain.heights.shape
     tall = ny * metres.dy / (nx * metres.dx)
-    width = min(7.5, 13 / tall)  # of the map, inches
-    figure = Figure(figsize=(width + 1.5, max(width * tall + 0.8, 2)), layout="constrained")
+    width = max(min(7.5, 13 / tall), 2.5)  # of the map, inches
+    figure = Figure(figsize=(width + 1.5, max(min(width * tall, 13), 2) + 0.8), layout="constrained")
     axis = figure.subplots()
-    x, y = terrain.x0 + np.arange(nx) * terrain.dx, terrain.y0 + np.arange(ny) * terrain.dy
-    extent = x[0] - terrain.dx / 2, x[-1] + terrain.dx / 2, y[0] - terrain.dy / 2, y[-1] + terrain.dy / 2
-    axis.imshow(colours, origin="lower", extent=extent, aspect=metres.dy / terrain.dy * terrain.dx / metres.dx)
+    (dx, dy, x0, y0), place = terrain.in_file, terrain.georeference or Georeference()
+    x, y = x0 + np.arange(nx) * dx, y0 + np.arange(ny) * dy
+    extent = x[0] - dx / 2, x[-1] + dx / 2, y[0] - dy / 2, y[-1] + dy / 2
+    axis.imshow(colours, origin="lower", extent=extent, aspect=metres.dy / dy * dx / metres.dx)
     low, high = float(np.nanmin(terrain.heights)), float(np.nanmax(terrain.heights))
     if contours is not None:
-        _draw_contours(axis, x, y, terrain.heights, contours, (low, high))
-    shown = ListedColormap(coloured(ramp, np.linspace(low, high, 256)[None], "interpolate")[0] / 255)
-    unit = terrain.georeference.height_unit if terrain.georeference else ""
-    unit = unit or ("m" if terrain.crs is not None and terrain.crs.degrees else "")  # as which they count there
-    colour_bar = ScalarMappable(Normalize(low, max(high, np.nextafter(low, np.inf))), shown)
-    figure.colorbar(colour_bar, ax=axis, label=f"height{unit and f', {unit}'}", shrink=0.6)
-    _draw_scale_bar(axis, terrain, metres)
+        every = slice(None, None, math.ceil(max(ny, nx) / _DRAWN))
+        _draw_contours(axis, x[every], y[every], terrain.heights[every, every], contours, (low, high))
+    degrees = bool(place.wkt) and coordinate_system(place.wkt).degrees  # in the file: here lengths are metres all the same
+    in_metres = degrees or place.unit.lower() in ("metre", "meter", "m")
+    shown = ListedColormap(coloured(ramp, np.linspace(low, high, 256)[None], entries)[0] / 255)
+    unit = place.height_unit or ("m" if degrees else "")
+    norm = Normalize(low, max(high, float(np.nextafter(np.float32(low), np.float32(np.inf)))))
+    legend = figure.colorbar(ScalarMappable(norm, shown), ax=axis, shrink=0.6)
+    legend.set_label(f"height{unit and f', {unit}'}", parse_math=False)
+    _draw_scale_bar(axis, nx * metres.dx / 5, dx / metres.dx, in_metres, place.unit)
     _draw_north(axis, terrain.turned_from_north)
     axis.ticklabel_format(useOffset=False, style="plain")
     axis.tick_params(labelsize=7)
     for along, inches in ((axis.xaxis, width), (axis.yaxis, width * tall)):
         along.set_major_locator(MaxNLocator(max(2, int(inches / 1.2))))
     axis.tick_params(axis="y", labelrotation=90)
-    axis.set_xlabel(caption, fontsize=8, color="0.3")
+    axis.set_xlabel(caption, fontsize=8, color="0.3", parse_math=False)
     if title:
-        axis.set_title(title, loc="left")
+        axis.set_title(title, loc="left", parse_math=False)
     return figure
 
 
@@ -80,9 +87,9 @@ def save_sheet(path: Path, figure: Any) -> None:
 
 
 def _draw_contours(axis: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, step: float, span: tuple[float, float]) -> None:
+    if (span[1] - span[0]) / step > _LINES:
+        raise UserError(f"relief: --contours must leave at most {_LINES} lines, heights go from {span[0]:g} to {span[1]:g}")
     first, last = math.ceil(span[0] / step), math.floor(span[1] / step)
-    if last - first > _LINES:
-        raise UserError(f"relief: --contours must leave at most {_LINES} lines, {step:g} makes {last - first + 1}")
     numbers = [k for k in range(first, last + 1) if k * step > span[0]]
     for thick, width in ((False, 0.3), (True, 0.8)):
         levels = [k * step for k in numbers if (k % _INDEX == 0) == thick]
@@ -92,18 +99,21 @@ def _draw_contours(axis: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, step:
                 axis.clabel(lines, fontsize=6, fmt="%g")
 
 
-def _draw_scale_bar(axis: Any, terrain: Terrain, metres: Terrain) -> None:
-    """About a fifth of the map, of a length whose first digit is 1, 2 or 5."""
+def _draw_scale_bar(axis: Any, most: float, drawn: float, in_metres: bool, unit: str) -> None:
+    """As long as may be, with 1, 2 or 5 for the first digit.
+
+    Args:
+      most: how long.
+      drawn: a unit of length, in coordinates.
+      in_metres: whether lengths are in metres.
+      unit: what they are in otherwise.
+    """
     from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
-    fifth = terrain.heights.shape[1] * metres.dx / 5
-    power = 10.0 ** math.floor(math.log10(fifth))
-    length = max(power * digit for digit in (1, 2, 5) if power * digit <= fifth)
-    degrees, unit = terrain.crs is not None and terrain.crs.degrees, terrain.georeference.unit if terrain.georeference else ""
-    in_metres = degrees or unit.lower() in ("metre", "meter", "m")
+    power = 10.0 ** math.floor(math.log10(most))
+    length = max([power / 2, *(power * digit for digit in (1, 2, 5) if power * digit <= most)])
     said = f"{length / 1000:g} km" if in_metres and length >= 1000 else f"{length:g} {'m' if in_metres else unit}".rstrip()
-    drawn = length * terrain.dx / metres.dx
-    bar = AnchoredSizeBar(axis.transData, drawn, said, "lower left", pad=0.4, borderpad=0.6, sep=3, frameon=True)
+    bar = AnchoredSizeBar(axis.transData, length * drawn, said, "lower left", pad=0.4, borderpad=0.6, sep=3, frameon=True)
     bar.patch.set(alpha=0.7, linewidth=0)
     axis.add_artist(bar)
 

@@ -47,5 +47,7 @@ def _driver(path: Path) -> str:
         for header in (path.with_suffix(".hdr"), path.with_name(f"{path.name}.hdr")):
             if header.is_file() and header.read_bytes().startswith(b"ENVI"):
                 return "ENVI"
-    with path.open("rb") as file:  # which is an ending of NASA's Planetary Data System, too
-        return "PDS" if driver == "HFA" and b"PDS_VERSION_ID" in file.read(1024) else driver
+    if driver == "HFA":  # NASA's Planetary Data System uses the ending .img, too
+        with path.open("rb") as file:
+            return "PDS" if b"PDS_VERSION_ID" in file.read(1024) else driver
+    return driver

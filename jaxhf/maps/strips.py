@@ -37,16 +37,27 @@ def by_strips(
         metres = place.in_metres(**{name: options[name] for name in ("dx", "dy") if name in options})
         options = options | {"dx": metres.dx, "dy": metres.dy}
     if "ramp" in takes:
-        ends = [_ends(rows.read(part, 1).heights) for part in parts]
-        options = options | {"ramp": as_ramp(options.get("ramp"), min(low for low, _ in ends), max(high for _, high in ends))}
+        ends = [_ends(rows.read(_with_neighbours(part, ny), 1).heights) for part in parts]
+        low, high = min(low for low, _ in ends), max(high for _, high in ends)
+        _require_heights(function, low <= high)
+        options = options | {"ramp": as_ramp(options.get("ramp"), low, high)}
     found = False
     for part in parts:
-        below, above = min(part.start, 1), min(ny - part.stop, 1)
-        terrain = rows.read(slice(part.start - below, part.stop + above), 1)
-        inside = slice(below, len(terrain.heights) - above)
+        around = _with_neighbours(part, ny)
+        terrain = rows.read(around, 1)
+        inside = slice(part.start - around.start, part.stop - around.start)
         found |= bool(np.isfinite(terrain.heights[inside]).any())
         make = function if np.isfinite(terrain.heights).any() else _without_heights(function)
         yield part, make(terrain, **options)[inside]
+    _require_heights(function, found)
+
+
+def _with_neighbours(part: slice, ny: int) -> slice:
+    """The rows with one more on either side, where there is one."""
+    return slice(max(part.start - 1, 0), min(part.stop + 1, ny))
+
+
+def _require_heights(function: Callable[..., np.ndarray], found: bool) -> None:
     if not found:
         raise ArgumentError(function.__name__, "heights", "must hold a finite one, all of them are nan or infinite")
 

@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..core.errors import ArgumentError, counted, require_kind
-from ..core.rules import OneOf, require
+from ..core.errors import ArgumentError, counted, kind_of, require_kind, whole_number
+from ..core.rules import OneOf, Whole, require
 from ..core.types import AnyArray, array_leaf
 from ..xla.compilation import compiled
 from .hfield import HField, known_numbers
-from .model import geom_number, geom_pose, geom_type, hfield_numbers, is_seen, moves
+from .model import geom_number, geom_pose, geom_type, hfield_numbers, is_seen, moves, require_model
 from .pose import quaternion
 from .primitives import KINDS
 
@@ -53,7 +53,7 @@ class Geoms(eqx.Module):
         Raises:
           ValueError: an unknown kind, shapes that do not fit, a size that is negative, a quat that is zero.
         """
-        self.hfields, self.kinds = tuple(hfields), tuple(kinds)
+        self.hfields, self.kinds = _several("Geoms", "hfields", hfields), _several("Geoms", "kinds", kinds)
         for k, field in enumerate(self.hfields):
             require_kind("Geoms", f"hfields[{k}]", field, HField, "a jaxhf.mujoco.HField")
             if field.dtype != self.hfields[0].dtype:
@@ -67,8 +67,11 @@ class Geoms(eqx.Module):
         self.size, self.pos = _numbers("size", size, (n, 3)), _numbers("pos", pos, (..., n, 3))
         straight: Any = np.broadcast_to([1.0, 0, 0, 0], (*self.pos.shape[:-1], 4))
         self.quat = straight if quat is None else _numbers("quat", quat, (*self.pos.shape[:-1], 4))
-        self.ids = tuple(range(count + n)) if ids is None else tuple(map(int, ids))
-        self.fixed = (False,) * count if fixed is None else tuple(map(bool, fixed))
+        self.ids = tuple(range(count + n)) if ids is None else _several("Geoms", "ids", ids)
+        self.ids = tuple(map(whole_number, self.ids))
+        for k, number in enumerate(self.ids):
+            require("Geoms", f"ids[{k}]", number, Whole(0))
+        self.fixed = (False,) * count if fixed is None else _several("Geoms", "fixed", fixed)
         for name, found, wanted in (("ids", self.ids, count + n), ("fixed", self.fixed, count)):
             if len(found) != wanted:
                 raise ArgumentError(
@@ -123,9 +126,8 @@ class Geoms(eqx.Module):
           ValueError: a geom that is a mesh or a signed distance field, or that the model does not have; none at all.
         """
         owner = "Geoms.from_model"
-        if isinstance(geoms, str):
-            raise ArgumentError(owner, "geoms", f"must be several numbers or names, it is {geoms!r}")
-        every = [k for k in range(model.ngeom) if is_seen(model, k)] if geoms is None else geoms
+        require_model(owner, model)
+        every = [k for k in range(model.ngeom) if is_seen(model, k)] if geoms is None else _several(owner, "geoms", geoms)
         numbers = [geom_number(owner, "geoms", model, geom) for geom in every]
         types = [geom_type(model, number) for number in numbers]
         for number, kind in zip(numbers, types, strict=True):
@@ -153,23 +155,29 @@ class Geoms(eqx.Module):
           data: a `mujoco.MjData`, or MJX's data, or a batch of these, after a step or `mj_forward`.
 
         Raises:
-          ValueError: the data have no `geom_xpos` and `geom_xmat`, or not of so many geoms.
+          ValueError: the data have no `geom_xpos` and `geom_xmat`, or not of so many geoms; or these geoms are a batch already.
         """
-        try:
-            xpos, xmat = data.geom_xpos, data.geom_xmat
-        except AttributeError as error:
-            raise ArgumentError("Geoms.at", "data", f"must be a simulation's, it is {type(data).__name__}") from error
-        if xpos.shape[-2] <= max(self.ids):
-            rule = f"must have the geoms of the model that these are from, {max(self.ids)} among them, it has {xpos.shape[-2]}"
+        xpos, xmat = (getattr(data, name, ()) for name in ("geom_xpos", "geom_xmat"))
+        shape: tuple[int, ...] = np.shape(xpos)
+        if len(shape) < 2 or shape[-1] != 3 or np.size(xmat) != 3 * np.size(xpos):
+            rule = f"must be a simulation's, with geom_xpos and geom_xmat, it is {kind_of(data)}"
             raise ArgumentError("Geoms.at", "data", rule)
-        batch, count, fields = xpos.shape[:-2], len(self.hfields), []
+        if shape[-2] <= max(self.ids):
+            rule = f"must have the geoms of the model that these are from, {max(self.ids)} among them, it has {shape[-2]}"
+            raise ArgumentError("Geoms.at", "data", rule)
+        if self.batch:
+            rule = f"must place geoms without a batch, as from_model returns them, theirs is {self.batch}"
+            raise ArgumentError("Geoms.at", "data", rule)
+        batch, count, fields = shape[:-2], len(self.hfields), []
         pos, quat = _poses(array_leaf(xpos, self.dtype), array_leaf(xmat, self.dtype), np.array(self.ids))
         for k, (field, fixed) in enumerate(zip(self.hfields, self.fixed, strict=True)):
             if fixed:
                 fields.append(field)
                 continue
-            copies = jnp.broadcast_to(field.data, (*batch, *field.data.shape[-2:]))
-            fields.append(HField(copies, field.size, pos[..., k, :], quat[..., k, :]))
+            grid: Any = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), field._grid)
+            copies = jnp.broadcast_to(field.data, (*batch, *field.data.shape))
+            moved = HField(copies, field.size, pos[..., k, :], quat[..., k, :])
+            fields.append(eqx.tree_at(lambda field: field._grid, moved, grid, is_leaf=lambda leaf: leaf is None))
         places = self.pos, self.quat
         if self.kinds:
             places = pos[..., count:, :], quat[..., count:, :]
@@ -189,12 +197,19 @@ def _poses(
 def _numbers(name: str, value: Any, shape: tuple[Any, ...]) -> Any:
     """Numbers whose shape ends so behind `...`, or is this one; of no primitive there need be none."""
     ends, free = shape[-2:], shape[0] is ...
-    nothing = value is None or np.size(value) == 0
-    leaf = known_numbers("Geoms", name, np.zeros(ends) if nothing and not ends[0] else () if value is None else value)
+    leaf = known_numbers("Geoms", name, () if value is None else value)
+    leaf = np.zeros(ends) if leaf.size == 0 and not ends[0] else leaf
     if leaf.ndim < 2 or leaf.shape[-2:] != ends if free else leaf.shape != shape:
         wanted = ", ".join("..." if part is ... else str(part) for part in shape)
         raise ArgumentError("Geoms", name, f"must have shape ({wanted}), its shape is {leaf.shape}")
     return leaf
+
+
+def _several(owner: str, name: str, given: Any) -> tuple[Any, ...]:
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        found = repr(given) if isinstance(given, str) else kind_of(given)
+        raise ArgumentError(owner, name, f"must be several, in a list, it is {found}")
+    return tuple(given)
 
 
 # How many numbers of each kind's size are used.

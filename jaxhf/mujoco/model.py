@@ -4,21 +4,29 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, kind_of, whole_number
 
 # mjtGeom's numbers, in their order.
 TYPES = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
 
 
+def require_model(owner: str, model: Any) -> None:
+    if not hasattr(model, "ngeom"):
+        raise ArgumentError(owner, "model", f"must be a mujoco.MjModel, or MJX's, it is {kind_of(model)}")
+
+
 def geom_number(owner: str, argument: str, model: Any, geom: int | str) -> int:
     """The number of a geom that is given by its number, or by its name where the model knows names; else ArgumentError."""
-    number: Any = geom
+    require_model(owner, model)
+    number: Any = whole_number(geom)
     if isinstance(geom, str):
         try:
             number = model.geom(geom).id
         except (KeyError, AttributeError) as error:  # MJX's model has no names
             rule = f"must be a geom's number, or its name in a mujoco.MjModel; no geom there is named {geom!r}"
             raise ArgumentError(owner, argument, rule) from error
+    if not isinstance(whole_number(number), int):
+        raise ArgumentError(owner, argument, f"must be a geom's number or name, it is {geom!r}")
     if not 0 <= number < model.ngeom:
         raise ArgumentError(owner, argument, f"must be a number from 0 to {model.ngeom - 1}, it is {geom!r}")
     return int(number)

@@ -16,8 +16,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float, Int
 
+from ..core.autodiff import with_tangent
 from ..core.ray import Ray
-from ..core.types import AnyArray, Flag, Index, Scalar, Vector
+from ..core.types import AnyArray, Index, Scalar, Vector
 from ..core.vector import dot, greater, largest_component, lesser, quotient, root, select, time_to, unit
 from ..xla.compilation import compiled
 from .pose import Quaternion, pose
@@ -108,23 +109,23 @@ def normal(kind: str, size: Vector, p: Vector) -> Vector:
     return jnp.where(at_end, jnp.array([0, 0, 1], p.dtype) * jnp.sign(z), side)
 
 
-def met(kind: Index, size: Vector, ray: Ray, kinds: list[str]) -> tuple[Scalar, Vector, Flag]:
-    """t, the normal in the primitive's frame and whether one is met, of the primitive whose place among KINDS is `kind`.
+def met(kind: Index, size: Vector, ray: Ray, found: Scalar, kinds: list[str]) -> tuple[Scalar, Vector]:
+    """t, and the normal in the primitive's frame, where a ray meets the primitive whose place among KINDS is `kind`.
 
     Differentiable in the numbers of the primitive and of the ray.
 
     Args:
       kind: may be traced.
       size, ray: see `first_crossing`.
+      found: t as a search has it. Where a ray just touches the primitive, rounding may say here that it passes: then it counts.
       kinds: those that may be asked for.
     """
     numbers = [KINDS.index(name) for name in kinds]
     sizes = [jnp.where(kind == number, size, 1) for number in numbers]  # of another kind they may be zero
     t = select(kind, zip(numbers, map(first_crossing, kinds, sizes, [ray] * len(kinds)), strict=True))
-    found = jnp.isfinite(t)
-    t = jnp.where(found, t, 0)
-    n = select(kind, zip(numbers, map(normal, kinds, sizes, [ray(t)] * len(kinds)), strict=True))
-    return t, jnp.where(found, n, 0), found
+    found = lax.stop_gradient(found)
+    t = with_tangent(found, jnp.where(jnp.isfinite(t), t, found))
+    return t, select(kind, zip(numbers, map(normal, kinds, sizes, [ray(t)] * len(kinds)), strict=True))
 
 
 @functools.partial(compiled, static_argnames=("kinds",))
@@ -143,13 +144,12 @@ def meet_primitives(
     that of a few numbers a ray, however many primitives there are.
     """
     axes, count = o.shape[:-1], math.prod(pos.shape[:-2])
-    numbers, known = np.array([KINDS.index(kind) for kind in kinds]), sorted(set(kinds))
+    kind, known = jnp.array([KINDS.index(kind) for kind in kinds], jnp.int32), sorted(set(kinds))
     of_kind = {kind: np.flatnonzero([kind == other for other in kinds]) for kind in known}
 
     def of_one(pos: jax.Array, quat: jax.Array, o: jax.Array, d: jax.Array) -> Scan:
-        which = _search(of_kind, *lax.stop_gradient((size, pos, quat, o, d)))
-        kind = jnp.asarray(numbers, jnp.int32)[which]
-        met = jax.vmap(functools.partial(_meet, known=known))(size[which], pos[which], quat[which], kind, o, d)
+        best, which = _search(of_kind, *lax.stop_gradient((size, pos, quat, o, d)))
+        met = jax.vmap(functools.partial(_meet, known=known))(size[which], pos[which], quat[which], kind[which], o, d, best)
         return dataclasses.replace(met, geom=jnp.where(met.mask, jnp.asarray(ids)[which], -1))
 
     grouped = (leaf.reshape(count, -1, leaf.shape[-1]) for leaf in (pos, quat, o, d))
@@ -163,8 +163,8 @@ def _search(
     quat: Float[jax.Array, "n 4"],
     o: Float[jax.Array, "rays 3"],
     d: Float[jax.Array, "rays 3"],
-) -> Int[jax.Array, " rays"]:
-    """The number of the primitive that each ray meets first; any where it meets none."""
+) -> tuple[Float[jax.Array, " rays"], Int[jax.Array, " rays"]]:
+    """At which t each ray meets a primitive first, infinite where it meets none, and the number of that primitive."""
     best = jnp.full(len(o), jnp.inf, o.dtype), jnp.zeros(len(o), jnp.int32)
     for kind, numbers in of_kind.items():
 
@@ -180,11 +180,14 @@ def _search(
             return (jnp.where(closer, t, best[0]), jnp.where(closer, number, best[1])), None
 
         best, _ = lax.scan(nearer, best, (jnp.asarray(numbers, jnp.int32), size[numbers], pos[numbers], quat[numbers]))
-    return best[1]
+    return best
 
 
-def _meet(size: Vector, pos: Vector, quat: Quaternion, kind: Index, o: Vector, d: Vector, known: list[str]) -> Scan:
-    frame = pose(pos, quat)
+def _meet(
+    size: Vector, pos: Vector, quat: Quaternion, kind: Index, o: Vector, d: Vector, best: Scalar, known: list[str]
+) -> Scan:
+    frame, found = pose(pos, quat), jnp.isfinite(best)
     local, length = scaled(in_frame(frame, Ray(o, d)))
-    t, n, found = met(kind, size, local, known)
-    return Scan(frame.point(local(t)), frame.vector(n), jnp.where(found, quotient(t, length), -1), found)
+    t, n = met(kind, size, local, jnp.where(found, best, 0) * length, known)
+    p, n = jnp.where(found, frame.point(local(t)), o), jnp.where(found, frame.vector(n), 0)
+    return Scan(p, n, jnp.where(found, quotient(t, length), -1), found)

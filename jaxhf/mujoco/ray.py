@@ -29,8 +29,8 @@ def ray(geoms: HField | Geoms, pnt: Any, vec: Any, *, max_range: Any = None) -> 
     geoms from within too. A ray that starts below the surface of a height field meets the base and the walls from within; the
     normal is the triangle's own, upwards, or points out of the solid, from whichever side the ray came. Unlike there no ray
     slips through between two triangles or two walls; one that starts on a height field's surface, to the last bit, leaves it;
-    and a `vec` that is zero or not finite meets nothing. Results are differentiable in all numbers of the geoms and of the
-    rays; at a miss the derivative is zero.
+    one that touches a round primitive in one point passes it; and a `vec` that is zero or not finite meets nothing. Results
+    are differentiable in all numbers of the geoms and of the rays; at a miss the derivative is zero.
 
     Args:
       geoms: a height field, or a batch of them; or several geoms.
@@ -89,13 +89,13 @@ def first_met(
         if geoms.kinds:
             size, pos, quat = (jnp.asarray(leaf, geoms.dtype) for leaf in (geoms.size, geoms.pos, geoms.quat))
             parts.append(meet_primitives(size, pos, quat, ids[len(geoms.hfields) :], o, d, kinds=geoms.kinds))
-        scan = _nearest_scan(tuple(parts), ids[: len(geoms.hfields)])
+        scan = _nearest_scan(tuple(parts), ids[: len(geoms.hfields)], o)
     return scan if max_range is None else _reached(scan, o, d, jnp.asarray(max_range, o.dtype))
 
 
 @compiled
-def _nearest_scan(parts: tuple[Scan, ...], ids: Int[AnyArray, " fields"]) -> Scan:
-    """The nearest of what the height fields, by their numbers, and behind them the primitives were met at."""
+def _nearest_scan(parts: tuple[Scan, ...], ids: Int[AnyArray, " fields"], o: Float[jax.Array, "*rays 3"]) -> Scan:
+    """The nearest of what rays from `o` met of the height fields, whose numbers are `ids`, and of the primitives."""
     numbered = [
         dataclasses.replace(part, geom=jnp.where(part.mask, jnp.asarray(ids)[k], -1)) if part.geom is None else part
         for k, part in enumerate(parts)
@@ -104,15 +104,24 @@ def _nearest_scan(parts: tuple[Scan, ...], ids: Int[AnyArray, " fields"]) -> Sca
     def nearer(best: Scan, part: Scan) -> Scan:
         return _chosen(part.mask & (~best.mask | (part.dist < best.dist)), part, best)
 
-    return functools.reduce(nearer, numbered)
+    best = functools.reduce(nearer, numbered)
+    return dataclasses.replace(best, p=jnp.where(best.mask[..., None], best.p, o))
 
 
 @compiled
 def _reached(scan: Scan, o: jax.Array, d: jax.Array, max_range: Scalar) -> Scan:
-    near = scan.mask & (scan.dist * jnp.linalg.norm(lax.stop_gradient(d), axis=-1) <= max_range)
+    near = scan.mask & (scan.dist * lengths(d) <= max_range)
     nothing = jax.tree.map(lambda leaf: jnp.full_like(leaf, -1), scan)
     nothing = dataclasses.replace(nothing, p=jnp.broadcast_to(o, scan.p.shape), n=0 * scan.n, mask=jnp.zeros_like(scan.mask))
     return _chosen(near, scan, nothing)
+
+
+def lengths(d: Float[jax.Array, "*rays 3"]) -> Float[jax.Array, "*rays"]:
+    """Of directions, without a derivative; they neither over- nor underflow."""
+    d = lax.stop_gradient(d)
+    largest = jnp.max(jnp.abs(d), axis=-1, keepdims=True)
+    largest = jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1)
+    return jnp.linalg.norm(d / largest, axis=-1) * largest[..., 0]
 
 
 def _chosen(first: Bool[jax.Array, "*rays"], one: Scan, other: Scan) -> Scan:

@@ -6,10 +6,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Float
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, kind_of
 from ..core.rules import Whole, require
 from ..core.types import ANGLE_OF_VIEW, POSITIVE, Scalar
 from ..scene.camera import require_size
@@ -18,7 +17,7 @@ from ..xla.devices import takes_numbers
 from .geoms import Geoms
 from .hfield import HField, known_numbers, number_pair
 from .pose import rotation
-from .ray import first_met, reach
+from .ray import first_met, lengths, reach
 from .scan import on_sensors
 from .surface import Scan
 
@@ -76,7 +75,7 @@ def lidar(
       pattern: directions (n, 3) in the sensor's frame; None: `lidar_pattern()`.
       max_range: how far rays reach; None: without end.
       noise: the standard deviation of a measured range, in units of length, by which `dist` and `p` are off along the rays;
-        normal, independent of ray to ray. None: exact ranges.
+        normal, independent from ray to ray; also beyond `max_range`. None: exact ranges.
       key: of JAX's random numbers, where there is noise.
 
     Returns:
@@ -137,22 +136,23 @@ def depth_image(
     met = first_met(geoms, o, d, reach("depth_image", max_range))
     if noise is not None:
         met = _blurred(met, d, jnp.asarray(noise, met.dist.dtype), key)
-    depth, lengths = met.dist, jnp.asarray(np.linalg.norm(pixels, axis=1), met.dist.dtype)
-    dist = jnp.where(met.mask, depth * jnp.broadcast_to(lengths, depth.shape), -1)
+    depth, slant = met.dist, jnp.asarray(np.linalg.norm(pixels, axis=1), met.dist.dtype)
+    dist = jnp.where(met.mask, depth * jnp.broadcast_to(slant, depth.shape), -1)
     shape = *depth.shape[:-1], height, width
     return depth.reshape(shape), dist.reshape(shape)
 
 
 def _noise(owner: str, noise: Any, key: jax.Array | None) -> Any:
-    if noise is not None and key is None:
-        raise ArgumentError(owner, "key", "must be a key of jax.random, where there is noise")
+    is_key = isinstance(key, jax.Array) and key.shape == (() if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else (2,))
+    if noise is not None and not is_key:
+        raise ArgumentError(owner, "key", f"must be one key of jax.random, where there is noise, it is {kind_of(key)}")
     return None if noise is None else known_numbers(owner, "noise", noise, POSITIVE)
 
 
 @compiled
 def _blurred(scan: Scan, d: Float[jax.Array, "*rays 3"], noise: Scalar, key: jax.Array) -> Scan:
     """With ranges that are off along the rays; none ends behind its start."""
-    length = jnp.linalg.norm(lax.stop_gradient(d), axis=-1)
+    length = lengths(d)
     off = noise * jax.random.normal(key, scan.dist.shape, scan.dist.dtype) / jnp.where(length > 0, length, 1)
     off = jnp.where(scan.mask, jnp.where(off > -scan.dist, off, -scan.dist), 0)
     return dataclasses.replace(scan, p=scan.p + off[..., None] * d, dist=scan.dist + off)

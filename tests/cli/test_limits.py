@@ -55,3 +55,12 @@ def test_a_terrain_counts_on_each_device(refused, monkeypatch):
     limits.require_memory(scene, 1)
     with pytest.raises(UserError, match=r"take more than 0\.000904 GB of memory on 2 devices, 0\.0005 GB are free"):
         limits.require_memory(scene, 2)
+
+
+def test_a_viewshed_that_does_not_fit(refused, monkeypatch, tmp_path):
+    monkeypatch.setattr(limits, "available_bytes", lambda: 9e5)
+    jaxhf.save_heights(tmp_path / "in.npz", jaxhf.Terrain(np.zeros((100, 150), np.float32)))
+    words = "viewshed", str(tmp_path / "in.npz"), "--observer", "3", "3", "--dx", "1", "--dy", "1"
+    said = "viewshed: 15000 heights take more than 0.00135 GB of memory, 0.0009 GB are free; --bbox takes a part"
+    assert refused(*words) == said
+    assert "take more than 0.0027 GB" in refused(*words, "--precision", "float64")

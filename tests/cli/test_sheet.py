@@ -27,7 +27,7 @@ def parts(terrain: jaxhf.Terrain, contours: float | None = None, dx: float | Non
     """The axes of the map, its picture, and the scale bar."""
     colours = jaxhf.relief(terrain, alpha=True) if terrain.crs else jaxhf.color_relief(terrain, alpha=True)
     metres = terrain.in_metres(dx=dx) if dx else terrain.in_metres()
-    figure = sheet(colours, terrain, metres, as_ramp(None, LOW, HIGH), contours, "A title", "a caption")
+    figure = sheet(colours, terrain, metres, as_ramp(None, LOW, HIGH), "interpolate", contours, "A title", "a caption")
     axis = figure.axes[0]
     assert (axis.get_title(loc="left"), axis.get_xlabel()) == ("A title", "a caption")
     (picture,) = axis.get_images()
@@ -47,6 +47,37 @@ def test_a_map_lies_at_its_coordinates_with_a_scale_bar_of_metres():
     assert bar.size_bar.get_children()[0].get_width() * metres.dx / terrain.dx == pytest.approx(500)
     assert [text.get_text() for text in axis.texts] == ["N"]
     assert axis.figure.axes[1].get_ylabel() == "height, m"
+
+
+def test_what_was_made_metres_lies_where_its_file_does():
+    """As of heights that were read in metres and saved."""
+    terrain = degrees()
+    step = 1 / 1200
+    axis, picture, bar = parts(terrain.in_metres())
+    np.testing.assert_allclose(picture.get_extent(), (7 - step / 2, 7 + 59.5 * step, 60 - step / 2, 60 + 39.5 * step))
+    assert bar.txt_label.get_text() == "500 m"
+    assert bar.size_bar.get_children()[0].get_width() * terrain.in_metres().dx / step == pytest.approx(500)
+    assert axis.figure.axes[1].get_ylabel() == "height, m"
+
+
+@pytest.mark.parametrize("entries", ["interpolate", "nearest", "exact"])
+def test_the_legend_has_the_colours_of_the_map(tmp_path, entries):
+    ramp = as_ramp(None, LOW, HIGH)
+    colours = jaxhf.color_relief(Z, ramp, entries=entries, alpha=True)
+    figure = sheet(colours, jaxhf.Terrain(Z), jaxhf.Terrain(Z), ramp, entries, None, None, "")
+    shown = next(part for part in figure.axes[1].collections if np.size(part.get_array()) == 256)
+    legend = {tuple(colour) for colour in (shown.cmap(np.arange(256)) * 255).round().astype(int)}
+    if entries != "interpolate":
+        assert {tuple(colour) for colour in colours.reshape(-1, 4)} <= legend | {(0, 0, 0, 0)}
+    assert len(legend) > 100 if entries == "interpolate" else len(legend) <= 13
+
+
+@pytest.mark.parametrize("shape", [(2, 500), (500, 2), (2, 2)])
+def test_narrow_and_level_terrain(tmp_path, shape):
+    terrain = jaxhf.Terrain(np.full(shape, -3.0, np.float32), 999.9999999999999 * 5 / shape[1], 7.0)
+    ramp = as_ramp(None, -3.0, -3.0)
+    figure = sheet(jaxhf.color_relief(terrain, alpha=True), terrain, terrain, ramp, "nearest", 1.0, None, "")
+    figure.savefig(tmp_path / "a.png", dpi=20)
 
 
 def test_what_has_no_unit_has_none():
@@ -84,12 +115,12 @@ def test_the_command(tmp_path, command, ending):
     terrain.heights[3:5, 3:5] = np.nan
     jaxhf.save_heights(tmp_path / "in.npz", dataclasses.replace(terrain))
     out = tmp_path / f"out{ending}"
-    words = ["--annotate", "--title", "Hills & dales", "--contours", 50, "--shadows", "--z-factor", 2, "--azimuth", 270]
+    words = ["--annotate", "--title", "Hills $ dales $x_$", "--contours", 50, "--shadows", "--z-factor", 2, "--azimuth", 270]
     code, said, err = command("relief", tmp_path / "in.npz", "-o", out, *words)
     assert (code, said.startswith(f"{out}: a sheet of 60 x 40 heights, ")) == (0, True), err
     if ending == ".svg":
         text = out.read_text()
-        for words in ("Hills &amp; dales", "light from 270°, 45° high; with cast shadows; shaded with heights x 2; WGS 84"):
+        for words in ("Hills $ dales $x_$", "light from 270°, 45° high; with cast shadows; shaded with heights x 2; WGS 84"):
             assert words in text
 
 
@@ -98,9 +129,11 @@ def test_the_command(tmp_path, command, ending):
     [
         ("-o a.tif --annotate", "cannot write a sheet with the ending '.tif'"),
         ("-o a.png --contours 5", "--contours would change nothing: without --annotate there is no sheet"),
+        ("-o a.png --annotate --alpha", "--alpha would change nothing: a sheet is white where there is no height"),
+        ("-o a.png --annotate --contours 1e-310", "--contours must leave at most 500 lines, heights go from"),
         ("-o a.png --title x", "--title would change nothing: without --annotate"),
         ("-o a.png --annotate --contours 0", "must be positive and finite, it is 0"),
-        ("-o a.png --annotate --contours 1e-6", "--contours must leave at most 500 lines, 1e-06 makes "),
+        ("-o a.png --annotate --contours 1e-6", "--contours must leave at most 500 lines, heights go from"),
     ],
 )
 def test_wrong_options(tmp_path, command, monkeypatch, words, message):

@@ -1,5 +1,7 @@
 """Maps of large rasters, made in strips, against those that are made at once."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -35,6 +37,20 @@ def large(tmp_path):
 def strips_of(heights, monkeypatch):
     for module in (jaxhf.cli.commands.maps, jaxhf.io.terrain.load):
         monkeypatch.setattr(module, "STRIP", heights)
+
+
+@pytest.mark.parametrize("words", ["relief --alpha", "slope"])
+@pytest.mark.parametrize("rows", [65, 129])
+def test_one_row_may_be_left(large, words, rows, command, monkeypatch):
+    name, *more = words.split()
+    terrain = jaxhf.load_heights(large)
+    jaxhf.save_heights(large, dataclasses.replace(terrain, heights=terrain.heights[:rows]))
+    files = []
+    for heights in (2**24, 64 * SHAPE[1]):
+        strips_of(heights, monkeypatch)
+        files.append(large.with_name(f"{heights}.tif"))
+        assert command(name, large, "-o", files[-1], *more)[0] == 0
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 @pytest.mark.parametrize("words", COMMANDS)

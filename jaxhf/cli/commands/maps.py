@@ -6,6 +6,7 @@ import inspect
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from ...core.errors import ArgumentError, UserError
 from ...core.extras import import_extra
 from ...io.errors import FileError
-from ...io.files import require_writable
+from ...io.files import reading, require_writable
 from ...io.terrain.load import STRIP, read_terrain, rows_of, terrain_rows
 from ...io.terrain.rasters import require_writable_raster, save_raster, writing_strips
 from ...io.terrain.terrain import Terrain
@@ -65,19 +66,25 @@ def _sheet(options: argparse.Namespace, function: Callable[..., Any]) -> None:
     path = require_writable("relief", "a sheet", SHEETS, options.output)
     begin = time.perf_counter()
     terrain = read_terrain(options.terrain, **arguments.reading(options))
-    names = inspect.signature(function).parameters.keys() & vars(options).keys()
-    given = arguments.given(options, *names)
-    image, said = function(terrain, **given | {"alpha": True}), []  # paper shows where there is no height
-    if "dx" in names:
-        report_spacing(options, terrain)
-        light = "light from {:g}°, {:g}° high".format(given.get("azimuth", 315.0), given.get("altitude", 45.0))
-        said += [light] if options.variant in (None, "regular", "combined") or options.shadows else []
+    if terrain.nodata.all():
+        raise UserError(f"{options.terrain}: there is no height in it")
+    takes = inspect.signature(function).parameters
+    given = arguments.given(options, *(takes.keys() & vars(options).keys()))
+    ramp = as_ramp(options.ramp, float(np.nanmin(terrain.heights)), float(np.nanmax(terrain.heights)))
+    image, said = function(terrain, **given | {"ramp": ramp, "alpha": True}), []  # paper shows where there is no height
+    if "dx" in takes:
+        if options.scale is None:
+            report_spacing(options, terrain)
+        azimuth, altitude = (given.get(name, takes[name].default) for name in ("azimuth", "altitude"))
+        if options.shadows or options.variant in (None, "regular", "combined"):
+            said.append(f"light from {azimuth:g}°, {altitude:g}° high")
         said += ["with cast shadows"] if options.shadows else []
         said += [f"shaded with heights x {given['z_factor']:g}"] if "z_factor" in given else []
     said += [terrain.georeference.name] if terrain.georeference and terrain.georeference.name else []
-    ramp = as_ramp(options.ramp, float(np.nanmin(terrain.heights)), float(np.nanmax(terrain.heights)))
-    metres = terrain.in_metres(**arguments.given(options, "dx", "dy"))
-    save_sheet(path, sheet(image, terrain, metres, ramp, options.contours, options.title, "; ".join(said)))
+    with reading(Path(options.terrain)):
+        metres = terrain.in_metres(**arguments.given(options, "dx", "dy"))
+    entries = given.get("entries", takes["entries"].default)
+    save_sheet(path, sheet(image, terrain, metres, ramp, entries, options.contours, options.title, "; ".join(said)))
     ny, nx = terrain.heights.shape
     print(f"{path}: a sheet of {nx} x {ny} heights, {time.perf_counter() - begin:.2f} s")
 
@@ -85,8 +92,11 @@ def _sheet(options: argparse.Namespace, function: Callable[..., Any]) -> None:
 def _chosen(options: argparse.Namespace) -> tuple[Callable[..., Any], float | None]:
     """The function that makes the map, of those options that it has parameters for, and the value there that means none."""
     name = options.command.name
-    if name == "relief" and not options.annotate:
-        arguments.refuse(options, "contours", "title", because="without --annotate there is no sheet")
+    if name == "relief":
+        if options.annotate:
+            arguments.refuse(options, "alpha", because="a sheet is white where there is no height")
+        else:
+            arguments.refuse(options, "contours", "title", because="without --annotate there is no sheet")
     if name in ("slope", "aspect", "ruggedness", "curvature"):
         require_numbers(options.output, name)
         if name == "curvature":

@@ -184,8 +184,9 @@ def writing_strips(path: Path, like: Terrain, nodata: float | None) -> Iterator[
             def put(rows: slice, values: np.ndarray) -> None:
                 if not datasets:
                     profile = _profile(like, values.dtype, 1 if values.ndim == 2 else values.shape[2], nodata)
-                    datasets.append(open_files.enter_context(rasterio.open(name, "w", **profile)))
-                    datasets[0].update_tags(AREA_OR_POINT=_area_or_point(like))
+                    with _disk_full(rasterio):
+                        datasets.append(open_files.enter_context(rasterio.open(name, "w", **profile)))
+                        datasets[0].update_tags(AREA_OR_POINT=_area_or_point(like))
                 bands = np.ascontiguousarray(np.moveaxis(values[::-1].reshape(*values.shape[:2], -1), -1, 0))
                 top = len(like.heights) - rows.stop
                 window = (top, top + len(values)), (0, values.shape[1])
