@@ -187,8 +187,8 @@ def test_rays():
 
 
 def on_hfield(data: jax.Array, size: jax.Array, quat: jax.Array, pnt: jax.Array, vec: jax.Array) -> jax.Array:
-    t, n = mujoco.ray(mujoco.HField(data, size, quat=quat), pnt, vec)
-    return jnp.sum(t) + jnp.sum(n @ jnp.asarray([1, 2, 3], n.dtype))
+    scan = mujoco.ray(mujoco.HField(data, size, quat=quat), pnt, vec)
+    return jnp.sum(scan.dist) + jnp.sum(scan.n @ jnp.asarray([1, 2, 3], scan.n.dtype))
 
 
 @pytest.mark.deep

@@ -69,7 +69,7 @@ def test_rays_and_maps(shape):
     down = jaxhf.mujoco.ray(
         jaxhf.mujoco.HField(np.clip(np.nan_to_num(z) / 20 + 0.5, 0, 1), (nx / 2, ny / 2, 10, 1)), (0, 0, 50), (0, 0, -1)
     )
-    assert 40 <= down[0] <= 50
+    assert 40 <= down.dist <= 50
     maps = [
         jaxhf.hillshade(z, dx=1.0),
         jaxhf.slope(z, dx=1.0),

@@ -170,7 +170,7 @@ def fields(heights) -> jaxhf.Heightfield:
 OF_MANY = {
     "batch": lambda z: jaxhf.cast(fields(z), start(), DOWN).t,
     "prepared": lambda z: jaxhf.cast(jaxhf.prepare(fields(z)), start(), DOWN).t,
-    "hfields": lambda z: jaxhf.mujoco.ray(jaxhf.mujoco.HField(z, np.ones(4)), start(), DOWN)[0],
+    "hfields": lambda z: jaxhf.mujoco.ray(jaxhf.mujoco.HField(z, np.ones(4)), start(), DOWN).dist,
 }
 
 
