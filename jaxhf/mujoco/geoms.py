@@ -48,7 +48,7 @@ class Geoms(eqx.Module):
     ):  # fmt: skip
         """
         Args:
-          hfields, kinds, size, pos, quat, ids, fixed: the attributes; None: no `quat` turns anything, `fixed` is none.
+          hfields, kinds, size, pos, quat, ids, fixed: the attributes; None: nothing is turned, they count from 0, none is fixed.
 
         Raises:
           ValueError: an unknown kind, shapes that do not fit, a size that is negative, a quat that is zero.

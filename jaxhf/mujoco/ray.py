@@ -55,7 +55,7 @@ def ray(geoms: HField | Geoms, pnt: Any, vec: Any, *, max_range: Any = None) -> 
         shape = np.broadcast_shapes(pnt.shape, vec.shape)
     except ValueError as error:
         raise ArgumentError("ray", "vec", f"must fit pnt of shape {pnt.shape}, its shape is {vec.shape}") from error
-    if shape[: len(geoms.batch)] != geoms.batch or (geoms.batch and len(shape) <= len(geoms.batch)) or len(shape) < 1:
+    if shape[: len(geoms.batch)] != geoms.batch or len(shape) <= len(geoms.batch):
         rule = f"must begin with the axes {geoms.batch} of the geoms, the rays have shape {shape}"
         raise ArgumentError("ray", "pnt", rule)
     return first_met(geoms, jnp.broadcast_to(pnt, shape), jnp.broadcast_to(vec, shape), reach("ray", max_range))
