@@ -48,7 +48,7 @@ class Geoms(eqx.Module):
     ):  # fmt: skip
         """
         Args:
-          hfields, kinds, size, pos, quat, ids, fixed: the attributes; None: nothing is turned, they count from 0, none is fixed.
+          hfields, kinds, size, pos, quat, ids, fixed: the attributes. None: nothing is turned, ids count on from 0, all moves.
 
         Raises:
           ValueError: an unknown kind, shapes that do not fit, a size that is negative, a quat that is zero.
