@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core.version import __version__
-from .catalogue import COMMANDS, GROUPS, Command
+from .catalogue import COMMANDS, GROUPS
+from .command import Command
 
 _EXAMPLES = """
 examples:
