@@ -90,8 +90,8 @@ def test_nothing_but_holes_is_no_map(large, command, monkeypatch):
 
 
 @pytest.mark.filterwarnings("default")
-def test_what_is_hardly_meant_is_seen_in_a_sample(large, command, monkeypatch):
-    monkeypatch.setattr(jaxhf.io.terrain.load, "_LOOKED_AT", 1000)
+def test_values_that_may_mean_no_height_are_seen_in_a_sample(large, command, monkeypatch):
+    monkeypatch.setattr(jaxhf.io.terrain.load, "_SAMPLE", 1000)
     strips_of(64 * SHAPE[1], monkeypatch)
     terrain = jaxhf.load_heights(large)
     terrain.heights[np.isnan(terrain.heights)] = 32767

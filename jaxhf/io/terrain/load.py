@@ -123,7 +123,7 @@ def _warn_of(path: Path, terrain: Terrain, z_scale: float = 1.0) -> None:
 
 
 STRIP = 2**24  # heights that are read at once, of a raster that holds more
-_LOOKED_AT = 2**22  # of these, for what is hardly meant
+_SAMPLE = 2**22  # about how many of these are looked at for values that may mean no height, see `_hints`
 
 
 @contextlib.contextmanager
@@ -146,7 +146,7 @@ def terrain_rows(
                     return stored(part, step)
 
             if ny * nx > STRIP:
-                step = math.ceil(math.sqrt(ny * nx / _LOOKED_AT))
+                step = math.ceil(math.sqrt(ny * nx / _SAMPLE))
                 _warn_of(path, read(slice(0, ny), step))
                 yield Rows(rows.place, read)
                 return
