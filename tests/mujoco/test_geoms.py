@@ -37,13 +37,13 @@ def in_precision(geoms: Geoms, dtype: Any) -> Geoms:
     return Geoms(fields, geoms.kinds, geoms.size, geoms.pos, geoms.quat, geoms.ids, geoms.fixed)
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), pytest.param(np.float64, 1e-11, marks=DOUBLE)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, 1e-5), pytest.param(np.float64, 1e-12, marks=DOUBLE)])
 def test_the_nearest_is_mujocos(dtype, tolerance):
     o, d = any_rays(8000)
     t, n, geom = mujocos_rays(MODEL, DATA, o, d)
     scan = ray(in_precision(Geoms.from_model(MODEL), dtype).at(DATA), o, d)
     # By the part of a difference that leads away from what was met: along a grazing ray roundings are drawn out.
-    off = np.abs(np.asarray(scan.dist) - t) * (np.linalg.norm(d, axis=1) if dtype == np.float64 else np.abs((d * n).sum(1)))
+    off = np.abs(np.asarray(scan.dist) - t) * np.abs((d * n).sum(1))
     wrong = (met_by(scan) != geom) | (off > tolerance) | (np.abs(np.asarray(scan.n) - n).max(1) > 100 * tolerance)
     assert wrong.sum() <= (2 if dtype == np.float32 else 0), np.flatnonzero(wrong)  # past an edge
     assert len(set(geom) - {-1}) >= MODEL.ngeom - 1  # one is hidden by others
