@@ -238,7 +238,7 @@ def gradient(run: benchmark.Run) -> None:
             run.claim(right, f"{align}, {name}: off by {error:.1e} and {both:.1e}, at most 1e-7 and 1e-10")
 
 
-def geoms(run: benchmark.Run, count: int, cores: int = 2) -> None:
+def geoms(run: benchmark.Run, count: int) -> None:
     """Rays from anywhere to anywhere among three height fields and ten primitives of random models, in single precision."""
     apart, others, misses, largest, rates = 0, 0, 0, 0.0, {}
     models = 10

@@ -50,8 +50,9 @@ def require_memory(scene: Scene, devices: int) -> None:
 def require_memory_of_map(command: str, heights: int, precision: str) -> None:
     """UserError where a map by JAX of so many heights certainly needs more memory than there is."""
     needed = _BYTES_A_HEIGHT_OF_MAPS * heights * (2 if precision == "float64" else 1)
-    if needed > available_bytes():
-        free = f"{available_bytes() / 1e9:.3g} GB are free"
+    available = available_bytes()
+    if needed > available:
+        free = f"{available / 1e9:.3g} GB are free"
         raise UserError(
             f"{command}: {heights} heights take more than {needed / 1e9:.3g} GB of memory, {free}; --bbox takes a part"
         )

@@ -1,7 +1,5 @@
 """How a surface bends: curvatures of a quadratic through, or near, the 3 x 3 heights round each vertex."""
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float32, Float64
 
@@ -55,7 +53,7 @@ def curvature(
         p, q = p / dx, q / dy
         r, s, t = r / dx / ground.dx, s / dx / ground.dy, t / dy / ground.dy
         limit = np.finfo(np.float32).max
-        return np.clip(_FORMULAS[kind](p, q, r, s, t), -limit, limit)
+        return np.clip(_bend(kind, p, q, r, s, t), -limit, limit)
 
     return over_windows(ground.heights, formula, compute_edges, np.float32(NODATA))
 
@@ -76,36 +74,15 @@ def _over(a: _Values, b: _Values) -> _Values:
     return np.divide(a, b, out=np.zeros_like(a), where=b > 0)
 
 
-def _steep(p: _Values, q: _Values) -> tuple[_Values, _Values]:
+def _bend(kind: str, p: _Values, q: _Values, r: _Values, s: _Values, t: _Values) -> _Values:
+    """The curvature from dz/dx, dz/dy, d²z/dx², d²z/dxdy and d²z/dy²."""
     squared = p * p + q * q
-    return squared, 1 + squared
-
-
-def _profile(p: _Values, q: _Values, r: _Values, s: _Values, t: _Values) -> _Values:
-    squared, stretch = _steep(p, q)
-    return -_over(r * p * p + 2 * s * p * q + t * q * q, squared * stretch**1.5)
-
-
-def _tangential(p: _Values, q: _Values, r: _Values, s: _Values, t: _Values) -> _Values:
-    squared, stretch = _steep(p, q)
-    return -_over(r * q * q - 2 * s * p * q + t * p * p, squared * np.sqrt(stretch))
-
-
-def _plan(p: _Values, q: _Values, r: _Values, s: _Values, t: _Values) -> _Values:
-    squared, _ = _steep(p, q)
-    return -_over(r * q * q - 2 * s * p * q + t * p * p, squared**1.5)
-
-
-def _mean(p: _Values, q: _Values, r: _Values, s: _Values, t: _Values) -> _Values:
-    _, stretch = _steep(p, q)
-    return -((1 + q * q) * r - 2 * p * q * s + (1 + p * p) * t) / (2 * stretch**1.5)
-
-
-def _gaussian(p: _Values, q: _Values, r: _Values, s: _Values, t: _Values) -> _Values:
-    _, stretch = _steep(p, q)
-    return (r * t - s * s) / stretch**2
-
-
-_FORMULAS: dict[str, Callable[[_Values, _Values, _Values, _Values, _Values], _Values]] = dict(
-    zip(CURVATURES, (_profile, _tangential, _plan, _mean, _gaussian), strict=True)
-)
+    stretch = 1 + squared
+    if kind == "mean":
+        return -((1 + q * q) * r - 2 * p * q * s + (1 + p * p) * t) / (2 * stretch**1.5)
+    if kind == "gaussian":
+        return (r * t - s * s) / stretch**2
+    if kind == "profile":
+        return -_over(r * p * p + 2 * s * p * q + t * q * q, squared * stretch**1.5)
+    across = r * q * q - 2 * s * p * q + t * p * p
+    return -_over(across, squared**1.5 if kind == "plan" else squared * np.sqrt(stretch))

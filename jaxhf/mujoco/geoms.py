@@ -129,16 +129,15 @@ class Geoms(eqx.Module):
         require_model(owner, model)
         every = [k for k in range(model.ngeom) if is_seen(model, k)] if geoms is None else _several(owner, "geoms", geoms)
         numbers = [geom_number(owner, "geoms", model, geom) for geom in every]
-        types = [geom_type(model, number) for number in numbers]
-        for number, kind in zip(numbers, types, strict=True):
+        types = {number: geom_type(model, number) for number in numbers}
+        for number, kind in types.items():
             if kind != "hfield" and kind not in KINDS:
                 raise ArgumentError(owner, "geoms", f"must be height fields and primitives, {number} is a {kind}: leave it out")
-        fields = [number for number, kind in zip(numbers, types, strict=True) if kind == "hfield"]
-        solids = [number for number, kind in zip(numbers, types, strict=True) if kind != "hfield"]
+        fields, solids = ([number for number in numbers if (types[number] == "hfield") == want] for want in (True, False))
         poses = [geom_pose(model, number) for number in solids]
         return cls(
             [HField(*hfield_numbers(model, number), *geom_pose(model, number)) for number in fields],
-            [geom_type(model, number) for number in solids],
+            [types[number] for number in solids],
             [np.array(model.geom_size[number], np.float64) for number in solids],
             [pos for pos, _ in poses],
             [quat for _, quat in poses],

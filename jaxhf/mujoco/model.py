@@ -1,5 +1,6 @@
 """What is read of a MuJoCo model: the numbers, kinds and places of its geoms."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from ..core.errors import ArgumentError, kind_of, whole_number
 
 # mjtGeom's numbers, in their order.
-TYPES = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
+_TYPES = ("plane", "hfield", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "sdf")
 
 
 def require_model(owner: str, model: Any) -> None:
@@ -18,23 +19,23 @@ def require_model(owner: str, model: Any) -> None:
 def geom_number(owner: str, argument: str, model: Any, geom: int | str) -> int:
     """The number of a geom that is given by its number, or by its name where the model knows names; else ArgumentError."""
     require_model(owner, model)
-    number: Any = whole_number(geom)
     if isinstance(geom, str):
         try:
-            number = model.geom(geom).id
+            return int(model.geom(geom).id)
         except (KeyError, AttributeError) as error:  # MJX's model has no names
             rule = f"must be a geom's number, or its name in a mujoco.MjModel; no geom there is named {geom!r}"
             raise ArgumentError(owner, argument, rule) from error
-    if not isinstance(whole_number(number), int):
+    number = whole_number(geom)
+    if not isinstance(number, int):
         raise ArgumentError(owner, argument, f"must be a geom's number or name, it is {geom!r}")
     if not 0 <= number < model.ngeom:
         raise ArgumentError(owner, argument, f"must be a number from 0 to {model.ngeom - 1}, it is {geom!r}")
-    return int(number)
+    return number
 
 
 def geom_type(model: Any, number: int) -> str:
     kind = int(model.geom_type[number])
-    return TYPES[kind] if 0 <= kind < len(TYPES) else "geom of another kind"
+    return _TYPES[kind] if 0 <= kind < len(_TYPES) else "geom of another kind"
 
 
 def is_seen(model: Any, number: int) -> bool:
@@ -44,24 +45,25 @@ def is_seen(model: Any, number: int) -> bool:
     return float(colour[3]) > 0
 
 
-def moves(model: Any, number: int) -> bool:
-    """Whether a joint, or a mocap body's place, moves a geom."""
+def _bodies(model: Any, number: int) -> Iterator[int]:
+    """A geom's body, the one that carries it, and so on, without the world."""
     body = int(model.geom_bodyid[number])
     while body:
-        if int(model.body_jntnum[body]) or int(model.body_mocapid[body]) >= 0:
-            return True
+        yield body
         body = int(model.body_parentid[body])
-    return False
+
+
+def moves(model: Any, number: int) -> bool:
+    """Whether a joint, or a mocap body's place, moves a geom."""
+    return any(int(model.body_jntnum[body]) or int(model.body_mocapid[body]) >= 0 for body in _bodies(model, number))
 
 
 def geom_pose(model: Any, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Position and quaternion of a geom in the world, while no joint has moved."""
     pos, quat = np.array(model.geom_pos[number], np.float64), np.array(model.geom_quat[number], np.float64)
-    body = int(model.geom_bodyid[number])
-    while body:
-        parent = np.array(model.body_quat[body], np.float64)
-        pos, quat = np.array(model.body_pos[body]) + _rotated(parent, pos), _product(parent, quat)
-        body = int(model.body_parentid[body])
+    for body in _bodies(model, number):
+        turn = np.array(model.body_quat[body], np.float64)
+        pos, quat = np.array(model.body_pos[body]) + _rotated(turn, pos), _product(turn, quat)
     return pos, quat
 
 

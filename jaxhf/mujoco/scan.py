@@ -90,16 +90,12 @@ def height_scan(
     require(owner, "align", align, OneOf(Align))
     offset = known_numbers(owner, "offset", offset, FINITE)
     starts = _starts(pos, quat, jnp.asarray(offset, pos.dtype), align=align)
-
-    def looked_up(field: HField) -> Scan:
-        return _look_up(field, starts, places)
-
     if align != "base" and isinstance(geoms, HField) and geoms.upright and max_range is None:
-        return looked_up(geoms)
+        return _look_up(geoms, starts, places)
     o, d = _rays(starts, places)
 
     def met(field: HField) -> Scan:
-        return looked_up(field) if align != "base" and field.upright else meet_hfield(field, o, d)
+        return _look_up(field, starts, places) if align != "base" and field.upright else meet_hfield(field, o, d)
 
     return first_met(geoms, o, d, reach(owner, max_range), met)
 

@@ -84,10 +84,8 @@ def lidar(
     Raises:
       ValueError: shapes that do not fit, a range or noise that is not positive, noise without a key.
     """
-    noise = _noise("lidar", noise, key)
-    o, d = _turned(*on_sensors("lidar", geoms, pos, quat, lidar_pattern() if pattern is None else pattern, 3))
-    scan = first_met(geoms, o, d, reach("lidar", max_range))
-    return scan if noise is None else _blurred(scan, d, jnp.asarray(noise, scan.dist.dtype), key)
+    directions = lidar_pattern() if pattern is None else pattern
+    return _measured("lidar", geoms, pos, quat, directions, max_range, noise, key)
 
 
 @takes_numbers
@@ -131,22 +129,31 @@ def depth_image(
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (cy - np.arange(height) - 0.5) / fy)
     # With 1 along the axis a ray's t is the depth itself.
     pixels = np.stack([x, y, -np.ones_like(x)], -1).reshape(-1, 3)
-    noise = _noise("depth_image", noise, key)
-    o, d = _turned(*on_sensors("depth_image", geoms, pos, quat, pixels, 3))
-    met = first_met(geoms, o, d, reach("depth_image", max_range))
-    if noise is not None:
-        met = _blurred(met, d, jnp.asarray(noise, met.dist.dtype), key)
+    met = _measured("depth_image", geoms, pos, quat, pixels, max_range, noise, key)
     depth, slant = met.dist, jnp.asarray(np.linalg.norm(pixels, axis=1), met.dist.dtype)
     dist = jnp.where(met.mask, depth * jnp.broadcast_to(slant, depth.shape), -1)
     shape = *depth.shape[:-1], height, width
     return depth.reshape(shape), dist.reshape(shape)
 
 
-def _noise(owner: str, noise: Any, key: jax.Array | None) -> Any:
+def _measured(
+    owner: str,
+    geoms: HField | Geoms,
+    pos: Any,
+    quat: Any,
+    directions: Any,
+    max_range: Any,
+    noise: Any,
+    key: jax.Array | None,
+) -> Scan:
+    """What rays from sensors meet, in directions that turn with them; see `lidar`."""
     is_key = isinstance(key, jax.Array) and key.shape == (() if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else (2,))
     if noise is not None and not is_key:
         raise ArgumentError(owner, "key", f"must be one key of jax.random, where there is noise, it is {kind_of(key)}")
-    return None if noise is None else known_numbers(owner, "noise", noise, POSITIVE)
+    noise = None if noise is None else known_numbers(owner, "noise", noise, POSITIVE)
+    o, d = _turned(*on_sensors(owner, geoms, pos, quat, directions, 3))
+    scan = first_met(geoms, o, d, reach(owner, max_range))
+    return scan if noise is None else _blurred(scan, d, jnp.asarray(noise, scan.dist.dtype), key)
 
 
 @compiled
