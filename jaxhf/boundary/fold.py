@@ -88,7 +88,7 @@ def _fold_on(grid: Grid, number: int, sample: BoundarySample, past: Ray, distanc
             cell=jnp.stack([cell_x, cell_y]),
             triangle=upper.astype(jnp.int32),
             side=side,
-            uv=jnp.stack([x / grid.cells[0], y / grid.cells[1]]),
+            uv=jnp.stack([x / grid.extent[0], y / grid.extent[1]]),
         )
 
     near, ahead = on_triangle(near_left), on_triangle(ahead_left)
@@ -98,7 +98,7 @@ def _fold_on(grid: Grid, number: int, sample: BoundarySample, past: Ray, distanc
     # The triangle on the left lies on the side of e x d if the source sees its +z side.
     across = unit(normal) * jnp.where(near_left, near.side, -near.side).astype(d.dtype)
     bends = (near.side != ahead.side) | ~(has_left & has_right)
-    step = _ASIDE * float(jnp.finfo(d.dtype).eps) ** 0.5 * max(grid.cells)
+    step = _ASIDE * float(jnp.finfo(d.dtype).eps) ** 0.5 * jnp.maximum(*grid.extent)
     back = _BACK * step / dot(local, d)
     beside = Ray(past.o - grid.world_from_grid.vector(across * step) - back * past.d, past.d)
     return Fold(past, distance, near, ahead, bends, beside, back, across)

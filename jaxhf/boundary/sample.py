@@ -133,13 +133,13 @@ def end_heights(grid: Grid, point: BoundarySample, more: Point2 | None = None) -
 
 def _ends(grid: Grid, point: BoundarySample) -> tuple[Index, Index]:
     """The numbers of the edge's two vertices in its grid, row by row."""
-    start, end = (vertex[1] * grid.shape[1] + vertex[0] for vertex in (point.start, point.end))
+    start, end = (vertex[1] * grid.nx + vertex[0] for vertex in (point.start, point.end))
     return start, end
 
 
 def _receiving_cell(grid: Grid, point: BoundarySample) -> Int[jax.Array, "2"]:
     """In range also where the shadow falls on another surface."""
-    return jnp.clip(point.cell, 0, jnp.array(grid.cells, jnp.int32) - 1)
+    return jnp.clip(point.cell, 0, jnp.stack(grid.cells) - 1)
 
 
 def deciding_vertices(world: World, point: BoundarySample) -> Int[jax.Array, "5"]:
@@ -151,7 +151,7 @@ def deciding_vertices(world: World, point: BoundarySample) -> Int[jax.Array, "5"
     for k, grid, before in world.grids:
         cell = _receiving_cell(grid, point)
         ends.append((k, before + jnp.clip(jnp.stack(_ends(grid, point)), 0, grid.rows.shape[0] - 1)))
-        triangles.append((k, before + jnp.stack(triangle_vertices(grid.shape[1], cell[0], cell[1], point.upper))))
+        triangles.append((k, before + jnp.stack(triangle_vertices(grid.nx, cell[0], cell[1], point.upper))))
     none = jnp.zeros(3, jnp.int32)
     return jnp.concatenate([select(point.surface, ends), select(point.receiver, triangles, none)])
 
@@ -177,7 +177,7 @@ def _fallen(world: World, point: BoundarySample, p: Vector, perturbation: Height
         # From `near` on, which lies there but for its derivative: far distances would cancel.
         local = grid.grid_from_world.ray(Ray(near, away))
         cell = _receiving_cell(grid, point)
-        heights = triangle_corners(grid.rows, grid.shape[1], cell[0], cell[1], point.upper)
+        heights = triangle_corners(grid.rows, grid.nx, cell[0], cell[1], point.upper)
         if perturbation is not None:
             heights = tuple(z + more for z, more in zip(heights, perturbation[2:], strict=True))
         a, b, c = plane_through(heights, point.upper)

@@ -49,7 +49,8 @@ def make_ceiling(grid: Grid, towards: Vector) -> Ceiling:
     takes the highest of the cells that it touches. All is widened by the rounding of a walk.
     """
     grid, towards = lax.stop_gradient((grid, towards))
-    z, (cells_x, cells_y) = grid.z, grid.cells
+    z = grid.z
+    cells_y, cells_x = (n - 1 for n in z.shape)
     eps, most = float(jnp.finfo(z.dtype).eps), max(cells_x, cells_y)
     d = grid.grid_from_world.vector(towards)
     d = d / largest_component(d)
@@ -128,7 +129,10 @@ def clears(ceiling: Ceiling, grid: Grid, number: int, hit: Hit) -> Flag:
     cells_x, cells_y = grid.cells
     strips, cells = jnp.where(ceiling.columns, cells_x, cells_y), jnp.where(ceiling.columns, cells_y, cells_x)
     strip, along = jnp.where(ceiling.columns, ix, iy), jnp.where(ceiling.columns, x, y)
-    strip, along = jnp.where(ceiling.back, strips - 1 - strip, strip), jnp.where(ceiling.back, strips - along, along)
+    strip, along = (
+        jnp.where(ceiling.back, strips - 1 - strip, strip),
+        jnp.where(ceiling.back, strips.astype(along.dtype) - along, along),
+    )
     parallel = jnp.where(ceiling.columns, y, x) - ceiling.across * along
     column = jnp.clip(jnp.floor(parallel).astype(jnp.int32) + value_at(ceiling.first, strip), 0, cells + 2)
     height = c + a * u + b * v - ceiling.rise * jnp.where(ceiling.columns, u, v)

@@ -31,6 +31,9 @@ from ..xla.materialise import materialise
 from .ceiling import Ceiling, clears, make_ceiling
 from .sky import visible_sky
 
+Ceilings = tuple[tuple[Ceiling | None, ...], ...]
+"""For each light and each object."""
+
 
 class World(eqx.Module):
     """A scene made ready for tracing, with the settings for which it was made.
@@ -49,7 +52,7 @@ class World(eqx.Module):
     surfaces: tuple[Surface, ...]
     materials: tuple[Material | Mirror, ...]
     lights: tuple[Light, ...]
-    ceilings: tuple[tuple[Ceiling | None, ...], ...]
+    ceilings: Ceilings
     sky: tuple[Float[jax.Array, "_ 3"] | None, ...]
     settings: Settings = eqx.field(static=True)
 
@@ -96,9 +99,7 @@ def _joined_to(grid: Grid, surfaces: tuple[Surface, ...]) -> list[Grid]:
     return [other for other in grids if other.seam is not None and grid.seam is not None]
 
 
-def make_ceilings(
-    surfaces: tuple[Surface, ...], lights: tuple[Light, ...], settings: Settings
-) -> tuple[tuple[Ceiling | None, ...], ...]:
+def make_ceilings(surfaces: tuple[Surface, ...], lights: tuple[Light, ...], settings: Settings) -> Ceilings:
     """See `World`: all of it that depends on the lights, beside these."""
     # A walk whose steps are counted is not to be spared.
     spared = settings.shadows and settings.early_exit and settings.max_steps is None

@@ -16,13 +16,15 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
+from ..preparation.any_size import roomy_ceilings, with_room
 from ..preparation.localise import anchor, localise, localise_camera, localise_lights, precision
-from ..preparation.world import World, make_ceilings, make_world, resolve_settings
+from ..preparation.world import Ceilings, World, make_ceilings, make_world, resolve_settings
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light
 from ..scene.scene import Scene
 from ..trace.grid import Grid, make_grid
+from ..trace.intersect import Surface
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import (
     chosen_mesh,
@@ -257,13 +259,22 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
     return lax.map(lambda z: make_grid(Heightfield(z, dx, dy), None, settings), heights)
 
 
-_make_ceilings = compiled(make_ceilings, static_argnames=("settings",))
-_make_world = compiled(make_world, static_argnames=("settings",))
-_make_world_with_horizons = compiled(make_world, newer=True, static_argnames=("settings",))
+@functools.partial(compiled, static_argnames=("settings",))
+def _make_ceilings(surfaces: tuple[Surface, ...], lights: tuple[Light, ...], settings: Settings) -> Ceilings:
+    return roomy_ceilings(surfaces, make_ceilings(surfaces, lights, settings))
+
+
+def _made_world(scene: Scene, settings: Settings, has_room: bool) -> World:
+    world = make_world(scene, settings)
+    return with_room(world) if has_room else world
+
+
+_make_world = compiled(_made_world, static_argnames=("settings", "has_room"))
+_make_world_with_horizons = compiled(_made_world, newer=True, static_argnames=("settings", "has_room"))
 
 
 def prepared_world(scene: Scene, settings: Settings) -> World:
-    """Of a `localise`d scene, by one program for all cameras."""
+    """Of a `localise`d scene, by one program for all cameras; with room, where programs of its own are to trace it."""
     make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
     scene = unfolded(scene) if is_traced() else scene
-    return make(eqx.tree_at(lambda scene: scene.camera, scene, None), settings=settings)
+    return make(eqx.tree_at(lambda scene: scene.camera, scene, None), settings=settings, has_room=not is_traced())

@@ -5,7 +5,7 @@ mu0 and mu are the cosines of the angles of incidence and of emission, g is the 
 
 import abc
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ from jaxtyping import Float
 from ..core.types import COLOUR, FINITE, AnyArray, Number, Scalar, ScalarLeaf, Vector, float_leaf, rgb_leaf
 from ..core.vector import GRAZING, angle, dot, greater, lesser, root, rounded_clamp
 from .record import Record
-from .texture import ImageTexture
+from .texture import FlatTexture, ImageTexture
 
 if TYPE_CHECKING:  # where a `brdf` is asked for textures have been looked up
     _Colour = jax.Array
@@ -217,11 +217,11 @@ SCATTERING: dict[str, Callable[..., Material]] = {
 }
 
 
-def map_textures(material: Any, fun: Callable[[ImageTexture], Any]) -> Any:
+def map_textures(material: Any, fun: Callable[[Any], Any]) -> Any:
     """A material with something else in place of its textures."""
 
-    def is_texture(leaf: Any) -> TypeGuard[ImageTexture]:
-        return isinstance(leaf, ImageTexture)
+    def is_texture(leaf: Any) -> bool:
+        return isinstance(leaf, ImageTexture | FlatTexture)
 
     return jax.tree.map(lambda leaf: fun(leaf) if is_texture(leaf) else leaf, material, is_leaf=is_texture)
 

@@ -1,5 +1,6 @@
 """Textures: images spread over a surface."""
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
@@ -52,10 +53,7 @@ class ImageTexture(eqx.Module):
 
     def __call__(self, uv: Point2) -> Vector:
         texels = jnp.asarray(self.texels)
-        (low, high, fy), (left, right, fx) = self._between(uv)
-        return (1 - fy) * ((1 - fx) * texels[low, left] + fx * texels[low, right]) + fy * (
-            (1 - fx) * texels[high, left] + fx * texels[high, right]
-        )
+        return _mixed(self._between(uv), lambda row, column: texels[row, column])
 
     def corners(self, uv: Point2) -> tuple[Int[jax.Array, "4"], Int[jax.Array, "4"], Float[jax.Array, "4"]]:
         """The rows and columns of the four texels between which a colour is looked up, and their weights."""
@@ -63,16 +61,56 @@ class ImageTexture(eqx.Module):
         rows, columns = jnp.stack([low, low, high, high]), jnp.stack([left, right, left, right])
         return rows, columns, jnp.stack([(1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx])
 
-    def _between(self, uv: Point2) -> tuple[tuple[Index, Index, Scalar], tuple[Index, Index, Scalar]]:
-        """The two rows, and then the two columns, between which (u, v) lies, and its share of the way."""
+    def _between(self, uv: Point2) -> "tuple[_Between, _Between]":
         h, w, _ = self.texels.shape
-        if self.at_vertices:
-            x, y = within(uv[0], 0.0, 1.0) * (w - 1), within(uv[1], 0.0, 1.0) * (h - 1)
-        else:
-            x, y = uv[0] * w - 0.5, uv[1] * h - 0.5
-            if self.wrap == "clamp":
-                x, y = within(x, 0.0, w - 1.0), within(y, 0.0, h - 1.0)
-        column, row = jnp.floor(x), jnp.floor(y)
-        fx, fy = x - column, y - row
-        ix, iy = column.astype(jnp.int32), row.astype(jnp.int32)
-        return (iy % h, (iy + 1) % h, fy), (ix % w, (ix + 1) % w, fx)
+        return _between(uv, jnp.int32(h), jnp.int32(w), self.at_vertices, self.wrap)
+
+
+class FlatTexture(eqx.Module):
+    """An `ImageTexture` whose size a program need not know: its texels row after row, and whatever behind them.
+
+    Attributes:
+      h, w: rows, and texels in each.
+      at_vertices, wrap: as of `ImageTexture`.
+    """
+
+    texels: Float[AnyArray, "n 3"]
+    h: Index
+    w: Index
+    at_vertices: bool = eqx.field(static=True)
+    wrap: Wrap = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, image: ImageTexture) -> "FlatTexture":
+        h, w, _ = image.texels.shape
+        return cls(jnp.asarray(image.texels).reshape(-1, 3), jnp.int32(h), jnp.int32(w), image.at_vertices, image.wrap)
+
+    def __call__(self, uv: Point2) -> Vector:
+        between = _between(uv, self.h, self.w, self.at_vertices, self.wrap)
+        return _mixed(between, lambda row, column: self.texels[row * self.w + column])
+
+
+_Between = tuple[Index, Index, Scalar]
+"""Two rows or columns of an image, and the share of the way from the first to the second."""
+
+
+def _between(uv: Point2, h: Index, w: Index, at_vertices: bool, wrap: Wrap) -> tuple[_Between, _Between]:
+    """The two rows, and then the two columns, between which (u, v) lies in an image of this size."""
+    height, width = h.astype(uv.dtype), w.astype(uv.dtype)
+    if at_vertices:
+        x, y = within(uv[0], 0.0, 1.0) * (width - 1), within(uv[1], 0.0, 1.0) * (height - 1)
+    else:
+        x, y = uv[0] * width - 0.5, uv[1] * height - 0.5
+        if wrap == "clamp":
+            x, y = within(x, 0.0, width - 1), within(y, 0.0, height - 1)
+    column, row = jnp.floor(x), jnp.floor(y)
+    fx, fy = x - column, y - row
+    ix, iy = column.astype(jnp.int32), row.astype(jnp.int32)
+    return (iy % h, (iy + 1) % h, fy), (ix % w, (ix + 1) % w, fx)
+
+
+def _mixed(between: tuple[_Between, _Between], texel: Callable[[Index, Index], Vector]) -> Vector:
+    """The four texels between which a point lies, by its shares of the ways."""
+    (low, high, fy), (left, right, fx) = between
+    below = (1 - fx) * texel(low, left) + fx * texel(low, right)
+    return (1 - fy) * below + fy * ((1 - fx) * texel(high, left) + fx * texel(high, right))

@@ -53,7 +53,7 @@ def _seen_share(grid: Grid, sky: Float[jax.Array, "_ 3"], hit: Hit) -> Scalar:
     """Of an even sky's light, what arrives at the upper side; from the visible sky at the vertices, see `sky_vector`."""
     ix, iy, x, y = place_on_grid(grid, hit)
     upper = hit.triangle == 1
-    first, between, last = triangle_corners(sky, grid.shape[1], ix, iy, upper)
+    first, between, last = triangle_corners(sky, grid.nx, ix, iy, upper)
     u, v = x - ix.astype(x.dtype), y - iy.astype(y.dtype)
     on_first, on_last = jnp.where(upper, v, u), jnp.where(upper, u, v)
     return greater(dot(first + on_first * (between - first) + on_last * (last - between), hit.ns), jnp.zeros((), hit.t.dtype))
@@ -189,7 +189,9 @@ def _solid_ground(world: World) -> tuple[int, Grid] | None:
         return None
     number, grid, _ = grids[0]
     others = (surface for k, surface in enumerate(world.surfaces) if k != number)
-    return (number, grid) if all(isinstance(other, Walls) and other.cells == grid.cells for other in others) else None
+    return (
+        (number, grid) if all(isinstance(other, Walls) and other.known_shape == grid.known_shape for other in others) else None
+    )
 
 
 def _hidden(

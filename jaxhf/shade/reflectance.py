@@ -9,7 +9,7 @@ from ..core.types import Flag, Scalar, Vector
 from ..core.vector import dot, greater, quotient, select
 from ..preparation.world import World
 from ..scene.material import Material, Matte, map_textures
-from ..scene.texture import ImageTexture
+from ..scene.texture import FlatTexture, ImageTexture
 from ..trace.hit import Hit
 
 # Directions in which a sky is looked at: Gauss's nodes along the sine of the altitude, and even steps of the azimuth.
@@ -78,5 +78,5 @@ def _at(material: Material, hit: Hit) -> Material:
     return jax.tree.map(jnp.asarray, map_textures(material, lambda image: image(hit.uv)))
 
 
-def _colour(leaf: jax.Array | ImageTexture, hit: Hit) -> jax.Array:
-    return leaf(hit.uv) if isinstance(leaf, ImageTexture) else jnp.asarray(leaf)
+def _colour(leaf: jax.Array | ImageTexture | FlatTexture, hit: Hit) -> jax.Array:
+    return leaf(hit.uv) if isinstance(leaf, ImageTexture | FlatTexture) else jnp.asarray(leaf)

@@ -1,5 +1,6 @@
 """A heightfield made ready for tracing."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -35,7 +36,8 @@ class Grid(eqx.Module):
       z_top: the largest of them.
       pyramid: bounds over blocks of cells.
       normals: at the vertices, object frame; None where shading is flat.
-      shape: (ny, nx).
+      cells, extent: cells along x and along y, the second as numbers of the heights' type.
+      known_shape: (ny, nx); None where a program serves several, see `of_any_size`.
       max_steps, early_exit: of searches on it, as in `Settings`, see `first_triangle`.
       perturbation: what is added at the vertices of the triangle that a ray meets, for derivatives of one ray in those
         numbers alone; None: nothing.
@@ -51,7 +53,9 @@ class Grid(eqx.Module):
     world_from_grid: Affine
     grid_from_world: Affine
     object_from_world: Affine | None
-    shape: tuple[int, int] = eqx.field(static=True)
+    cells: tuple[Index, Index]
+    extent: tuple[Scalar, Scalar]
+    known_shape: tuple[int, int] | None = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     early_exit: bool = eqx.field(static=True)
     perturbation: Corners | None = None
@@ -62,13 +66,24 @@ class Grid(eqx.Module):
     @property
     def z(self) -> Float[jax.Array, "ny nx"]:
         """The heights as an array of two axes."""
-        return self.rows.reshape(self.shape)
+        return self.rows[: math.prod(self.shape)].reshape(self.shape)
 
     @property
-    def cells(self) -> tuple[int, int]:
-        """Cells along x and along y."""
-        ny, nx = self.shape
-        return nx - 1, ny - 1
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx), where it is known as a program is made."""
+        assert self.known_shape is not None
+        return self.known_shape
+
+    @property
+    def nx(self) -> Index:
+        """Vertices in a row."""
+        return self.cells[0] + 1
+
+    @property
+    def most_steps(self) -> Index:
+        """Of a search: as many as suffice for any ray, or `max_steps` if that is less."""
+        enough = self.pyramid.enough
+        return enough if self.max_steps is None else jnp.minimum(enough, jnp.int32(min(self.max_steps, MOST_PLACES)))
 
 
 def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Settings) -> Grid:
@@ -101,9 +116,11 @@ def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Se
     if settings.shading == "smooth":
         normals = _at_seam(field, vertex_normals(heights, field.dx, field.dy, settings.normals or "six")).reshape(-1, 3)
     pyramid = make_pyramid(lax.stop_gradient(z), z_top, 0 if settings.traversal == "dda" else None)
+    cells, extent = ((jnp.asarray(nx - 1, kind), jnp.asarray(ny - 1, kind)) for kind in (jnp.int32, dtype))
     return Grid(
-        z.reshape(-1), z_top, pyramid, normals, world_from_grid, grid_from_world, object_from_world, (ny, nx),
-        settings.max_steps, settings.early_exit, seam=None if field.seam is None else jnp.isfinite(field.seam[..., 0]),
+        z.reshape(-1), z_top, pyramid, normals, world_from_grid, grid_from_world, object_from_world,
+        cells, extent, (ny, nx), settings.max_steps, settings.early_exit,
+        seam=None if field.seam is None else jnp.isfinite(field.seam[..., 0]),
     )  # fmt: skip
 
 
@@ -133,10 +150,18 @@ def joined(grids: Grid) -> tuple[Grid, Grid]:
     def at(parts: Callable[[Grid], Any], grids: Grid, values: Any) -> Grid:
         return eqx.tree_at(parts, grids, values, is_leaf=lambda leaf: leaf is None)
 
+    def sizes(grid: Grid) -> tuple[Any, ...]:
+        pyramid = grid.pyramid
+        return *grid.cells, *grid.extent, pyramid.width, pyramid.height, pyramid.largest, pyramid.below, pyramid.enough
+
+    def of_all(leaf: jax.Array) -> jax.Array:
+        return leaf[0] if leaf.ndim == 1 else leaf.reshape(-1, *leaf.shape[2:])
+
     grids = at(places, grids, (first_places(grids.rows), first_places(grids.pyramid.bounds)))
     common = at(arrays, jax.tree.map(lambda _: False, grids), (True, True, None if grids.normals is None else True))
+    common = at(sizes, common, (True,) * len(sizes(grids)))
     shared, own = eqx.partition(grids, common)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), shared), own
+    return jax.tree.map(of_all, shared), own
 
 
 def first_places(values: Shaped[jax.Array, "count n"]) -> Int[jax.Array, " count"]:
@@ -149,7 +174,7 @@ def first_places(values: Shaped[jax.Array, "count n"]) -> Int[jax.Array, " count
 
 def triangle_plane(grid: Grid, ix: Index, iy: Index, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:
     """(a, b, c) of the triangle's plane c + a u + b v, with u and v from the cell's vertex 00; finite in a hole too."""
-    return plane_through(triangle_corners(grid.rows, grid.shape[1], ix, iy, upper, grid.first), upper)
+    return plane_through(triangle_corners(grid.rows, grid.nx, ix, iy, upper, grid.first), upper)
 
 
 def height_over(grid: Grid, ix: Index, iy: Index, upper: Flag, x: Scalar, y: Scalar) -> Scalar:

@@ -135,7 +135,7 @@ def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkRes
     and normals once a tile. What the walk itself says passes by both conditionals, as they would copy it (frames took
     up to a tenth longer).
     """
-    nx, triangle = grid.shape[1], (found.ix, found.iy, found.upper)
+    nx, triangle = grid.nx, (found.ix, found.iy, found.upper)
     heights = triangle_corners(grid.rows, nx, *triangle, grid.first)
     normals = None if grid.normals is None else triangle_corners(grid.normals, nx, *triangle, grid.first)
     if grid.perturbation is not None:
@@ -209,7 +209,7 @@ def _geometry(
     p = grid.world_from_grid.point(jnp.stack([x, y, c + a * u + b * v]))
     one, zero = jnp.ones((), dtype), jnp.zeros((), dtype)
     n = unit(grid.grid_from_world.covector(jnp.stack([-a, -b, one])))
-    cells_x, cells_y = grid.cells
+    cells_x, cells_y = grid.extent
     uv = jnp.stack([x / cells_x, y / cells_y])
     ns, turning = _shading_normal(grid, found.upper, normals, u, v, n)
     if not tangents:

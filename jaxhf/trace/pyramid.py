@@ -1,5 +1,7 @@
 """Bounds of the heights over square blocks of cells, at every size: a min-max quadtree in the form of a mip chain."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -26,23 +28,29 @@ class Pyramid(eqx.Module):
     Attributes:
       bounds: level after level, each row padded to the finest's width; first for rays above, then for rays below.
       width, height: of the finest level, cells, rounded up to powers of two.
-      levels: how many levels stand above the finest.
+      largest: cells along a side of the coarsest level's blocks.
+      below: where the bounds for rays below begin.
+      enough: a number of steps that suffices for any ray, see `enough_steps`.
+      has_levels: whether there may be any above the finest.
       first: where the first bound stands; None: at 0, else `bounds` holds those of several grids, one after the other.
     """
 
     bounds: Float[jax.Array, " n"]
-    width: int = eqx.field(static=True)
-    height: int = eqx.field(static=True)
-    levels: int = eqx.field(static=True)
+    width: Index
+    height: Index
+    largest: Index
+    below: Index
+    enough: Index
+    has_levels: bool = eqx.field(static=True)
     first: Index | None = None
 
     def bound(self, above: Flag, level: Index, ix: Index, iy: Index) -> Scalar:
         """That of the block of `level` which holds the cell (ix, iy), for a ray above or below the surface."""
-        first_row = 2 * self.height - lax.shift_right_logical(jnp.full_like(level, 2 * self.height), level)
+        twice = 2 * self.height
+        first_row = twice - lax.shift_right_logical(jnp.broadcast_to(twice, level.shape), level)
         row = first_row + lax.shift_right_logical(iy, level)
         index = row * self.width + lax.shift_right_logical(ix, level)
-        of_one = self.width * (2 * self.height - (self.height >> self.levels))
-        index = index + jnp.where(above, 0, of_one)
+        index = index + jnp.where(above, 0, self.below)
         index = index if self.first is None else index + self.first
         return value_at(self.bounds, index)
 
@@ -58,7 +66,7 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None
     ny, nx = z.shape
     width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)
     most = min(width, height).bit_length() - 1
-    levels = most if levels is None else min(levels, most)
+    has_levels, levels = levels != 0, most if levels is None else min(levels, most)
     outwards = 32 * jnp.finfo(z.dtype).eps * z_top
     hole = jnp.isnan(z)
     gone = jnp.pad(hole[:-1] | hole[1:], ((1, 1), (0, 0)), constant_values=True)
@@ -80,4 +88,23 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None
             rows.append(jnp.pad(block, ((0, 0), (0, width - block.shape[1])), constant_values=-jnp.inf))
         return jnp.concatenate(rows).reshape(-1)
 
-    return Pyramid(jnp.concatenate([chain(z), chain(-z)]), width, height, levels)
+    above, below = chain(z), chain(-z)
+    return Pyramid(
+        bounds=jnp.concatenate([above, below]),
+        width=jnp.int32(width),
+        height=jnp.int32(height),
+        largest=jnp.int32(2**levels),
+        below=jnp.int32(above.size),
+        enough=jnp.int32(enough_steps(nx - 1, ny - 1, levels)),
+        has_levels=has_levels,
+    )
+
+
+def enough_steps(cells_x: int, cells_y: int, levels: int) -> int:
+    """A number of steps that suffices for any ray.
+
+    A ray moves one way along each axis, so on each level it passes through at most (blocks along x) + (blocks along y) - 1
+    blocks. It comes to each of them at most once: it grows to a block only on entering it, and goes down into one
+    only from the block around it. Each step deals with at least one of them.
+    """
+    return sum(math.ceil(cells_x / 2**level) + math.ceil(cells_y / 2**level) - 1 for level in range(levels + 1))

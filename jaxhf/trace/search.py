@@ -1,6 +1,5 @@
 """Which triangle does a ray meet? A discrete search: integers come out, which carry no derivative."""
 
-import math
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -34,7 +33,7 @@ def first_triangle(
     With one level of bounds this is the walk of Amanatides and Woo (A fast voxel traversal algorithm, Eurographics 1987), with
     the distance to each crossing recomputed from the integer cell, as a running sum drifts; with all levels, that of Tevs
     et al. (I3D 2008) over their maximum mipmaps. The loop has a fixed budget of steps, each of which skips up to two blocks and
-    visits one cell: the grid's `max_steps`, or `enough_steps`. It ends early, when all rays of the batch have ended; without
+    visits one cell: the grid's `most_steps`. It ends early, when all rays of the batch have ended; without
     the grid's `early_exit` it always takes all of them. The search is discrete and under
     `stop_gradient`; derivatives begin at the hit, see `surface_hit` in `intersect.py`.
 
@@ -50,39 +49,26 @@ def first_triangle(
     """
     grid, ray, leaving, t_max = lax.stop_gradient((grid, ray, leaving, t_max))
     walk, state, valid = walk_start(grid, ray, leaving, number, t_max, active)
-    state, steps = _search(walk, state, enough_steps(grid), count_steps, grid.early_exit)
+    state, steps = _search(walk, state, count_steps, grid.early_exit)
     return walk.finish(state, valid, steps)
-
-
-def enough_steps(grid: Grid) -> int:
-    """A number of steps that suffices for any ray, or the grid's `max_steps` if that is less.
-
-    A ray moves one way along each axis, so on each level it passes through at most (blocks along x) + (blocks along y) - 1
-    blocks. It comes to each of them at most once: it grows to a block only on entering it, and goes down into one
-    only from the block around it. Each step deals with at least one of them.
-    """
-    cells_x, cells_y = grid.cells
-    levels = range(grid.pyramid.levels + 1)
-    enough = sum(math.ceil(cells_x / 2**level) + math.ceil(cells_y / 2**level) - 1 for level in levels)
-    return enough if grid.max_steps is None else min(grid.max_steps, enough)
 
 
 # Blocks of cells that are looked at between two visits to cells.
 SKIPS = 2
 
 
-def _search(walk: Walk, state: jax.Array, budget: int, count: bool, early_exit: bool) -> tuple[jax.Array, Index | None]:
+def _search(walk: Walk, state: jax.Array, count: bool, early_exit: bool) -> tuple[jax.Array, Index | None]:
     """The state in which a walk ends, and the number of its steps if they are to be counted.
 
     Under `vmap` the steps are repeated until the last walk of the batch has ended. JAX's own rule for `while_loop` would
     count the steps of each ray and keep the state of an ended walk by a selection; `Walk` does both by itself, so that this
     rule leaves them out (without it a frame takes 1.06 to 1.09 of the time).
     """
-    one = _search_many(jax.tree.map(lambda _: False, walk), budget, count, early_exit)
+    one = _search_many(jax.tree.map(lambda _: False, walk), count, early_exit)
     return jax.tree.map(lambda leaf: leaf[0], one(walk, state[None]))
 
 
-def _search_many(of_ray: Walk, budget: int, count: bool, early_exit: bool) -> Callable[[Walk, jax.Array], Any]:
+def _search_many(of_ray: Walk, count: bool, early_exit: bool) -> Callable[[Walk, jax.Array], Any]:
     """`_search` for a batch of walks, of which `of_ray` says which leaves differ from one to the other.
 
     Under a further `vmap`, as over heightfields each with rays of its own, all become one batch, and grids one array: a loop
@@ -102,6 +88,7 @@ def _search_many(of_ray: Walk, budget: int, count: bool, early_exit: bool) -> Ca
             return visit(batched, state), steps
 
         steps = jnp.zeros(state.shape, jnp.int32) if count else None
+        budget = jnp.max(eqx.combine(batched, shared).budget)  # of grids of one shape it is the same
         return until_ended(advance, (state, steps), budget, early_exit)
 
     @jax.custom_batching.custom_vmap
@@ -114,7 +101,7 @@ def _search_many(of_ray: Walk, budget: int, count: bool, early_exit: bool) -> Ca
         rays = state.shape[-1]
         flat, differs = _one_batch(walk, of_ray, in_batched[0], axis_size, rays)
         state = jnp.broadcast_to(state, (axis_size, rays)).reshape(-1)
-        ended = _search_many(differs, budget, count, early_exit)(flat, state)
+        ended = _search_many(differs, count, early_exit)(flat, state)
         return jax.tree.map(lambda leaf: leaf.reshape(axis_size, rays), ended), jax.tree.map(lambda _: True, ended)
 
     return run
@@ -160,7 +147,7 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
     return flat, with_places(differs, differ, next(given), bounds_differ, next(given))
 
 
-def until_ended(advance: Callable[[Any], Any], carry: Any, budget: int, early_exit: bool) -> Any:
+def until_ended(advance: Callable[[Any], Any], carry: Any, budget: Index, early_exit: bool) -> Any:
     """What a walk carries, `advance`d until it has ended, or `budget` times; without `early_exit` always so many times.
 
     The first part of `carry` is the state of a walk, or of a batch, where the last one counts.

@@ -28,13 +28,16 @@ class Walls(eqx.Module):
       base: z of the floor.
       tallest: the height of the tallest wall.
       size: of the footprint, x and y.
+      cells: along x and along y.
+      known_shape: of the heightfield that they close, as a `Grid` has it.
     """
 
     tops: Float[jax.Array, " vertices"]
     base: Scalar
     tallest: Scalar
-    size: tuple[float, float] = eqx.field(static=True)
-    cells: tuple[int, int] = eqx.field(static=True)
+    size: tuple[Scalar, Scalar]
+    cells: tuple[Index, Index]
+    known_shape: tuple[int, int] | None = eqx.field(static=True)
     world_from_object: Affine
     object_from_world: Affine
 
@@ -49,7 +52,8 @@ class Walls(eqx.Module):
         o, d = local.o, local.d
         wide = _WIDE * jnp.finfo(o.dtype).eps
         best, found, nearest = jnp.full_like(self.base, jnp.inf), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
-        planes = [*_upright(self), (2, self.base, 0, self.size[0], 0, 0)]
+        none = jnp.zeros((), jnp.int32)
+        planes = [*_upright(self), (2, self.base, 0, self.size[0], none, none)]
         for side, (axis, place, along, length, cells, first) in enumerate(planes):
             t, ever = time_to(place - o[axis], d[axis])
             at, rate = o + t * d, jnp.where(ever, d[axis], 1)
@@ -60,8 +64,8 @@ class Walls(eqx.Module):
             if side == _FLOOR:
                 inside = inside & (at[1] >= -wider[1]) & (at[1] <= self.size[1] + wider[1])
             else:
-                low, high, share = _tops(self, first, jnp.clip(at[along] / length, 0, 1) * cells, cells)
-                more = wider[2] + jnp.abs(high - low) * (cells / length) * wider[along]
+                low, high, share = _tops(self, first, jnp.clip(at[along] / length, 0, 1) * cells.astype(at.dtype), cells)
+                more = wider[2] + jnp.abs(high - low) * (cells.astype(at.dtype) / length) * wider[along]
                 inside = inside & (at[2] >= self.base - wider[2]) & (at[2] <= low + share * (high - low) + more)
             met = ever & (t > 0) & (t < best) & inside
             if leaving is not None:
@@ -92,21 +96,23 @@ def make_walls(skirt: Skirt, world_from_object: Affine | None) -> Walls:
     tops = jnp.concatenate([jnp.asarray(side) for side in (skirt.south, skirt.north, skirt.west, skirt.east)])
     dtype = tops.dtype
     world = Affine(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)) if world_from_object is None else world_from_object
-    cells = len(skirt.south) - 1, len(skirt.west) - 1
-    size = cells[0] * skirt.dx, cells[1] * skirt.dy
+    shape = ny, nx = len(skirt.west), len(skirt.south)
+    size = jnp.asarray((nx - 1) * skirt.dx, dtype), jnp.asarray((ny - 1) * skirt.dy, dtype)
+    cells = jnp.int32(nx - 1), jnp.int32(ny - 1)
     base = jnp.asarray(skirt.base, dtype)
     tallest = jnp.max(jnp.where(jnp.isfinite(tops), tops, base)) - base
-    return Walls(tops, base, tallest, size, cells, world, world.inverse())
+    return Walls(tops, base, tallest, size, cells, shape, world, world.inverse())
 
 
-def _upright(walls: Walls) -> list[tuple[int, float, int, float, int, int]]:
+def _upright(walls: Walls) -> list[tuple[int, Scalar, int, Scalar, Index, Index]]:
     """Of each wall: the axis across it, its place there, the axis along it, its length, its cells, and its first of `tops`."""
-    (size_x, size_y), (nx, ny) = walls.size, (n + 1 for n in walls.cells)
-    return [(1, 0.0, 0, size_x, nx - 1, 0), (1, size_y, 0, size_x, nx - 1, nx),
-            (0, 0.0, 1, size_y, ny - 1, 2 * nx), (0, size_x, 1, size_y, ny - 1, 2 * nx + ny)]  # fmt: skip
+    (size_x, size_y), (cells_x, cells_y) = walls.size, walls.cells
+    zero, first, (nx, ny) = jnp.zeros_like(size_x), jnp.zeros_like(cells_x), (cells_x + 1, cells_y + 1)
+    return [(1, zero, 0, size_x, cells_x, first), (1, size_y, 0, size_x, cells_x, nx),
+            (0, zero, 1, size_y, cells_y, 2 * nx), (0, size_x, 1, size_y, cells_y, 2 * nx + ny)]  # fmt: skip
 
 
-def _tops(walls: Walls, first: int, position: Scalar, cells: int) -> tuple[Scalar, Scalar, Scalar]:
+def _tops(walls: Walls, first: Index, position: Scalar, cells: Index) -> tuple[Scalar, Scalar, Scalar]:
     """The heights of a wall before and after a position from 0 to `cells` along it, and its share of the way."""
     cell = jnp.clip(position.astype(jnp.int32), 0, cells - 1)
     return walls.tops[first + cell], walls.tops[first + cell + 1], position - cell.astype(position.dtype)
@@ -122,7 +128,8 @@ def wall_slopes(walls: Walls, number: int, level: Vector, leaving: Hit) -> tuple
     """
     p = leaving.p
     o, d = walls.object_from_world.point(p), walls.object_from_world.vector(level)
-    wide, own = _WIDE * float(jnp.finfo(o.dtype).eps) * (largest_component(o[:2]) + max(walls.size)), leaving.object == number
+    reach = largest_component(o[:2]) + jnp.maximum(*walls.size)
+    wide, own = _WIDE * float(jnp.finfo(o.dtype).eps) * reach, leaving.object == number
     low, high = jnp.full_like(walls.base, jnp.inf), jnp.full_like(walls.base, -jnp.inf)
     for axis, place, along, length, cells, first in _upright(walls):
         t, ever = time_to(place - o[axis], d[axis])
@@ -130,7 +137,7 @@ def wall_slopes(walls: Walls, number: int, level: Vector, leaving: Hit) -> tuple
         ahead = ever & (t * largest_component(d) > wide) & (other >= -wide) & (other <= length + wide)
         t = quotient(jnp.where(ahead, place - o[axis], 1), jnp.where(ahead, d[axis], 1))  # of others it may be huge
         at = o + t * d
-        *tops, share = _tops(walls, first, within(at[along] / length, 0.0, 1.0) * cells, cells)
+        *tops, share = _tops(walls, first, within(at[along] / length, 0.0, 1.0) * cells.astype(o.dtype), cells)
         first_top, last_top = (jnp.where(jnp.isfinite(tops[0] + tops[1]), top, walls.base) for top in tops)
         for z in (walls.base, first_top + share * (last_top - first_top)):
             rise = walls.world_from_object.point(jnp.stack([at[0], at[1], z]))[2] - p[2]

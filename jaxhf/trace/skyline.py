@@ -20,7 +20,7 @@ from ..xla.materialise import materialise
 from .edges import STEPS
 from .grid import Grid
 from .hit import Hit
-from .search import SKIPS, enough_steps, until_ended
+from .search import SKIPS, until_ended
 from .triangle import corners, plane_through, triangle_corners
 from .walk import MISS, Walk, walking
 from .walk_start import point_on_grid, walk_start
@@ -51,20 +51,20 @@ def hidden_slopes(
 
 def _over_footprint(grid: Grid, o: Vector) -> tuple[Flag, Scalar]:
     """Whether a point in the grid's frame is above or below the surface, or on its border, and how high above it."""
-    cells_x, cells_y = grid.cells
+    cells_x, cells_y = grid.extent
     wide = _rounding(grid, o)
     covers = (o[0] >= -wide) & (o[0] <= cells_x + wide) & (o[1] >= -wide) & (o[1] <= cells_y + wide)
     ix, iy = (jnp.clip(jnp.floor(o[k]).astype(jnp.int32), 0, n - 1) for k, n in enumerate(grid.cells))
     u, v = o[0] - ix.astype(o.dtype), o[1] - iy.astype(o.dtype)
-    heights = triangle_corners(grid.rows, grid.shape[1], ix, iy, v > u, grid.first)
+    heights = triangle_corners(grid.rows, grid.nx, ix, iy, v > u, grid.first)
     a, b, c = plane_through(heights, v > u)
-    whole = jnp.isfinite(sum(corners(grid.rows, grid.shape[1], ix, iy, grid.first)))  # of a hole's cells three may be there
+    whole = jnp.isfinite(sum(corners(grid.rows, grid.nx, ix, iy, grid.first)))  # of a hole's cells three may be there
     return covers & whole, lax.stop_gradient(o[2] - (c + a * u + b * v))
 
 
-def _rounding(grid: Grid, o: Vector) -> float:
+def _rounding(grid: Grid, o: Vector) -> Scalar:
     """By how many cells a point on a wall along the border may be off."""
-    return 64 * float(jnp.finfo(o.dtype).eps) * max(grid.cells)
+    return 64 * float(jnp.finfo(o.dtype).eps) * jnp.maximum(*grid.extent)
 
 
 def skyline_slope(
@@ -111,7 +111,7 @@ def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index, above: bool) ->
       edge: see `_edge`.
     """
     known, edge = edge >= 0, jnp.maximum(edge, 0)
-    first, kind, nx = edge // 3, edge % 3, grid.shape[1]
+    first, kind, nx = edge // 3, edge % 3, grid.nx
     step = jnp.asarray(STEPS, jnp.int32)[kind]
     z0, z1 = (grid.rows.at[at].get(mode="clip") for at in (first, first + step[1] * nx + step[0]))
     known = known & jnp.isfinite(z0 + z1)
@@ -180,7 +180,7 @@ def _outermost_edge(
         return jnp.where(goes_on, state, MISS), slope, jnp.where(found >= 0, found, edge)
 
     init = state, lowest if above else highest, jnp.full_like(leaving.object, -1)
-    state, _, edge = until_ended(advance, init, enough_steps(grid), grid.early_exit)
+    state, _, edge = until_ended(advance, init, walk.budget, grid.early_exit)
     return edge, walking(state)
 
 

@@ -18,7 +18,7 @@ class Corners(eqx.Module):
 
 
 def corners(
-    rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index, grid: Index | None
+    rows: Float[jax.Array, "vertices *rest"], nx: Index | int, ix: Index, iy: Index, grid: Index | None
 ) -> tuple[jax.Array, ...]:
     """The values at the vertices 00, 10, 01, 11 of a cell that is in range, from a flat array whose rows have nx vertices.
 
@@ -30,7 +30,7 @@ def corners(
 
 
 def triangle_corners(
-    rows: Float[jax.Array, "vertices *rest"], nx: int, ix: Index, iy: Index, upper: Flag, grid: Index | None = None
+    rows: Float[jax.Array, "vertices *rest"], nx: Index | int, ix: Index, iy: Index, upper: Flag, grid: Index | None = None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The values at the vertices of a triangle of a cell in range: 00, the one between (10, or 01 in the upper), and 11.
 
@@ -41,7 +41,7 @@ def triangle_corners(
     return value_at(rows, first), value_at(rows, between), value_at(rows, last)
 
 
-def triangle_vertices(nx: int, ix: Index, iy: Index, upper: Flag) -> tuple[Index, Index, Index]:
+def triangle_vertices(nx: Index | int, ix: Index, iy: Index, upper: Flag) -> tuple[Index, Index, Index]:
     """The numbers of these vertices, row by row."""
     first = iy * nx + ix
     return first, first + jnp.where(upper, nx, 1), first + nx + 1

@@ -102,6 +102,8 @@ class Walk(eqx.Module):
 
     Attributes:
       rows, nx, pyramid: the grid's heights, how many are in a row, its bounds.
+      of_x: the bits of the code of x, which has one more than x needs, for the size.
+      first_of_y: the first bit of y in the state.
       first: its first height in `rows`, where those hold several grids, one after the other; None: 0.
       x, y, z_ray: where the walk begins.
       dx, dy, dz: the ray's direction.
@@ -112,14 +114,17 @@ class Walk(eqx.Module):
       t_start: the ray's t where the walk begins; the walk's own distances count from there.
       t_end: where the ray leaves the grid's floor or ceiling.
       t_stop: where it leaves the box, or what it is asked for.
+      budget: steps after which it is given up.
       ahead: for a ray that departs from a triangle, whether the cell's diagonal may lie before it; None where none does.
       noise: for such rays, a g no larger than this has no sign: near a vertex the ray crosses into a neighbour at once,
         where g is all rounding, and a neighbour in the same plane would be met.
     """
 
     rows: Float[jax.Array, " vertices"]
-    nx: int = eqx.field(static=True)
+    nx: Index
     pyramid: Pyramid
+    of_x: Index
+    first_of_y: UInt32[jax.Array, ""]
     x: Scalar
     y: Scalar
     z_ray: Scalar
@@ -136,14 +141,10 @@ class Walk(eqx.Module):
     t_start: Scalar
     t_end: Scalar
     t_stop: Scalar
+    budget: Index
     ahead: Flag | None
     noise: Scalar | None
     first: Index | None = None
-
-    @property
-    def bits_x(self) -> int:
-        """That x takes in the state: one more than its largest value needs, for the size."""
-        return self.pyramid.width.bit_length()
 
     @property
     def flip(self) -> tuple[Index, Index]:
@@ -157,15 +158,15 @@ class Walk(eqx.Module):
         return (plane.astype(self.y.dtype) - self.y) * self.inv_y
 
     def pack(self, status: jax.Array | int, above: jax.Array, code_x: jax.Array, iy: jax.Array) -> jax.Array:
-        def bits(value: jax.Array | int, shift: int) -> jax.Array:
+        def bits(value: jax.Array | int, shift: UInt32[jax.Array, ""] | int) -> jax.Array:
             return jnp.asarray(value).astype(jnp.uint32) << shift
 
-        return bits(status, 0) | bits(above, 2) | bits(code_x, 3) | bits(iy, 3 + self.bits_x)
+        return bits(status, 0) | bits(above, 2) | bits(code_x, 3) | bits(iy, self.first_of_y)
 
     def _fields(self, state: jax.Array) -> tuple[Flag, Index, Index]:
         """What `pack` took besides the status."""
-        code = (state >> 3).astype(jnp.int32) & ((1 << self.bits_x) - 1)
-        return (state & 4) != 0, code, (state >> (3 + self.bits_x)).astype(jnp.int32)
+        code = (state >> 3).astype(jnp.int32) & self.of_x
+        return (state & 4) != 0, code, (state >> self.first_of_y).astype(jnp.int32)
 
     def unpack(self, state: jax.Array) -> tuple[Flag, Index, Index, Index]:
         """Whether the ray is above the surface, and its block's first cell and size."""
@@ -194,7 +195,7 @@ class Walk(eqx.Module):
         clear = height > bound
         onwards = self.onwards(above, ix, iy, size, out_x, out_y)
         inside = state
-        if self.pyramid.levels:
+        if self.pyramid.has_levels:
             half = size >> 1
             part_x = jnp.where(self.distance_x(ix + half) <= near, ix + half, ix)
             part_y = jnp.where(self.distance_y(iy + half) < near, iy + half, iy)
@@ -263,9 +264,9 @@ class Walk(eqx.Module):
         through_x = out_x <= out_y
         next_x, next_y = jnp.where(through_x, ix + size, ix), jnp.where(through_x, iy, iy + size)
         leaves = self.t_stop <= lesser(out_x, out_y)
-        if self.pyramid.levels:
+        if self.pyramid.has_levels:
             plane = jnp.where(through_x, next_x, next_y)
-            grows = ((plane & size) == 0) & (size < (1 << self.pyramid.levels))
+            grows = ((plane & size) == 0) & (size < self.pyramid.largest)
             size = jnp.where(grows, 2 * size, size)
             next_x, next_y = next_x & -size, next_y & -size
         return jnp.where(

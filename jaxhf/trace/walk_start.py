@@ -27,9 +27,9 @@ def _surface_start(grid: Grid, leaving: Hit | None, number: int) -> tuple[Any, .
 
 def place_on_grid(grid: Grid, hit: Hit) -> tuple[Index, Index, Scalar, Scalar]:
     """The cell of a hit, and its point in grid coordinates; in range also where the hit lies on another surface."""
-    cells_x, cells_y = grid.cells
-    cell = jnp.clip(hit.cell, 0, jnp.array([cells_x - 1, cells_y - 1], hit.cell.dtype))
-    return cell[0], cell[1], hit.uv[0] * cells_x, hit.uv[1] * cells_y
+    (cells_x, cells_y), (extent_x, extent_y) = grid.cells, grid.extent
+    ix, iy = (jnp.clip(hit.cell[k], 0, cells - 1) for k, cells in enumerate((cells_x, cells_y)))
+    return ix, iy, hit.uv[0] * extent_x, hit.uv[1] * extent_y
 
 
 def point_on_grid(grid: Grid, hit: Hit) -> Vector:
@@ -46,16 +46,15 @@ def walk_start(
     The arguments are those of `first_triangle`.
     """
     width, height = grid.pyramid.width, grid.pyramid.height
-    assert 3 + width.bit_length() + (height - 1).bit_length() <= 32, "Heightfield checks that a walk's state fits"
     valid = finite(ray.o) & finite(ray.d) & ((ray.d[0] != 0) | (ray.d[1] != 0) | (ray.d[2] != 0))
     dx, dy, dz = ray.d[0], ray.d[1], ray.d[2]
     inverse = inv_x, inv_y, inv_z = reciprocal(dx), reciprocal(dy), reciprocal(dz)
     t_start, enters, through_end = _enter(grid, ray, inverse, valid)
-    cells_x, cells_y = grid.cells
+    (cells_x, cells_y), (extent_x, extent_y) = grid.cells, grid.extent
     # An ulp inside the far border, so that a ray which stands still on it is in the last cell.
     inside = 1 - jnp.finfo(dx.dtype).epsneg
-    x = jnp.clip(ray.o[0] + t_start * dx, 0, cells_x * inside)
-    y = jnp.clip(ray.o[1] + t_start * dy, 0, cells_y * inside)
+    x = jnp.clip(ray.o[0] + t_start * dx, 0, extent_x * inside)
+    y = jnp.clip(ray.o[1] + t_start * dy, 0, extent_y * inside)
     z_ray = jnp.clip(ray.o[2] + t_start * dz, 0, grid.z_top)
     away, own_ix, own_iy, own_x, own_y, own_upper, side = _surface_start(grid, leaving, number)
     if leaving is not None:
@@ -66,14 +65,16 @@ def walk_start(
     # From the grid's frame to the walk's.
     back_x, back_y = inv_x < 0, inv_y < 0
     end_x, end_y = jnp.where(back_x, width, cells_x), jnp.where(back_y, height, cells_y)
-    x, y = jnp.where(back_x, width - x, x), jnp.where(back_y, height - y, y)
+    x, y = (jnp.where(back, n.astype(at.dtype) - at, at) for back, n, at in ((back_x, width, x), (back_y, height, y)))
     turned = back_x != back_y
     rate = jnp.where(turned, jnp.abs(dx) + jnp.abs(dy), jnp.abs(dx) - jnp.abs(dy))
     begins_upper = (rate > 0) != back_x
     walk = Walk(
         rows=grid.rows,
-        nx=grid.shape[1],
+        nx=grid.nx,
         pyramid=grid.pyramid,
+        of_x=2 * width - 1,
+        first_of_y=(35 - lax.clz(width)).astype(jnp.uint32),
         x=x,
         y=y,
         z_ray=z_ray,
@@ -90,6 +91,7 @@ def walk_start(
         t_start=t_start,
         t_end=jnp.where(inv_z > 0, grid.z_top - z_ray, -z_ray) * inv_z,
         t_stop=jnp.full_like(x, jnp.inf),
+        budget=grid.most_steps,
         ahead=None if leaving is None else (own_upper == begins_upper) & (rate != 0),
         first=grid.first,
         noise=None if leaving is None else jnp.where(away, 4 * jnp.finfo(x.dtype).eps * grid.z_top, 0),
@@ -124,7 +126,7 @@ def _enter(grid: Grid, ray: Ray, inverse: tuple[Scalar, Scalar, Scalar], valid: 
     widened by the rounding of the operations behind them, so that no ray along a face is lost (Ize, Robust BVH ray
     traversal, JCGT 2(2), 2013).
     """
-    cells_x, cells_y = grid.cells
+    cells_x, cells_y = grid.extent
     near_x, far_x = _slab(ray.o[0], inverse[0], cells_x)
     near_y, far_y = _slab(ray.o[1], inverse[1], cells_y)
     near_z, far_z = _slab(ray.o[2], inverse[2], grid.z_top)
@@ -135,7 +137,7 @@ def _enter(grid: Grid, ray: Ray, inverse: tuple[Scalar, Scalar, Scalar], valid: 
     return start, enters, ((ray.o[2] < 0) | (ray.o[2] > grid.z_top)) & (start == near_z)
 
 
-def _slab(o: Scalar, inverse: Scalar, high: Scalar | int) -> tuple[Scalar, Scalar]:
+def _slab(o: Scalar, inverse: Scalar, high: Scalar) -> tuple[Scalar, Scalar]:
     """Distances between which a ray is in 0 <= coordinate <= high; (inf, -inf) where it never is."""
     a, b = -o * inverse, (high - o) * inverse
     still, inside = inverse == FAR, (o >= 0) & (o <= high)

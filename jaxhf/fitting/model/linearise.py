@@ -318,7 +318,7 @@ def _texels(world: World, hit: Hit, light: jax.Array, channels: int, factors: tu
 def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
     """The numbers of the vertices of the triangle that was hit; one too large where that is not of the first heightfield."""
     number, grid, _ = world.grids[0]
-    here = triangle_vertices(grid.shape[1], hit.cell[0], hit.cell[1], hit.triangle == 1)
+    here = triangle_vertices(grid.nx, hit.cell[0], hit.cell[1], hit.triangle == 1)
     return jnp.where(hit.object == number, jnp.stack(here), grid.rows.shape[0])
 
 

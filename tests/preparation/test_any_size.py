@@ -1,0 +1,139 @@
+"""Pictures of terrains of many sizes from one program, beside those from a program for a terrain's size."""
+
+import dataclasses
+import math
+
+import jax
+import numpy as np
+import pytest
+
+import jaxhf
+from jaxhf.preparation import any_size
+from jaxhf.preparation.localise import localise
+from jaxhf.preparation.world import World, resolve_settings
+from jaxhf.rendering import render, tiles
+from jaxhf.scene.procedural import fractal
+
+SETTINGS = jaxhf.Settings(chunk=64)
+SIZES = [(40, 50), (33, 61), (60, 47), (71, 71)]  # one room for all
+
+
+def scene(shape: tuple[int, int], pixels: int = 72, **more) -> jaxhf.Scene:
+    heights = fractal([max(shape)] * 2, seed=4, exponent=2.4, range=(0.0, 0.3)).astype(np.float32)[: shape[0], : shape[1]]
+    field = jaxhf.Heightfield(heights, 1 / max(shape), 1 / max(shape))
+    camera = jaxhf.Perspective.look_at((0.4, -1.0, 0.9), (0.5, 0.5, 0.1), width=pixels, height=pixels)
+    return jaxhf.Scene([jaxhf.Object(field, **more)], camera, [jaxhf.Directional((1.0, 0.3, 0.6))])
+
+
+def solid(shape: tuple[int, int]) -> jaxhf.Scene:
+    """All that has arrays of the terrain's size: colours at the vertices, walls, a sky that mountains hide."""
+    colours = np.random.default_rng(1).random((*shape, 3), np.float32)
+    image = jaxhf.ImageTexture(colours, at_vertices=True, wrap="clamp")
+    plain = scene(shape, material=jaxhf.Matte(image))
+    objects = [*plain.objects, jaxhf.Object(jaxhf.Skirt.of(plain.heightfields[0], -0.1))]
+    return jaxhf.Scene(objects, plain.camera, [*plain.lights, jaxhf.Sky(0.4, occlusion=4)])
+
+
+def in_sun(shape: tuple[int, int]) -> jaxhf.Scene:
+    return solid(shape).with_lights([jaxhf.Sun((1.0, 0.3, 0.6))])
+
+
+def of_two(shape: tuple[int, int]) -> jaxhf.Scene:
+    first, second = scene(shape), scene((20, 90))
+    away = np.eye(4)
+    away[:3, 3] = 0.3, 0.2, 0.25
+    return jaxhf.Scene(
+        [*first.objects, jaxhf.Object(second.heightfields[0], world_from_object=away)], first.camera, first.lights
+    )
+
+
+def holed(shape: tuple[int, int]) -> jaxhf.Scene:
+    heights = np.array(scene(shape).heights)
+    heights[5:15, 10:20], heights[:, -1] = np.nan, np.nan
+    return scene(shape).with_heights(heights)
+
+
+@pytest.fixture
+def traced(monkeypatch) -> list[tuple[str, ...]]:
+    """What was traced for tiles."""
+    found, trace_tile = [], tiles._trace_tile
+
+    def noted(aovs, *args):
+        found.append(aovs)
+        return trace_tile(aovs, *args)
+
+    monkeypatch.setattr(tiles, "_trace_tile", noted)
+    return found
+
+
+@pytest.mark.parametrize("make", [scene, pytest.param(solid, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("pixels", [72, 24])  # by the program for any size, by one for this
+def test_another_terrain_needs_no_other_program(make, pixels, traced):
+    settings = dataclasses.replace(SETTINGS, max_steps=10**6 + pixels)  # programs of this test alone
+    seen = [make(shape) for shape in SIZES]
+    seen = [one.with_camera(dataclasses.replace(one.camera, width=pixels, height=pixels)) for one in seen]
+    jaxhf.render(seen[0], settings)
+    assert traced.count(()) > 0
+    traced.clear()
+    for one in seen[1:]:
+        image = jaxhf.render(one, settings)
+        assert image.std() > 0.03
+        ready = jaxhf.prepare(one, settings)
+        np.testing.assert_array_equal(jaxhf.render(ready), image)
+        darker = [jaxhf.Directional((-1.0, 0.3, 0.6), 0.5), *one.lights[1:]]
+        np.testing.assert_array_equal(jaxhf.render(ready.with_lights(darker)), jaxhf.render(one.with_lights(darker), settings))
+    assert traced == []
+    jaxhf.render(make((72, 72)), settings)  # which has more bounds of shadows than there is room for
+    assert traced.count(()) > 0
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        scene,
+        *(pytest.param(make, marks=pytest.mark.deep) for make in (solid, in_sun, of_two, holed)),
+    ],
+)
+def test_pictures_are_those_of_a_program_for_their_terrain(make, monkeypatch):
+    """To the bit; also of terrains without room, which are narrow or have a seam."""
+    for shape in (SIZES[1], (17, 40), (90, 9)):
+        aovs = ("depth", "uv", "cell", "normal", "shadow", "steps", "status")
+        found = jaxhf.render(make(shape), SETTINGS, aovs=aovs)
+        with monkeypatch.context() as patched:
+            patched.setattr(render, "with_room", lambda world: world)
+            jax.clear_caches()
+            expected = jaxhf.render(make(shape), SETTINGS, aovs=aovs)
+        jax.clear_caches()
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
+        assert expected[0].std() > 0.03
+
+
+def roomy(scene: jaxhf.Scene) -> World:
+    return render.prepared_world(localise(scene), resolve_settings(SETTINGS, scene))
+
+
+def test_room_is_bounded():
+    """By five times what is needed for vertices and four for bounds; there is none for a narrow terrain, nor within a jit."""
+    for shape in [(72, 72), (100, 257), (258, 70), (129, 129), (4097, 4097), (2050, 1030), (4000, 10)]:
+        room, (ny, nx) = any_size._room(shape), shape
+        assert room is not None
+        assert nx * ny <= room.vertices <= max(5 * nx * ny, 5120)
+        blocks = math.prod(2 ** math.ceil(math.log2(n - 1)) for n in shape)
+        assert 4 * blocks <= room.bounds <= max(16 * blocks, 2**16)
+        assert 2 * (nx + ny) <= room.border
+    assert any_size._room((9, 4000)) is any_size._room((4098, 4098)) is None
+    (_, grid, _), *_ = roomy(scene((9, 60))).grids
+    assert grid.rows.shape == (9 * 60,)
+    (_, grid, _), *_ = roomy(scene(SIZES[0])).grids
+    assert grid.rows.shape == (5120,)
+    np.testing.assert_array_equal(grid.z.shape, SIZES[0])
+    lengths = []
+
+    @jax.jit
+    def within(heights):
+        (_, grid, _), *_ = roomy(scene(SIZES[0]).with_heights(heights)).grids
+        lengths.append(grid.rows.size)
+        return heights
+
+    within(scene(SIZES[0]).heights)
+    assert lengths == [2000]
