@@ -17,7 +17,6 @@ from .ceiling import Ceiling
 from .world import Ceilings, World
 
 _LEAST_CELLS, _MOST_CELLS = 2**14, 2**24  # beyond, room would be gigabytes, and pictures take longer than to compile
-_LEAST_SIDE = 16  # cells: what a narrower terrain needs does not go by their number
 _SPARE = 5 / 4  # of the cells' number: vertices and the bins of a `Ceiling` are more
 
 
@@ -39,12 +38,13 @@ def _room(shape: tuple[int, int]) -> _Room | None:
     """Of two sizes for each power of four, so that room is at most five times what is needed; None where there is none."""
     ny, nx = shape
     width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)
-    if min(width, height) < _LEAST_SIDE or width * height > _MOST_CELLS:
-        return None
     cells = max(4 ** math.ceil(math.log2(width * height) / 2), _LEAST_CELLS)
     needed = max(nx * ny, (nx - 1) * (ny - 1) + 3 * max(nx, ny))
-    few = int(_SPARE * cells / 4)
-    return _Room(few if needed <= few else int(_SPARE * cells), 4 * cells, cells // 4)
+    enough = [vertices for vertices in (int(_SPARE * cells / 4), int(_SPARE * cells)) if needed <= vertices]
+    border = cells // 32 + 64
+    if cells > _MOST_CELLS or not enough or 2 * (nx + ny) > border:  # a narrow one has more of it than others
+        return None
+    return _Room(enough[0], 4 * cells, border)
 
 
 def with_room(world: World) -> World:

@@ -96,7 +96,7 @@ def test_another_terrain_needs_no_other_program(make, pixels, traced):
 )
 def test_pictures_are_those_of_a_program_for_their_terrain(make, monkeypatch):
     """To the bit; also of terrains without room, which are narrow or have a seam."""
-    for shape in (SIZES[1], (17, 40), (90, 9)):
+    for shape in (SIZES[1], (17, 40), (5, 300)):
         aovs = ("depth", "uv", "cell", "normal", "shadow", "steps", "status")
         found = jaxhf.render(make(shape), SETTINGS, aovs=aovs)
         with monkeypatch.context() as patched:
@@ -105,7 +105,7 @@ def test_pictures_are_those_of_a_program_for_their_terrain(make, monkeypatch):
             expected = jaxhf.render(make(shape), SETTINGS, aovs=aovs)
         jax.clear_caches()
         jax.tree.map(np.testing.assert_array_equal, found, expected)
-        assert expected[0].std() > 0.03
+        assert expected[0].std() > 0.005
 
 
 def roomy(scene: jaxhf.Scene) -> World:
@@ -114,7 +114,7 @@ def roomy(scene: jaxhf.Scene) -> World:
 
 def test_room_is_bounded():
     """By five times what is needed for vertices and four for bounds; there is none for a narrow terrain, nor within a jit."""
-    for shape in [(72, 72), (100, 257), (258, 70), (129, 129), (4097, 4097), (2050, 1030), (4000, 10)]:
+    for shape in [(72, 72), (100, 257), (258, 70), (129, 129), (4097, 4097), (2050, 1030), (800, 20)]:
         room, (ny, nx) = any_size._room(shape), shape
         assert room is not None
         assert nx * ny <= room.vertices <= max(5 * nx * ny, 5120)
@@ -122,8 +122,8 @@ def test_room_is_bounded():
         assert 4 * blocks <= room.bounds <= max(16 * blocks, 2**16)
         assert 2 * (nx + ny) <= room.border
     assert any_size._room((9, 4000)) is any_size._room((4098, 4098)) is None
-    (_, grid, _), *_ = roomy(scene((9, 60))).grids
-    assert grid.rows.shape == (9 * 60,)
+    (_, grid, _), *_ = roomy(scene((5, 300))).grids
+    assert grid.rows.shape == (5 * 300,)
     (_, grid, _), *_ = roomy(scene(SIZES[0])).grids
     assert grid.rows.shape == (5120,)
     np.testing.assert_array_equal(grid.z.shape, SIZES[0])
