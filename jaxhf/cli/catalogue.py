@@ -126,16 +126,17 @@ _TRADEOFF = Command(
 
 # Files.
 
-_WRITTEN = ".tif, .npz, .npy, .asc, .png (rounded) or .exr; a mesh: .glb, .obj or .ply"
+_WRITTEN = ".tif, .npz, .npy, .asc, .png (rounded) or .exr; a mesh: .glb, .obj, .ply or .stl"
 _CONVERT = Command(
     "convert",
     "write a terrain in another format",
-    examples=("terrain.tif terrain.npz", "terrain.tif block.glb --base 0"),
+    examples=("terrain.tif terrain.npz", "terrain.tif block.glb --base 0", "terrain.tif print.stl --base 0 --longer-side 150"),
     options={
         "": (
             IN,
             option("output", metavar="OUT", help=_WRITTEN),
             number("--base", "Z", "close a mesh by walls down to this height [open]"),
+            number("--longer-side", "MM", "of a mesh's footprint, to which all is scaled, as for printers [as in the terrain]"),
         ),
         **RASTER,
     },

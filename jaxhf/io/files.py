@@ -26,7 +26,7 @@ _KINDS = {
     **dict.fromkeys((".toml", ".pbrt"), "a scene, for jaxhf render"),
     **dict.fromkeys((".tif", ".tiff", ".npz", ".asc", ".hgt"), "a terrain, for jaxhf view, hillshade, relief or convert"),
     **dict.fromkeys((".png", ".jpg", ".jpeg", ".exr", ".npy", ".pfm"), "a picture"),
-    **dict.fromkeys((".glb", ".obj", ".ply"), "a mesh"),
+    **dict.fromkeys((".glb", ".obj", ".ply", ".stl"), "a mesh"),
 }
 
 
@@ -157,7 +157,7 @@ _NEEDS = {  # the package that writes a format, and the extra that installs it
     ".exr": ("OpenEXR", "exr"),
     ".mp4": ("av", "video"),
     **dict.fromkeys((".tif", ".tiff"), ("rasterio", "geo")),
-    **dict.fromkeys((".glb", ".obj", ".ply"), ("trimesh", "mesh")),
+    **dict.fromkeys((".glb", ".obj", ".ply", ".stl"), ("trimesh", "mesh")),
 }
 
 

@@ -61,6 +61,16 @@ def test_a_solid_is_closed_and_has_its_volume(tmp_path, holes):
         np.testing.assert_allclose(mesh.volume, np.nansum(cells) * 600, rtol=1e-6)
 
 
+def test_a_print_has_its_size(tmp_path):
+    """Of a terrain of 150 x 80 units in x and y, 100 of the printer's on the longer side, and as high in proportion."""
+    save_mesh(tmp_path / "x.stl", terrain(), base=1.0, longer_side=100.0)
+    mesh = trimesh.load(tmp_path / "x.stl")  # which joins what an .stl holds once for each triangle
+    assert mesh.is_watertight
+    np.testing.assert_allclose(mesh.extents, np.array([150, 80, HEIGHTS.max() - 1]) / 1.5, rtol=1e-6)
+    save_mesh(tmp_path / "x.ply", terrain(), base=1.0)
+    np.testing.assert_allclose(mesh.volume, read(tmp_path / "x.ply").volume / 1.5**3, rtol=1e-5)
+
+
 def test_colours_and_texture_coordinates(tmp_path):
     colours = np.random.default_rng(0).integers(0, 256, (5, 6, 3), np.uint8)
     save_mesh(tmp_path / "x.ply", terrain(), colours=colours)
@@ -86,7 +96,10 @@ def test_colours_and_texture_coordinates(tmp_path):
 
 def test_what_is_no_mesh_is_refused(tmp_path):
     cases: list[tuple[str, Terrain, dict[str, Any], str]] = [
-        ("x.stl", terrain(), {}, r"cannot write a mesh with the ending '\.stl'"),
+        ("x.off", terrain(), {}, r"cannot write a mesh with the ending '\.off'"),
+        ("x.stl", terrain(), {"uv": True}, r"uv cannot stand in an \.stl, as x\.stl is"),
+        ("x.stl", terrain(), {"colours": np.zeros((5, 6, 3), np.uint8)}, r"colours cannot stand in an \.stl"),
+        ("x.stl", terrain(), {"longer_side": 0.0}, r"longer_side must be positive and finite, it is 0\.0"),
         ("x.ply", terrain(), {"base": 6.0}, r"base must lie below all heights, the lowest is 5\.\d+, it is 6\.0"),
         ("x.ply", terrain(), {"colours": np.zeros((5, 6, 3))}, "colours must be uint8 of shape"),
         ("x.ply", Terrain(np.full((2, 2), np.nan)), {}, "must have a cell without a hole"),

@@ -5,7 +5,6 @@ import dataclasses
 import warnings
 from pathlib import Path
 
-from ...core.errors import UserError
 from ...io.terrain.load import load_heights
 from ...io.terrain.meshes import MESHES, require_writable_mesh, save_mesh
 from ...io.terrain.save import HEIGHTS, require_writable_heights, save_heights
@@ -20,14 +19,13 @@ def run(options: argparse.Namespace) -> None:
         require_writable_mesh(options.output)
     else:
         require_writable_heights(options.output, HEIGHTS + MESHES)
-        if options.base is not None:
-            raise UserError(f"--base is for meshes ({', '.join(MESHES)}), {options.output} is none")
+        arguments.refuse(options, "base", "longer_side", because=f"meshes are {', '.join(MESHES)}, {options.output} is none")
     with warnings.catch_warnings():
         if not in_metres:
             warnings.filterwarnings("ignore", "degrees from latitude")
         terrain = load_heights(options.terrain, **arguments.reading(options))
     if in_metres:
-        save_mesh(options.output, terrain, base=options.base)
+        save_mesh(options.output, terrain, **arguments.given(options, "base", "longer_side"))
     else:
         save_heights(options.output, terrain)
         dx, dy, x0, y0 = terrain.in_file

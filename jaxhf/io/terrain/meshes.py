@@ -13,14 +13,22 @@ from ..files import PathLike, replacing, require_writable
 from ..pictures.images import linear_from_srgb
 from .terrain import Terrain
 
-MESHES = (".glb", ".obj", ".ply")
+MESHES = (".glb", ".obj", ".ply", ".stl")
 require_writable_mesh = partial(require_writable, "save_mesh", "a mesh", MESHES)
 
 _Triangles = Int[np.ndarray, "m 3"]
 
 
-def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, colours: Any = None, uv: bool = False) -> None:
-    """Writes a terrain as a mesh of the triangles that the renderer sees: .ply, .obj or .glb (needs trimesh).
+def save_mesh(
+    path: PathLike,
+    terrain: Terrain,
+    *,
+    base: float | None = None,
+    colours: Any = None,
+    uv: bool = False,
+    longer_side: float | None = None,
+) -> None:
+    """Writes a terrain as a mesh of the triangles that the renderer sees: .ply, .obj, .glb or .stl (needs trimesh).
 
     Its vertices are those of the terrain from vertex (0, 0) on, as float32 holds no UTM coordinates, in the terrain's unit; x
     points east, y north and z up, in .glb y up and z south, as glTF demands. Cells at a hole are left out. The file appears
@@ -33,10 +41,12 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
         to be printed or cut. None: the surface alone.
       colours: of the vertices, sRGB as bytes: uint8 of shape (ny, nx, 3) or, with opacity, (ny, nx, 4), row 0 in the south.
       uv: whether each vertex has its position in the footprint, 0..1 to the east and to the north, for an image to be draped.
+      longer_side: how long the footprint's longer side is in the file, to which all is scaled; printers take an .stl's numbers
+        for millimetres. None: as long as in the terrain's unit.
 
     Raises:
-      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or no cell has four heights, or `base`, `colours`
-        or `uv` cannot be, see there.
+      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or no cell has four heights, or `base`, `colours`,
+        `uv` or `longer_side` cannot be, see there; .stl holds neither colours nor `uv`.
     """
     path = require_writable_mesh(path)
     if not hasattr(terrain, "dx"):  # as of a Heightfield, which would import JAX here
@@ -46,6 +56,10 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
     if base is not None and not base < np.nanmin(heights, initial=np.inf):
         lowest = np.nanmin(heights, initial=np.inf)
         raise ArgumentError("save_mesh", "base", f"must lie below all heights, the lowest is {lowest:.6g}, it is {base}")
+    if longer_side is not None and not 0 < longer_side < np.inf:
+        raise ArgumentError("save_mesh", "longer_side", f"must be positive and finite, it is {longer_side}")
+    if path.suffix.lower() == ".stl" and (uv or colours is not None):
+        raise ArgumentError("save_mesh", "uv" if uv else "colours", f"cannot stand in an .stl, as {path.name} is")
     if colours is not None:
         colours = np.asarray(colours)
         if uv or colours.dtype != np.uint8 or colours.shape not in ((ny, nx, 3), (ny, nx, 4)):
@@ -60,6 +74,8 @@ def save_mesh(path: PathLike, terrain: Terrain, *, base: float | None = None, co
     if base is not None:
         faces = np.concatenate([faces, faces[:, ::-1] + ny * nx, _walls(whole, ny * nx)])
         points = np.concatenate([points, points * (1, 1, 0) + (0, 0, base)])
+    if longer_side is not None:
+        points = points * (longer_side / max((nx - 1) * terrain.dx, (ny - 1) * terrain.dy))
     mesh = _mesh(path.suffix.lower(), points, faces, heights.shape, colours, uv)
     with replacing(path) as temporary:
         temporary.write_bytes(mesh)
