@@ -112,7 +112,7 @@ REFUSED = [
     ("hillshade none.npz -o a.npy", "hillshade: heights must hold a finite one"),
     ("skyview hills.npz -o a.npy --azimuths 0", "--azimuths must be a whole number from 1 on, it is 0"),
     ("horizon hills.npz -o a.npy --azimuth nan", "--azimuth must be finite, it is nan"),
-    ("convert hills.npz a.tif --base 0", "--base"),
+    ("convert hills.npz a.tif --base 0", "--base would change nothing: meshes are .glb"),
     ("convert hills.npz a.glb --base 5", "base must lie below all heights, the lowest is 0, it is 5"),
     ("view hills.npz -o a.gif --sun-from 90,10", "--sun-from and --sun-to belong together"),
     ("view hills.npz -o a.png --sun-from 90,10 --sun-to 90,20", "a moving sun makes a film"),
