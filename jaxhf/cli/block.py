@@ -113,14 +113,10 @@ def lights(field: Heightfield, look: Look) -> list[Light]:
 def photograph(
     ready: Prepared, camera: Perspective, look: Look, progress: Callable[[], Any] | None = None
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear radiance of a prepared `block`, with haze before a background.
+    """Linear radiance of a `block` that was prepared in the lights of this look, with haze before a background.
 
     Each of a pixel's samples gets haze by its own distance, so it is a picture of its own, from a camera that looks past the
-    pixel's centre.
-
-    Args:
-      ready: the block, in the lights of this look.
-      progress: called after each sample.
+    pixel's centre; `progress` is called after each.
     """
     side = math.isqrt(look.samples)
     field = ready.scene.heightfields[0]

@@ -14,12 +14,9 @@ from ..xla.plain import is_asked_for
 
 
 def keep_programs(wanted: bool) -> None:
-    """Lets JAX keep its programs beside ours in `folder.opened()`, unless the user has named a folder to JAX itself.
+    """Lets JAX keep its programs, if that is `wanted`, beside ours, unless the user has named a folder to JAX itself.
 
     Where they cannot be kept a warning says so, no more. In plain mode none are.
-
-    Args:
-      wanted: whether to keep any; if not, a folder that the user has named to JAX is not used either.
     """
     if is_asked_for():
         return

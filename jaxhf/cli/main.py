@@ -16,8 +16,7 @@ from . import interruption
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; returns its exit code: 0, 2 after an error of the user's, 130 after Ctrl-C, 141 where nobody reads on.
 
-    Args:
-      arguments: None: those of this process, which then is the command's, also in what Ctrl-C does to it.
+    Without arguments those of this process count, which then is the command's, also in what Ctrl-C does to it.
     """
     if arguments is None:
         interruption.end_at_once()

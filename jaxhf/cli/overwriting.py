@@ -17,13 +17,7 @@ _PLACED = (".png", ".asc")  # are written with what lies beside them
 def require_no_input(options: argparse.Namespace, *others: Path) -> None:
     """UserError where an output of a command is one of its inputs: a file that another option names, or a scene's file.
 
-    Args:
-      options: of the command: `output` and `report` are written; every other string that names a file counts as read.
-        `command.placed`: files beside the output will say where it lies.
-      others: what the command writes besides.
-
-    Raises:
-      FileError: an option is an address on the network.
+    `output`, `report` and the `others` are written; every other string that names a file counts as read.
     """
     values = {name: value for name, value in vars(options).items() if isinstance(value, str)}
     for value in values.values():  # as it was written: a path would lose one of its slashes

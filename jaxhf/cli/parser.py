@@ -64,11 +64,7 @@ def parser_of(command: Command) -> _Parser:
 
 
 def parse(words: Sequence[str] | None = None) -> argparse.Namespace:
-    """The options of the command that these words name, with itself as `command`; see `_Parser.read`.
-
-    Args:
-      words: None: those of this process.
-    """
+    """The options of the command that these words, or those of this process, name, with itself as `command`."""
     words = sys.argv[1:] if words is None else words
     about = ["Renders heightfields, makes maps of them, and recovers them from pictures."]
     for title, group in GROUPS.items():

@@ -35,12 +35,9 @@ def bar(**options: Any) -> tqdm:
 
 @contextlib.contextmanager
 def compiled_bar(**options: Any) -> Iterator[Callable[[int, int], None]]:
-    """A bar, with the options of `bar`, that says "compiling" until the first report, and from then on how much time is left.
+    """A bar that says "compiling" until the first report, and from then on how much time is left, without that of compilation.
 
-    That is estimated without the seconds that JAX says went to compilation.
-
-    Yields:
-      What is to be called with (done, in all): the `progress` of `render`.
+    It yields what is to be called with (done, in all): the `progress` of `render`.
     """
     compiling = CompileTime()
     with bar(bar_format="{desc}", desc="compiling", smoothing=0, **options) as shown:
@@ -61,11 +58,7 @@ def compiled_bar(**options: Any) -> Iterator[Callable[[int, int], None]]:
 
 @contextlib.contextmanager
 def told(line: Callable[[], str]) -> Iterator[None]:
-    """Says what work of unknown length has come to: each second on a terminal, elsewhere once a minute on standard error.
-
-    Args:
-      line: what is to be said, asked for in a thread of its own.
-    """
+    """Says each second on a terminal, elsewhere once a minute, what work of unknown length has come to, asked in a thread."""
     ended = threading.Event()
     with bar(bar_format="{desc}", desc=line()) as shown:
 

@@ -32,13 +32,9 @@ def sheet(
     """A map in colours as a figure of matplotlib's.
 
     Args:
-      colours: of each vertex, row 0 in the south, with opacity.
-      terrain: as its file has it, maybe in degrees; coordinates are those of the file that its heights are from.
+      terrain: as its file has it, maybe in degrees, with row 0 in the south.
       metres: the same with the lengths that count.
-      ramp, entries: what colours the heights have, see `color_relief`.
       contours: how far apart contour lines are, in the unit of the heights; None: there are none.
-      title: above it.
-      caption: below it.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
@@ -100,14 +96,7 @@ def _draw_contours(axis: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, step:
 
 
 def _draw_scale_bar(axis: Any, most: float, drawn: float, in_metres: bool, unit: str) -> None:
-    """As long as may be, with 1, 2 or 5 for the first digit.
-
-    Args:
-      most: how long.
-      drawn: a unit of length, in coordinates.
-      in_metres: whether lengths are in metres.
-      unit: what they are in otherwise.
-    """
+    """As long as may be, with 1, 2 or 5 for the first digit; `drawn` is a unit of length in coordinates."""
     from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
     power = 10.0 ** math.floor(math.log10(most))

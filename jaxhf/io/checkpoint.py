@@ -15,10 +15,7 @@ _MAGIC = b"jaxhf checkpoint 2\n"
 
 
 def save_checkpoint(path: PathLike, facts: dict[str, Any], arrays: Any) -> None:
-    """Writes a checkpoint: facts (what JSON can hold) and a pytree's arrays.
-
-    A kill or a power failure at any moment leaves the old file or the new one, see `replacing`.
-    """
+    """Writes a checkpoint: facts (what JSON can hold) and a pytree's arrays; see `replacing`."""
     stream = io.BytesIO()
     stream.write(json.dumps(facts).encode() + b"\n")
     eqx.tree_serialise_leaves(stream, arrays)

@@ -27,25 +27,14 @@ def nearest(word: str, known: Iterable[str], cutoff: float = 0.5) -> str:
 
 
 def resolve_inside(root: Path, folder: Path, name: str) -> Path:
-    """The file that `name` in a scene means.
-
-    Args:
-      root: the folder of the outermost scene file; nothing outside it is opened.
-      folder: that of the file in which `name` stands; a relative name starts there.
-      name: as written.
-
-    Raises:
-      FileError: `name` leads out of `root`, by "..", by an absolute path or by a link; or it is a .vrt, whose sources may lie
-        anywhere, or holds a null character.
-      FileNotFoundError: no file is there.
-    """
+    """The file that `name` in a scene of this folder means; none outside `root`, the folder of the outermost scene."""
     if "\0" in name:
         raise FileError(f"{name!r} is no file's name")
     root = root.resolve()
     path = (folder / os.fsdecode(name.encode())).resolve()  # in a C locale letters are bytes in the names of files
     if not path.is_relative_to(root):
         raise FileError(f"{name!r} lies outside the scene's folder {str(root)!r}")
-    if path.suffix.lower() == ".vrt":
+    if path.suffix.lower() == ".vrt":  # whose sources may lie anywhere
         raise FileError(f"{name!r} names other files, which a scene cannot open (gdal_translate makes a .tif of it)")
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {name!r} in {str(folder)!r}")

@@ -137,10 +137,7 @@ TEMPORARIES: set[Path] = set()  # that there may be now: for Ctrl-C, which ends 
 
 @contextlib.contextmanager
 def utf8_name(path: Path) -> Iterator[str]:
-    """The file's name as GDAL and OpenEXR take it, in UTF-8; where it is not, another name that links to it.
-
-    Links to the files that say where it lies stand beside that, too.
-    """
+    """The file's name as GDAL and OpenEXR take it, in UTF-8; where it is not, that of a link, beside links to its sidecars."""
     path, named = path.absolute(), None
     with contextlib.suppress(UnicodeDecodeError):
         named = os.fsencode(path).decode()
@@ -162,17 +159,9 @@ _NEEDS = {  # the package that writes a format, and the extra that installs it
 
 
 def require_writable(owner: str, what: str, endings: Iterable[str], path: PathLike) -> Path:
-    """Checks that a file can be written, so that nobody renders or fits for an hour first.
+    """Checks that `owner` can write a file of one of these endings, so that nobody renders or fits for an hour first.
 
-    Args:
-      owner: the function that writes it, as errors say it.
-      what: it will hold, "an image".
-      endings: those that hold this.
-      path: the file.
-
-    Raises:
-      FileError: another ending, or a package for it that is missing.
-      FileError, FileNotFoundError, PermissionError: as `require_folder`.
+    FileError where the ending is another, or a package for it is missing; else as `require_folder`.
     """
     path = file_path(owner, path)
     by_ending(dict.fromkeys(endings), path, f"write {what} with")

@@ -23,10 +23,7 @@ _LEAST_DIFFUSE = 2e-3  # below which the model's diffuse light of a sun on the h
 def beam(altitude: Float[AnyArray, " n"], height: Float[AnyArray, "..."], turbidity: ScalarLeaf) -> Float[jax.Array, " n"]:
     """The share of the sun's light that comes straight through, on a surface across it (equations 3 to 12).
 
-    Args:
-      altitude: of the sun as it is seen, with refraction, degrees, above 0.
-      height: above the sea, metres; one, or one for each sun.
-      turbidity: Linke's, for an air mass of 2.
+    The altitude is that of the sun as it is seen, with refraction, degrees, above 0; the height is above the sea, metres.
     """
     pressure = jnp.exp(-height / _SCALE_HEIGHT)
     # Kasten and Young, Revised optical air mass tables and approximation formula, Applied Optics 28, 4735, 1989

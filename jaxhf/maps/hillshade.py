@@ -51,7 +51,7 @@ def hillshade(
         lights from 225, 270, 315 and 360 degrees, weighted by the aspect (Mark, USGS Open-File Report 92-422, 1992); "igor":
         shadows as weak as the slope, on white (Brejc, Maperitive).
       compute_edges: also at the border and beside holes, where otherwise there is no value.
-      shadows: what the surface keeps the light from is 1, whatever the variant; see `cast_shadows`.
+      shadows: what the surface keeps the light from is 1, whatever the variant.
 
     Raises:
       ArgumentError: a number is out of range, a name unknown, or there is no height.

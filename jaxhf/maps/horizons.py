@@ -53,18 +53,9 @@ def map_over_horizons(
     mesh: Mesh | None,
     besides: Besides | None = None,
 ) -> jax.Array:
-    """A map of a summary, by its name, of the horizons at a terrain's vertices.
+    """A map of one of `_SUMMARIES` of the horizons at a terrain's vertices: shape (..., ny, nx), nan where there is no height.
 
-    Args:
-      owner: the function that was called, for errors.
-      summary: of `_SUMMARIES`.
-      azimuths: of the horizons, degrees clockwise from north.
-      lowest: the slope where nothing rises higher; may be -inf.
-      progress, mesh: as for `horizon`.
-      besides: what else the summary takes.
-
-    Returns:
-      Shape (..., ny, nx); nan where there is no height.
+    `lowest` is the slope where nothing rises higher, -inf at least; `besides` is what else the summary takes.
     """
     require_progress(owner, progress, is_traced())
     dtype, mesh = field.heights.dtype, chosen_mesh(owner, mesh, field)

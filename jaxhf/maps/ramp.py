@@ -71,11 +71,7 @@ def hypsometric(low: float, high: float) -> Ramp:
 
 
 def matplotlib_ramp(name: str, low: float, high: float) -> Ramp:
-    """A colour map of matplotlib's, from the lowest height to the highest.
-
-    Raises:
-      UserError: matplotlib is not installed, or has no such colour map.
-    """
+    """A colour map of matplotlib's, from the lowest height to the highest."""
     matplotlib = import_extra("matplotlib", f"the colour ramp {name!r} needs", "plot")
     if name not in matplotlib.colormaps:
         known = {known.lower(): known for known in reversed(list(matplotlib.colormaps))}

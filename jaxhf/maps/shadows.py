@@ -174,15 +174,8 @@ def _crossing(
 ) -> Bool[np.ndarray, " n"]:
     """Whether the surface is above the rays where they meet an edge between two rows' lines, the first one excluded.
 
-    All rays start at vertices, so that they meet edges at the same shares of them.
-
-    Args:
-      z, there: heights, and which edges there are, flat; nan and none beyond them.
-      width: of a row of `z`.
-      at: places of the starts in `z`.
-      height: of the starts.
-      step: how many rows' lines have been passed.
-      light: the rays' direction.
+    All rays start at vertices, so that they meet edges at the same shares of them. `at` are the places of these vertices in the
+    flat `z`, whose rows have this width; `step` rows' lines have been passed.
     """
     across, rise, falling = light
     place = math.floor(step * across)

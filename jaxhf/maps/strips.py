@@ -16,14 +16,10 @@ from .ramp import as_ramp
 def by_strips(
     function: Callable[..., np.ndarray], rows: Rows, strip: int, from_north: bool, options: dict[str, Any]
 ) -> Iterator[tuple[slice, np.ndarray]]:
-    """A map of a terrain in strips of some rows: rows, counted from the south, and the values there.
+    """A map of a terrain in strips of so many rows: rows, counted from the south, and the values there.
 
-    Args:
-      function: that makes the map of a `Terrain`, from the eight neighbours of each vertex at most.
-      rows: the terrain.
-      strip: how many rows are read at once.
-      from_north: which strip comes first.
-      options: of the function, which besides its own are here for the whole terrain: cell sizes, a ramp of colours.
+    The function makes it of a `Terrain`, from the eight neighbours of each vertex at most. Of its options cell sizes and a ramp
+    of colours are those of the whole terrain.
     """
     place = rows.place
     ny = len(place.heights)

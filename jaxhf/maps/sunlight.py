@@ -47,15 +47,8 @@ def suns_of(
     """The suns of a time at a place.
 
     They follow each other by a minute, in long times by more. Each counts half in a sector and half in the next where it
-    stands between the middles of two, and so on in proportion.
-
-    Args:
-      begin, end: in UTC.
-      place: latitude and longitude, degrees.
-      turned: by how much y points clockwise of north, degrees.
-      turbidity: see `beam`.
-      azimuths: how many sectors there are.
-      wanted: see `insolation`.
+    stands between the middles of two, and so on in proportion. `turned` is by how much y points clockwise of north, degrees;
+    see `insolation` for the others.
     """
     count = int(np.ceil((end - begin) / max(_LEAST_STEP, (end - begin) / _MOST_SUNS)))
     times = begin + ((np.arange(count) + 0.5) * ((end - begin) / np.timedelta64(1, "us") / count)).astype("timedelta64[us]")

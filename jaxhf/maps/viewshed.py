@@ -129,12 +129,9 @@ def _hidden(
     Along a line all horizontal distances are as many cells, so that the size of cells does not matter.
 
     Args:
-      heights: of the terrain.
       eye: its column and row, and its height.
-      target: the target's height above the ground.
       falls: a vertex so many cells away stands lower by the sum of the squares of these times the cells; None: it does not.
       visible: whether no more is to be said than whether that is 0.
-      mesh: the devices that share the work.
     """
     (ny, nx), dtype = heights.shape, heights.dtype
     if falls is not None:
@@ -265,12 +262,7 @@ def _frame(terrain: Any, dx: float | None, dy: float | None) -> tuple[tuple[floa
 def cells_of(
     owner: str, name: str, points: Any, shape: tuple[int, ...], begin: tuple[float, float], step: tuple[float, float]
 ) -> Float[np.ndarray, "n 2"]:
-    """Where points stand in columns and rows of a terrain of this shape; ArgumentError where that is beside it.
-
-    Args:
-      points: x and y, shape (2,) or (n, 2).
-      begin, step: x and y of vertex (0, 0), and the spacing, in the points' coordinates.
-    """
+    """Where points stand in columns and rows of a terrain of this shape, whose vertex (0, 0) stands at `begin`."""
     try:
         given = np.asarray(points, np.float64)
     except (TypeError, ValueError):

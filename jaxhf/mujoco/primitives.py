@@ -110,13 +110,9 @@ def normal(kind: str, size: Vector, p: Vector) -> Vector:
 
 
 def met(kind: Index, size: Vector, ray: Ray, found: Scalar, kinds: list[str]) -> tuple[Scalar, Vector]:
-    """t, and the normal in the primitive's frame, where a ray meets the primitive whose place among KINDS is `kind`.
-
-    Differentiable in the numbers of the primitive and of the ray.
+    """t, and the normal in its frame, where a ray meets the primitive whose place among KINDS is `kind`; differentiable.
 
     Args:
-      kind: may be traced.
-      size, ray: see `first_crossing`.
       found: t as a search has it. Where a ray just touches the primitive, rounding may say here that it passes: then it counts.
       kinds: those that may be asked for.
     """

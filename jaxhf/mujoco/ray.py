@@ -73,12 +73,9 @@ def first_met(
     max_range: Any = None,
     of_field: Callable[[HField], Scan] | None = None,
 ) -> Scan:
-    """What rays in the world's frame meet first; their axes are those of the batch, and any others behind them.
+    """What rays in the world's frame meet first, see `ray`; their axes are those of the batch, and any others behind them.
 
-    Args:
-      geoms, max_range: see `ray`.
-      o, d: origins and directions.
-      of_field: what these rays meet of one height field, where that can be told without a search of each.
+    `of_field` is what these rays meet of one height field, where that can be told without a search of each.
     """
     of_field = of_field or (lambda field: meet_hfield(field, o, d))
     if isinstance(geoms, HField):

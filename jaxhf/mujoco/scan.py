@@ -103,11 +103,8 @@ def height_scan(
 def on_sensors(
     owner: str, geoms: HField | Geoms, pos: Any, quat: Any, pattern: Any, columns: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """What robots or sensors are given, in the precision of the geoms.
-
-    Returns:
-      Positions (..., 3) and orientations (..., 4), which begin with the axes of the geoms' batch; the pattern (n, columns).
-    """
+    """Positions (..., 3) and orientations (..., 4) of robots or sensors, which begin with the axes of the geoms' batch, and the
+    pattern (n, columns), checked and in the precision of the geoms."""
     require_kind(owner, "geoms", geoms, HField | Geoms, "a jaxhf.mujoco.HField or Geoms")
     given, dtype, batch = quat, geoms.dtype, geoms.batch
     pos, quat = as_numbers(owner, "pos", pos, dtype), as_numbers(owner, "quat", quat, dtype)

@@ -111,11 +111,7 @@ def base_faces(ground: Ground, ray: Ray, within: tuple[Side, Side]) -> list[Side
 def wall(ground: Ground, ray: Ray, side: Side, below: Flag) -> Side:
     """The wall in whose plane a side of the ray's column lies: met where that is over the floor and below the rim.
 
-    Args:
-      ground, ray: as for `column`.
-      side: where the ray enters or leaves its column.
-      below: whether the ray is below the surface, for where rounding cannot tell at the rim: so nothing gets in between a
-        wall and the surface.
+    Where rounding cannot tell at the rim, it is met by a ray `below` the surface: so nothing gets in between the two.
     """
     t = jnp.where(side.met & jnp.isfinite(side.t), side.t, 0)
     p, up = ray(t), ray.d[2]

@@ -137,13 +137,7 @@ def triangle_heights(ground: Ground, ix: Index, iy: Index, upper: Flag) -> tuple
 def nearest(ground: Ground, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Scan:
     """The nearest of the triangle that a search found and of the solid's sides; of two at the same distance the first side.
 
-    Args:
-      ground: the height field.
-      local: the ray in its frame.
-      frame: world from that frame.
-      found: the triangle; t counts as the ray's does. Of a ray straight down only its cell is used, as it is over one place
-        wherever on it the search began.
-      solid: the sides.
+    Of a ray straight down only the cell that was found is used, as it is over one place wherever on it the search began.
     """
     nrow, ncol = ground.shape
     plane = a, b, c = plane_through(triangle_heights(ground, found.ix, found.iy, found.upper), found.upper)

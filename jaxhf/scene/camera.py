@@ -306,10 +306,7 @@ def _form_of_any_size(kind: type[Camera], far: bool) -> Any:
 
 
 def cropped(camera: Camera, x: float | int, y: float | int, width: int, height: int) -> Camera:
-    """The camera of a part of a picture: of `width` by `height` pixels from column x and row y on.
-
-    Its matrix may be no rotation any more, see `Perspective`.
-    """
+    """The camera of `width` by `height` pixels of a picture from column x and row y on; its matrix may be no rotation."""
     matrix = np.array(camera.world_from_camera, np.float64)
     sx, sy = screen(camera, x + width / 2, y + height / 2)
     times = min(width, height) / min(camera.width, camera.height)

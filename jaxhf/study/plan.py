@@ -47,11 +47,7 @@ def plan(
     path: PathLike, folder: PathLike | None = None, *, width: int | None = None, devices: int | None = None,
     knobs: Sequence[str] = (), quick: bool = False,
 ) -> Sweep:  # fmt: skip
-    """What is to be measured of a scene file; the keywords are the options of `jaxhf tradeoff`, whose --help tells of them.
-
-    Raises:
-      ValueError: an unknown knob, or anything about the scene.
-    """
+    """What is to be measured of a scene file; the keywords are the options of `jaxhf tradeoff`, whose --help tells of them."""
     for knob in knobs:
         if knob not in KNOBS:
             raise ArgumentError("tradeoff", "knobs", f"must be among {', '.join(KNOBS)}; one is {knob!r}")

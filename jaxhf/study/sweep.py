@@ -22,7 +22,6 @@ def run(sweep: Sweep, repeats: int, tell: Callable[[str], None], progress: Calla
     turns with those of the base, whose process lives through all of it, so that a machine whose speed drifts favours none.
 
     Args:
-      sweep: what is to be measured.
       repeats: how many runs each; those of a slow configuration end after 15 seconds, at the third run at the earliest.
       tell: is given lines for the user: what will be done, and how long it should take.
       progress: called with (done, of how many, what now).

@@ -19,11 +19,9 @@ require_writable_film = partial(require_writable, "writing_film", "a film", FILM
 
 @contextlib.contextmanager
 def writing_film(path: PathLike, rate: int) -> Iterator[Add]:
-    """Yields a function that takes one sRGB picture after the other, of one size; the file appears whole or not at all.
+    """Yields a function that takes one sRGB picture of one size after the other, `rate` a second.
 
-    Args:
-      path: .gif, which repeats for ever, or .mp4 (H.264; a last column or row is left out where their number is odd).
-      rate: pictures a second.
+    A .gif repeats for ever; an .mp4 (H.264) leaves out a last column or row where their number is odd.
     """
     path = require_writable_film(path)
     ending = path.suffix.lower()

@@ -34,10 +34,6 @@ def load_colours(path: PathLike, low: float, high: float) -> tuple[list[tuple[fl
     A line holds a height and red, green, blue (and opacity), or a colour's name. Numbers are separated by spaces, tabs, commas
     or colons; lines that begin with # or / are comments. For the height may stand a percentage (of the range `low` to `high`),
     `nv` (where there is no height) or `default` (no entry fits; GRASS).
-
-    Raises:
-      FileNotFoundError: no file is there.
-      SceneError: a line is none of these, with its number; or there is no entry.
     """
     path = require_file(path)
     with reading(path):

@@ -21,9 +21,6 @@ def load_drape(path: PathLike, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
 
     A GeoTIFF is laid where it lies, which must be in the terrain's reference system; it is black where it does not cover the
     terrain. Any other picture goes from corner to corner, its top in the north.
-
-    Raises:
-      FileNotFoundError, ValueError: as `load_image`; or a GeoTIFF that is not of bytes, in another system, or elsewhere.
     """
     path = require_file(path)
     if path.suffix.lower() not in (".tif", ".tiff"):

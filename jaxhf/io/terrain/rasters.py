@@ -120,20 +120,10 @@ require_writable_raster = partial(require_writable, "save_raster", "a map", (".n
 
 
 def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None = None) -> None:
-    """Writes a map of a terrain: a value or a colour at each of its vertices. The file appears whole or not at all.
+    """Writes a map of the terrain `like`: a value or a colour at each of its vertices, row 0 in the south.
 
-    .tif is a GeoTIFF in the coordinates of the file that `like` is from, with its reference system; .png has its place in a
-    world file beside it (.pgw), as GIS programs read it; .npy holds the values alone, in the order of `values`.
-
-    Args:
-      path: the file; it begins with the northern row, but for .npy.
-      values: row 0 in the south, as in `Terrain`: uint8 of shape (ny, nx), (ny, nx, 3) or (ny, nx, 4), red, green, blue and
-        opacity; uint16 or, not for .png, float32 or float64 of shape (ny, nx).
-      like: the terrain, which says where the map lies.
-      nodata: the value that means that there is none, for .tif.
-
-    Raises:
-      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or `values` are of another shape or kind.
+    .tif is a GeoTIFF in the coordinates of the file that `like` is from, with its reference system, and `nodata` for no value;
+    .png has its place in a world file beside it (.pgw), as GIS programs read it; .npy holds the values alone.
     """
     path = require_writable_raster(path)
     values = np.asarray(values)

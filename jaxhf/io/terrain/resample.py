@@ -11,14 +11,8 @@ def at_vertices(terrain: Terrain, wanted: Terrain) -> Float[np.ndarray, "ny nx"]
     """The bilinear surface of `terrain` at the vertices of `wanted`.
 
     Half a cell beyond the outermost vertices, as far as pixels reach, the outermost heights hold: the centres of a coarse
-    raster's pixels lie further inside than those of a fine one with the same corners.
-
-    Args:
-      terrain: nan where there is no height; so are the vertices of `wanted` with a share in it.
-      wanted: a grid in the same kind of coordinates, degrees or lengths; both have a `crs`.
-
-    Raises:
-      ValueError: `wanted` goes further, or its coordinates are of another system.
+    raster's pixels lie further inside than those of a fine one with the same corners. Vertices with a share in a hole are nan.
+    Both have a `crs`, in the same kind of coordinates: degrees or lengths.
     """
     own, other = terrain.crs, wanted.crs
     assert own is not None

@@ -273,13 +273,7 @@ def heights_of(values: np.ndarray, nodata: float | None, scale: float = 1.0, off
 def places_within(
     box: Box | None, shape: tuple[int, ...], corner: tuple[float, float], steps: tuple[float, float]
 ) -> tuple[slice, slice]:
-    """Rows and columns of the heights that stand within west, south, east and north; None: all.
-
-    Args:
-      shape: of the grid, whose rows begin in the south.
-      corner: x and y of its first height.
-      steps: from column to column, from row to row.
-    """
+    """Rows and columns of the heights within west, south, east and north, None: all; corner and steps are those of x and y."""
     if box is None:
         return slice(0, shape[0]), slice(0, shape[1])
     if np.shape(box) != (4,) or not np.isfinite(box).all() or not (box[0] < box[2] and box[1] < box[3]):

@@ -7,10 +7,8 @@ Where = tuple[str | int, ...]  # the way to a value: ("objects", 0, "heights")
 
 
 def line_of(text: str, where: Where) -> int | None:
-    """The line on which the value of `where` begins, or the nearest table around it; None: that is the whole file.
-
-    It is the line behind the longest beginning of the file that is TOML and does not hold it.
-    """
+    """The line behind the longest beginning of the file that is TOML without the value of `where`, or the nearest table around
+    it; None: that is the whole file."""
     lines, begin, deepest, found = text.split("\n"), 1, 0, None
     for end, line in enumerate(lines, 1):
         if line.rstrip().endswith(",") and "#" not in line:  # the row of an array, of which there may be many

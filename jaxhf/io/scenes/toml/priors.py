@@ -79,9 +79,6 @@ def known_heights(field: Provenance, deviations: bool, path: Path) -> Float[np.n
 
     If the file and the terrain both have a `crs`: its heights, resampled to the terrain's vertices. Else the heights of the
     file as they are, which `fit` stretches over the terrain from corner to corner.
-
-    Raises:
-      FileNotFoundError, ValueError: as `load_heights`; or the file does not cover the terrain, or has holes in it.
     """
     z_scale = abs(field.z_scale) if deviations else field.z_scale
     terrain = read_terrain(path, z_scale, field.nodata, nodata_overrules=False)
