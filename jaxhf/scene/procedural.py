@@ -1,8 +1,8 @@
 """Heights and textures made from a formula and a seed, in NumPy.
 
 The same seed gives the same numbers wherever NumPy's `default_rng` does, up to rounding. A size is (rows, columns); row 0 lies
-at v = 0 (of heights: in the south), column 0 at u = 0 (in the west). Heights fill their `range` exactly; textures are linear
-colours.
+at v = 0 (of heights: in the south), column 0 at u = 0 (in the west). Heights fill their `range`, (lowest, highest), exactly;
+textures are linear colours.
 """
 
 from collections.abc import Sequence
@@ -22,14 +22,9 @@ Colour = Sequence[float]
 def fractal(
     size: Sequence[int], seed: int = 0, exponent: float = 2.0, range: Pair = (0.0, 1.0), level: float | None = None
 ) -> Float[np.ndarray, "ny nx"]:
-    """Heights whose spectrum falls as 1 / frequency^`exponent`: 1.5 is rough, 2.5 smooth. Opposite borders match.
+    """Heights whose amplitudes fall as 1 / frequency^`exponent`: 1.5 is rough, 2.5 smooth. Opposite borders match.
 
-    Args:
-      size: (ny, nx).
-      seed: of the random phases.
-      exponent: of the amplitude.
-      range: (lowest, highest).
-      level: what lies lower is filled up to it, as by a lake; None: nothing is.
+    What lies below the `level`, if there is one, is filled up to it, as by a lake.
     """
     heights = _stretched(_noise(size, seed, exponent), range)
     return heights if level is None else np.maximum(heights, level)
@@ -46,14 +41,8 @@ def waves(
 ) -> Float[np.ndarray, "ny nx"]:
     """Heights of a sea: `count` sine waves with random phases, each as high as its length allows.
 
-    Args:
-      size: (ny, nx).
-      seed: of directions, lengths and phases.
-      count: how many waves are added.
-      direction: where they run, degrees counter-clockwise from +x.
-      spread: standard deviation of their directions, degrees.
-      lengths: (shortest, longest) wave, as parts of the field's longer side.
-      range: (lowest, highest).
+    They run in a direction, degrees counter-clockwise from +x, with a spread, the standard deviation; the shortest and the
+    longest are parts of the field's longer side.
     """
     require("", "count", count, Whole(1))
     if not 0 < lengths[0] <= lengths[1]:
@@ -71,15 +60,7 @@ def waves(
 def bumps(
     size: Sequence[int], seed: int = 0, count: int = 12, radius: float = 0.12, range: Pair = (0.0, 1.0)
 ) -> Float[np.ndarray, "ny nx"]:
-    """Heights of round hills, `count` Gaussians in random places.
-
-    Args:
-      size: (ny, nx).
-      seed: of the places.
-      count: how many hills.
-      radius: their standard deviation, as a part of the field's longer side.
-      range: (lowest, highest).
-    """
+    """Heights of round hills: `count` Gaussians in random places, whose deviation is `radius` times the field's longer side."""
     require("", "count", count, Whole(1))
     require("", "radius", radius, POSITIVE)
     x, y = _positions(size)
@@ -127,11 +108,7 @@ def sky(
 
     Args:
       size: (h, w), with w about four times h for round clouds.
-      seed: of the clouds.
-      zenith, horizon: colours of the clear sky.
-      sun: (u, v) of the sun.
-      sun_radius: of its disc, in v.
-      sun_radiance: of its disc; a glow of a tenth of it surrounds it.
+      sun: its (u, v); `sun_radius` is that of its disc in v, `sun_radiance` its radiance, of which a glow has a tenth.
       clouds: the part of the sky that is covered, 0..1.
     """
     require("", "clouds", clouds, Number("lie in 0..1", lambda value: 0 <= value <= 1))
