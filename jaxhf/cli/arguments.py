@@ -10,17 +10,19 @@ from functools import partial
 from typing import Any
 
 from ..core.errors import UserError
-from ..core.rules import Whole
+from ..core.rules import OneOf, Rule, Whole
 from ..core.settings import Settings
 
 Option = tuple[tuple[str, ...], dict[str, Any]]
 """What argparse's `add_argument` takes: names, and keywords."""
-Rule = tuple[str, Callable[[Any], bool]]
-"""What a value must be, in words, and whether it is."""
 
-_ANY: Rule = "", lambda value: True
-FINITE: Rule = "finite", math.isfinite
-POSITIVE: Rule = "positive and finite", lambda value: 0 < value < math.inf
+
+def finite(value: float) -> str | None:
+    return None if math.isfinite(value) else f"must be finite, it is {value}"
+
+
+def positive(value: float) -> str | None:
+    return None if 0 < value < math.inf else f"must be positive and finite, it is {value}"
 
 
 def option(*names: str, **keywords: Any) -> Option:
@@ -31,25 +33,24 @@ def flag(name: str, help: str) -> Option:
     return option(name, action="store_true", help=help)
 
 
-def number(name: str, metavar: str, help: str, default: float | None = None, rule: Rule = _ANY, **more: Any) -> Option:
+def number(name: str, metavar: str, help: str, default: float | None = None, rule: Rule | None = None, **more: Any) -> Option:
     return option(name, type=partial(_converted, real_number, rule), metavar=metavar, default=default, help=help, **more)
 
 
 def whole(name: str, metavar: str, help: str, least: int | None = None, default: int | None = None) -> Option:
-    rule = _ANY if least is None else (f"a whole number from {least} on", lambda value: value >= least)
+    rule = None if least is None else Whole(least)
     return option(name, type=partial(_converted, whole_number, rule), metavar=metavar, default=default, help=help)
 
 
 def choice(name: str, names: Sequence[str], help: str, default: str | None = None) -> Option:
-    rule = f"one of {', '.join(names)}", names.__contains__
-    return option(name, type=partial(_converted, str, rule), metavar=f"{{{','.join(names)}}}", default=default, help=help)
+    kind = partial(_converted, str, OneOf(names))
+    return option(name, type=kind, metavar=f"{{{','.join(names)}}}", default=default, help=help)
 
 
-def _converted(convert: Callable[[str], Any], rule: Rule, text: str) -> Any:
+def _converted(convert: Callable[[str], Any], rule: Rule | None, text: str) -> Any:
     value = convert(text)
-    words, holds = rule
-    if not holds(value):
-        raise argparse.ArgumentTypeError(f"must be {words}{';' if ',' in words else ','} it is {value!r}")
+    if rule is not None and (wrong := rule(value)):
+        raise argparse.ArgumentTypeError(wrong)
     return value
 
 

@@ -1,7 +1,7 @@
 """The commands: what `jaxhf --help` and their own --help say, and their options. What they do stands in `commands`."""
 
 from ..core.settings import Settings
-from .arguments import FINITE, POSITIVE, choice, flag, names, number, option, settings_options, size, sun, whole
+from .arguments import choice, finite, flag, names, number, option, positive, settings_options, size, sun, whole
 from .command import DEGREES, IN, MACHINE, PLACE, RASTER, SCENE, TERRAIN, Command, output
 from .map_catalogue import MAPS
 
@@ -43,11 +43,11 @@ _VIEW = Command(
             number("--haze", "SHARE", "of light lost along the terrain [0.15]"),
         ),
         "terrain": (
-            number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]", rule=POSITIVE),
+            number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]", rule=positive),
             option("--ramp", metavar="FILE|NAME", help=_HEIGHT_COLOURS),
             option("--drape", metavar="IMAGE", help=_DRAPE),
             choice("--material", MATERIALS, "the law by which it reflects [matte]", default="matte"),
-            number("--water", "LEVEL", "below it is water", rule=FINITE),
+            number("--water", "LEVEL", "below it is water", rule=finite),
             option("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet"),
         ),
         **RASTER,

@@ -38,21 +38,22 @@ def require_memory(scene: Scene, devices: int) -> None:
     width, height = scene.camera.width, scene.camera.height
     heights = sum(field.heights.size for field in scene.heightfields)
     single = scene.heights.dtype.itemsize / 4 if scene.heightfields else 1
-    needed, available = single * (_BYTES_A_HEIGHT * heights * devices + _BYTES_A_PIXEL * width * height), available_bytes()
-    if needed > available:
-        raise UserError(
-            f"{width} x {height} pixels of {heights} heights take more than {needed / 1e9:.3g} GB of memory on "
-            f"{counted(devices, 'device')}, {available / 1e9:.3g} GB are free; a smaller picture or terrain, or fewer "
-            "--devices, take less"
-        )
+    _require_free(
+        single * (_BYTES_A_HEIGHT * heights * devices + _BYTES_A_PIXEL * width * height),
+        f"{width} x {height} pixels of {heights} heights",
+        f" on {counted(devices, 'device')}",
+        "a smaller picture or terrain, or fewer --devices, take less",
+    )
 
 
-def require_memory_of_map(command: str, heights: int, precision: str) -> None:
-    """UserError where a map by JAX of so many heights certainly needs more memory than there is."""
+def require_memory_of_viewshed(heights: int, precision: str) -> None:
+    """UserError where a viewshed of so many heights certainly needs more memory than there is."""
     needed = _BYTES_A_HEIGHT_OF_MAPS * heights * (2 if precision == "float64" else 1)
+    _require_free(needed, f"viewshed: {heights} heights", "", "--bbox takes a part")
+
+
+def _require_free(needed: float | int, what: str, where: str, hint: str) -> None:
     available = available_bytes()
     if needed > available:
         free = f"{available / 1e9:.3g} GB are free"
-        raise UserError(
-            f"{command}: {heights} heights take more than {needed / 1e9:.3g} GB of memory, {free}; --bbox takes a part"
-        )
+        raise UserError(f"{what} take more than {needed / 1e9:.3g} GB of memory{where}, {free}; {hint}")

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from ..maps.choices import ALGORITHMS, CURVATURES, ENTRIES, QUADRATICS, RUGGEDNESS, SUNLIGHT, VARIANTS, WEIGHTINGS
-from .arguments import FINITE, POSITIVE, Option, choice, flag, moment, number, option, real_number, whole
+from .arguments import Option, choice, finite, flag, moment, number, option, positive, real_number, whole
 from .command import IN, MACHINE, NODATA, PART, PLACE, RASTER, Command, output
 
 
@@ -14,6 +14,7 @@ def _files(written: str, *more: Option) -> dict[str, Sequence[Option]]:
 _BYTES = ".tif (8 bits, keeps its place), .png (and a world file) or .npy"
 _COLOURED = ".tif (keeps its place), .png (and a world file) or .npy"
 _NUMBERS = ".tif (keeps its place) or .npy"
+_EDGES = flag("--compute-edges", "also at the border and beside holes")
 _DIRECTION = flag("--trigonometric", "counterclockwise from east"), flag("--zero-for-flat", "0 in place of -9999")
 _STEPS = (
     number("--dx", "D", "spacing of the columns [as the file says]"),
@@ -22,7 +23,7 @@ _STEPS = (
 _SCALE = "vertical units in a horizontal one [1; degrees are measured in metres at the middle latitude]"
 _SPACING = {"spacing": (number("--scale", "S", _SCALE), *_STEPS)}
 _ALGORITHM = choice("--algorithm", ALGORITHMS, "slopes from eight neighbours or four [horn]")
-_SLOPES = {"slopes": (_ALGORITHM, flag("--compute-edges", "also at the border and beside holes"))}
+_SLOPES = {"slopes": (_ALGORITHM, _EDGES)}
 _LIGHT = {
     "light": (
         number("--azimuth", "DEGREES", "of the light, from north, clockwise [315]"),
@@ -35,7 +36,7 @@ _LIGHT = {
 _SHEET = {
     "sheet": (
         flag("--annotate", "with coordinates, a scale bar, north, and what the colours mean, as .png, .pdf or .svg"),
-        number("--contours", "STEP", "contour lines so far apart, in the unit of the heights [none]", rule=POSITIVE),
+        number("--contours", "STEP", "contour lines so far apart, in the unit of the heights [none]", rule=positive),
         option("--title", metavar="TEXT", help="above the map [none]"),
     )
 }
@@ -120,7 +121,7 @@ MAPS = (
                 _NUMBERS,
                 choice("--kind", CURVATURES, "down the slope, across it, of the contour line, mean or Gaussian [mean]"),
                 choice("--quadratic", QUADRATICS, "nearest to nine heights, or through five [evans]"),
-                flag("--compute-edges", "also at the border and beside holes"),
+                _EDGES,
             ),
             **_SPACING,
         },
@@ -135,7 +136,7 @@ MAPS = (
             **_files(
                 _NUMBERS,
                 choice("--measure", RUGGEDNESS, "gdaldem's roughness, TRI (Riley's or Wilson's) or TPI [roughness]"),
-                flag("--compute-edges", "also at the border and beside holes"),
+                _EDGES,
             )
         },
         module="maps",
@@ -166,7 +167,7 @@ MAPS = (
         examples=("dem.tif -o horizon.npy --azimuths 36", "dem.tif -o west.tif --azimuth 270"),
         options=_sky(
             "the map: .npy of shape (azimuths, rows, columns), or .tif, one file an azimuth: OUT_090.tif",
-            number("--azimuth", "DEGREES", "one direction, from north, clockwise, in its place", rule=FINITE),
+            number("--azimuth", "DEGREES", "one direction, from north, clockwise, in its place", rule=finite),
         ),
         module="sky",
         about="They are in degrees above the horizontal, at least 0: exact and without a search radius.",

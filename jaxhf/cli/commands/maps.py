@@ -29,6 +29,7 @@ from .. import arguments
 from ..progress import bar
 from ..sheet import SHEETS, save_sheet, sheet
 
+_NUMBERS = {"slope": slope, "aspect": aspect, "curvature": curvature, "ruggedness": ruggedness}  # and no bytes
 _LIGHT = ("azimuth", "altitude", "z_factor", "variant", "shadows", "algorithm", "scale", "dx", "dy")
 
 
@@ -65,9 +66,7 @@ def _sheet(options: argparse.Namespace, function: Callable[..., Any]) -> None:
     import_extra("matplotlib", "--annotate draws with", "plot")
     path = require_writable("relief", "a sheet", SHEETS, options.output)
     begin = time.perf_counter()
-    terrain = read_terrain(options.terrain, **arguments.reading(options))
-    if terrain.nodata.all():
-        raise UserError(f"{options.terrain}: there is no height in it")
+    terrain = _read(options)
     takes = inspect.signature(function).parameters
     given = arguments.given(options, *(takes.keys() & vars(options).keys()))
     ramp = as_ramp(options.ramp, float(np.nanmin(terrain.heights)), float(np.nanmax(terrain.heights)))
@@ -92,18 +91,13 @@ def _sheet(options: argparse.Namespace, function: Callable[..., Any]) -> None:
 def _chosen(options: argparse.Namespace) -> tuple[Callable[..., Any], float | None]:
     """The function that makes the map, of those options that it has parameters for, and the value there that means none."""
     name = options.command.name
-    if name == "relief":
-        if options.annotate:
-            arguments.refuse(options, "alpha", because="a sheet is white where there is no height")
-        else:
-            arguments.refuse(options, "contours", "title", because="without --annotate there is no sheet")
-    if name in ("slope", "aspect", "ruggedness", "curvature"):
+    if name in _NUMBERS:
         require_numbers(options.output, name)
-        if name == "curvature":
-            return curvature, NODATA
-        if name == "ruggedness":
-            return ruggedness, NODATA
-        return (slope, NODATA) if name == "slope" else (aspect, None if options.zero_for_flat else NODATA)
+        return _NUMBERS[name], None if getattr(options, "zero_for_flat", False) else NODATA
+    if name == "relief" and options.annotate:
+        arguments.refuse(options, "alpha", because="a sheet is white where there is no height")
+    elif name == "relief":
+        arguments.refuse(options, "contours", "title", because="without --annotate there is no sheet")
     if name == "relief" and not options.shading:
         arguments.refuse(options, *_LIGHT, because="--no-shading leaves the light out")
         return color_relief, None
@@ -132,11 +126,16 @@ def report_spacing(options: argparse.Namespace, terrain: Terrain) -> None:
         print(f"jaxhf: {options.terrain} {said}", file=sys.stderr)
 
 
+def _read(options: argparse.Namespace) -> Terrain:
+    terrain = read_terrain(options.terrain, **arguments.reading(options))
+    if terrain.nodata.all():
+        raise UserError(f"{options.terrain}: there is no height in it")
+    return terrain
+
+
 def read_in_metres(options: argparse.Namespace) -> tuple[Terrain, Terrain]:
     """The terrain of a file as it is stored, in the precision that was asked for, and with lengths in metres."""
-    stored = read_terrain(options.terrain, **arguments.reading(options))
-    if stored.nodata.all():
-        raise UserError(f"{options.terrain}: there is no height in it")
+    stored = _read(options)
     stored = dataclasses.replace(stored, heights=stored.heights.astype(options.precision))
     report_spacing(options, stored)
     try:
