@@ -93,12 +93,9 @@ def seen_from(
 ) -> np.ndarray:
     """`viewshed` from places in columns and rows; errors call them by `name`."""
     require("viewshed", "wanted", wanted, OneOf(WANTED))
-    require("viewshed", "height", height, POSITIVE)
-    require("viewshed", "target_height", target_height, _AT_LEAST_0)
+    _require_line("viewshed", height, target_height, radius)
     if wanted == "above-ground" and target_height:
         raise ArgumentError("viewshed", "target_height", f"must be 0 where wanted is above-ground, it is {target_height}")
-    if radius is not None:
-        require_positive("viewshed", "radius", radius)
     require_progress("viewshed", progress, False)
     field = Heightfield(ground.heights, ground.dx, ground.dy)
     heights_there = [require_height(ground.heights, cell, "viewshed", f"{name}[{k}]") for k, cell in enumerate(cells)]
@@ -207,10 +204,7 @@ def line_of_sight(
       terrain, radius, dx, dy: as for `viewshed`, whose errors it has, too.
     """
     owner = "line_of_sight"
-    require(owner, "height", height, POSITIVE)
-    require(owner, "target_height", target_height, _AT_LEAST_0)
-    if radius is not None:
-        require_positive(owner, "radius", radius)
+    _require_line(owner, height, target_height, radius)
     terrain = _with_place(terrain)
     ground, frame = surface(owner, terrain, dx, dy), _frame(terrain, dx, dy)
     z, places, ends = ground.heights.astype(np.float64), [], []
@@ -240,6 +234,13 @@ def line_of_sight(
         visible = not (profile > line)[1:-1].any()
         needed = ((profile - eye)[1:-1] / share[1:-1]) + eye - profile[-1]
     return LineOfSight(distance, profile, line, visible, float(max(0, np.nanmax(needed, initial=0))))
+
+
+def _require_line(owner: str, height: float, target_height: float, radius: float | None) -> None:
+    require(owner, "height", height, POSITIVE)
+    require(owner, "target_height", target_height, _AT_LEAST_0)
+    if radius is not None:
+        require_positive(owner, "radius", radius)
 
 
 _AT_LEAST_0 = Number("be at least 0 and finite", lambda value: (value >= 0) & (value < np.inf))
@@ -276,9 +277,8 @@ def cells_of(
         if not ((cell >= -rounding) & (cell <= last + rounding)).all():
             spans = [f"{a:.10g} to {a + (n - 1) * d:.10g}" for a, d, n in zip(begin, step, (nx, ny), strict=True)]
             x, y = given.reshape(-1, 2)[k]
-            raise ArgumentError(
-                owner, name, f"must be on the terrain, x from {spans[0]} and y from {spans[1]}; one is {x:.10g} {y:.10g}"
-            )
+            rule = f"must be on the terrain, x from {spans[0]} and y from {spans[1]}; one is {x:.10g} {y:.10g}"
+            raise ArgumentError(owner, name, rule)
     return np.clip(cells, 0, last)
 
 
@@ -287,11 +287,8 @@ def require_height(z: Float[np.ndarray, "ny nx"], cell: Float[np.ndarray, "2"], 
     found = height_at(z, *cell.tolist())
     if not math.isfinite(found):
         place = "column {:.6g} and row {:.6g}".format(*cell)
-        raise ArgumentError(
-            owner,
-            name,
-            f"must be on a triangle of the terrain; a height of its cell is missing, at {place} from the south-west",
-        )
+        rule = f"must be on a triangle of the terrain; a height of its cell is missing, at {place} from the south-west"
+        raise ArgumentError(owner, name, rule)
     return found
 
 

@@ -62,12 +62,8 @@ class Heightfield(eqx.Module):
             raise ArgumentError("Heightfield", "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {shape}")
         padded = [next_power_of_two(n - 1) for n in shape]
         if math.prod(padded) > MOST_CELLS:
-            raise ArgumentError(
-                "Heightfield",
-                "heights",
-                "must have at most 2**28 cells, each side rounded up to a power of two; "
-                f"shape {shape} makes {padded[0]} x {padded[1]}",
-            )
+            rule = "must have at most 2**28 cells, each side rounded up to a power of two"
+            raise ArgumentError("Heightfield", "heights", f"{rule}; shape {shape} makes {padded[0]} x {padded[1]}")
         for name, value in (("dx", dx), ("dy", dy), ("x0", x0), ("y0", y0)):
             if isinstance(value, Tracer):
                 raise ArgumentError("Heightfield", name, "must be known when programs are compiled, it is traced by JAX")

@@ -116,12 +116,9 @@ def _along(inner: Heightfield, outer: Heightfield, axis: int) -> _Along:
     cells = (n - 1 - begin) // times
     if before < 2 or last - cells < 2 or cells < 3:
         ends = f"{start:.9g} to {start + (n - 1) * d:.9g}", f"{first:.9g} to {first + (count - 1) * coarse:.9g}"
-        raise ArgumentError(
-            "nested",
-            "fields",
-            "must hold 3 cells of the next coarser one each, which goes on for 2 of its cells beyond them on every side; "
-            f"along {'yx'[axis]} one lies from {ends[0]}, the next, of cells of {coarse:.6g}, from {ends[1]}",
-        )
+        rule = "must hold 3 cells of the next coarser one each, which goes on for 2 of its cells beyond them on every side"
+        found = f"along {'yx'[axis]} one lies from {ends[0]}, the next, of cells of {coarse:.6g}, from {ends[1]}"
+        raise ArgumentError("nested", "fields", f"{rule}; {found}")
     return _Along(times, begin, cells, before, last - cells)
 
 

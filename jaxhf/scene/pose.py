@@ -27,9 +27,8 @@ def look_at_pose(eye: Any, target: Any, up: Any) -> Any:
     forward = direction(target - eye)
     right = xp.cross(forward, up)
     if host and not np.linalg.norm(right) > 1e-9 * np.linalg.norm(up):
-        raise ArgumentError(
-            "look_at", "up", f"must not point along the view, it is {up.tolist()} for the view {forward.tolist()}"
-        )
+        rule = f"must not point along the view, it is {up.tolist()} for the view {forward.tolist()}"
+        raise ArgumentError("look_at", "up", rule)
     right = direction(right)
     columns = xp.stack([right, xp.cross(right, forward), forward, eye], axis=1)
     return xp.concatenate([columns, xp.asarray([[0.0, 0.0, 0.0, 1.0]], dtype=columns.dtype)])
@@ -41,6 +40,5 @@ def require_pose(matrix: Any) -> None:
     if isinstance(matrix, np.ndarray):
         turn = matrix[:3, :3]
         if np.abs(turn.T @ turn - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
-            raise ArgumentError(
-                "from_intrinsics", "world_from_camera", f"must rotate without scaling or mirroring, it is {turn.tolist()}"
-            )
+            rule = f"must rotate without scaling or mirroring, it is {turn.tolist()}"
+            raise ArgumentError("from_intrinsics", "world_from_camera", rule)

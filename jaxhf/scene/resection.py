@@ -36,9 +36,8 @@ def resected(
     tapering = np.linalg.norm(projection[2, :3])  # what depths differ by, beside their mean
     if tapering < _PARALLEL or np.linalg.det(projection[:, :3]) < 0:
         if tapering > max(_PARALLEL, off / size):
-            raise ArgumentError(
-                _OWNER, "pixels", "must count right and down from the top left corner, these show a mirror image"
-            )
+            rule = "must count right and down from the top left corner, these show a mirror image"
+            raise ArgumentError(_OWNER, "pixels", rule)
         rule = "must be seen in perspective, these by parallel rays, as far as their pixels tell: Orthographic.from_points"
         raise ArgumentError(_OWNER, "points", rule)
     eye = middle - axes @ np.linalg.solve(projection[:, :3], projection[:, 3])

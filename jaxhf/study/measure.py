@@ -17,7 +17,7 @@ from ..scene.scene import Scene
 from ..scene.views import resized, shrunk
 from ..xla.compilation import compiled
 from ..xla.devices import peak_device_mb
-from .table import Row, Sweep, settings_of
+from .table import SETTINGS, Row, Sweep
 from .worker import Answers, timed
 
 DERIVATIVE_PIXELS = 160  # of the longer side: a derivative costs some times a picture
@@ -112,7 +112,8 @@ def prepare(job: tuple[Sweep, Row]) -> Answers:
     jax.config.update("jax_num_cpu_devices", sweep.devices)
     jax.config.update("jax_enable_compilation_cache", False)  # the time of compilation is a figure
     scene = resized(load_scene(sweep.path, np.dtype(one["precision"])), sweep.width, sweep.height)
-    measured = {"picture": Picture, "derivative": Derivative}[one["task"]](scene, settings_of(one))
+    settings = Settings(**{name: one[name] for name in SETTINGS})
+    measured = {"picture": Picture, "derivative": Derivative}[one["task"]](scene, settings)
     path = sweep.reference(one["task"])
 
     def first() -> dict[str, float]:

@@ -27,10 +27,6 @@ The task is a "picture" or a "derivative": value and gradient of a loss.
 """
 
 
-def settings_of(row: Row) -> Settings:
-    return Settings(**{name: row[name] for name in SETTINGS})
-
-
 def changes(row: Row, base: Row) -> dict[str, Any]:
     """The knobs in which a configuration differs from the base."""
     return {knob: row[knob] for knob in KNOBS if row[knob] != base[knob]}

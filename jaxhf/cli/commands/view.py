@@ -145,7 +145,7 @@ def _frames(
 
 def _film(output: Path, ready: Prepared, frames: Sequence[tuple[Perspective, Look]]) -> None:
     """Writes frames of a block that was prepared in the light of the first one."""
-    with writing_film(output, 24) as add, bar(total=len(frames), unit=" frames") as shown:
+    with writing_film(output) as add, bar(total=len(frames), unit=" frames") as shown:
         for camera, look in frames:
             lit = ready if look is frames[0][1] else ready.with_lights(lights(ready.scene.heightfields[0], look))
             image = photograph(lit, camera, look)

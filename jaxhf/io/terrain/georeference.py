@@ -3,7 +3,7 @@
 import importlib
 import math
 import re
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -116,18 +116,13 @@ def on_globe(wkt: str, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.nda
     globe = _globe(wkt) or WGS84
     earth = math.isclose(globe.axis, WGS84.axis, rel_tol=0.01)
     target = "EPSG:4326" if earth else f"+proj=longlat +a={globe.axis} +f={globe.flattening} +no_defs"
-    latitude, longitude = _transformed(wkt, target, x.ravel(), y.ravel())
-    return np.reshape(latitude, x.shape), np.reshape(longitude, x.shape)
-
-
-def _transformed(wkt: str, target: str, x: Any, y: Any) -> tuple[Any, Any]:
     rasterio = import_extra("rasterio", "finding the latitude and longitude of a terrain needs", "geo")
     warp = importlib.import_module("rasterio.warp")
     try:
-        longitude, latitude = warp.transform(rasterio.crs.CRS.from_wkt(wkt), target, x, y)
+        longitude, latitude = warp.transform(rasterio.crs.CRS.from_wkt(wkt), target, x.ravel(), y.ravel())
     except rasterio.errors.RasterioError:  # a local system has no place on the globe
-        return np.full(len(x), np.nan), np.full(len(x), np.nan)
-    return latitude, longitude
+        return np.full(x.shape, np.nan), np.full(x.shape, np.nan)
+    return np.reshape(latitude, x.shape), np.reshape(longitude, x.shape)
 
 
 def _globe(wkt: str) -> Ellipsoid | None:
