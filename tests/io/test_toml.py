@@ -15,8 +15,8 @@ from PIL import Image
 import jaxhf
 from jaxhf import Directional, Heightfield, ImageTexture, Matte, Mirror, Orthographic, Perspective, SceneError, load_scene
 from jaxhf.io.scenes.toml import tables
+from jaxhf.io.scenes.toml.checks import line_of
 from jaxhf.io.scenes.toml.fit import load_case
-from jaxhf.io.scenes.toml.lines import line_of
 from jaxhf.io.scenes.toml.values import STEPS
 from jaxhf.io.terrain.georeference import WGS84_DEGREES, Georeference
 from jaxhf.scene.procedural import bumps, grid

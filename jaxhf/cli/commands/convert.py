@@ -9,7 +9,7 @@ from ...io.terrain.load import load_heights
 from ...io.terrain.meshes import MESHES, require_writable_mesh, save_mesh
 from ...io.terrain.save import HEIGHTS, require_writable_heights, save_heights
 from .. import arguments
-from ..describe import heightfield_line
+from .info import heightfield_line
 
 
 def run(options: argparse.Namespace) -> None:

@@ -1,14 +1,16 @@
 """Checks on the tables of a TOML scene; each of them ends with the line on which things went wrong."""
 
 import difflib
+import tomllib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ....core.errors import ArgumentError, UserError
 from ...errors import SceneError, nearest, resolve_inside
-from .lines import Where, follow, line_of
 from .tables import Keys
+
+Where = tuple[str | int, ...]  # the way to a value: ("objects", 0, "heights")
 
 
 class Part(NamedTuple):
@@ -21,7 +23,7 @@ class Part(NamedTuple):
 
     def at(self, *steps: str | int) -> "Part":
         """What stands in this table under `steps`; what is missing there, or is no table, is an empty one."""
-        depth, inner = follow(self.table, steps)
+        depth, inner = _follow(self.table, steps)
         is_table = depth == len(steps) and isinstance(inner, dict)
         return self._replace(where=(*self.where, *steps), table=inner if is_table else {})
 
@@ -109,3 +111,32 @@ class Part(NamedTuple):
             raise self.error(
                 f"{self.name}: {message}" if self.where and not message.startswith(self.name) else message
             ) from error
+
+
+def line_of(text: str, where: Where) -> int | None:
+    """The line behind the longest beginning of the file that is TOML without the value of `where`, or the nearest table around
+    it; None: that is the whole file."""
+    lines, begin, deepest, found = text.split("\n"), 1, 0, None
+    for end, line in enumerate(lines, 1):
+        if line.rstrip().endswith(",") and "#" not in line:  # the row of an array, of which there may be many
+            continue
+        try:
+            depth, _ = _follow(tomllib.loads("\n".join(lines[:end])), where)
+        except tomllib.TOMLDecodeError:  # inside a value of several lines
+            continue
+        if depth > deepest:
+            deepest, found = depth, begin
+        if depth == len(where):
+            break
+        begin = end + 1
+    return found
+
+
+def _follow(content: Any, where: Where) -> tuple[int, Any]:
+    """How many steps of the way there are, and what stands behind them."""
+    for depth, step in enumerate(where):
+        try:
+            content = content[step]
+        except (KeyError, IndexError, TypeError):
+            return depth, content
+    return len(where), content
