@@ -74,9 +74,8 @@ class Geoms(eqx.Module):
         self.fixed = (False,) * count if fixed is None else _several("Geoms", "fixed", fixed)
         for name, found, wanted in (("ids", self.ids, count + n), ("fixed", self.fixed, count)):
             if len(found) != wanted:
-                raise ArgumentError(
-                    "Geoms", name, f"must have {counted(wanted, 'value')}, one of each geom, it has {len(found)}"
-                )
+                rule = f"must have {counted(wanted, 'value')}, one of each geom, it has {len(found)}"
+                raise ArgumentError("Geoms", name, rule)
         self._require_sizes()
         self._require_batches()
 

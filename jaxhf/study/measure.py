@@ -13,8 +13,7 @@ from ..io.files import reading, replacing
 from ..io.scenes.load import load_scene
 from ..rendering.cast import cast_camera
 from ..rendering.render import render
-from ..scene.scene import Scene
-from ..scene.views import resized, shrunk
+from ..scene.scene import Scene, resized, shrunk
 from ..xla.compilation import compiled
 from ..xla.devices import peak_device_mb
 from .table import SETTINGS, Row, Sweep

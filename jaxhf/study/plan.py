@@ -19,8 +19,7 @@ from ..io.scenes.load import load_scene
 from ..preparation.world import resolve_settings
 from ..scene.light import Sky
 from ..scene.material import Mirror
-from ..scene.scene import Scene
-from ..scene.views import resized, shrunk
+from ..scene.scene import Scene, resized, shrunk
 from ..xla.machine import default_devices
 from .table import KNOBS, Row, Sweep
 

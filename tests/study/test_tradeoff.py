@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.scene.views import shrunk
+from jaxhf.scene.scene import shrunk
 from jaxhf.study.measure import DERIVATIVE_PIXELS, Picture, centre_hits
 from jaxhf.study.pareto import advice, by_task, markdown, one_at_a_time, pareto_front
 from jaxhf.study.plan import plan

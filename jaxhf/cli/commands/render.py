@@ -13,7 +13,7 @@ from ...io.scenes.load import load_scene
 from ...preparation.world import resolve_settings
 from ...rendering.aovs import known_aovs
 from ...rendering.render import render
-from ...scene.views import resized
+from ...scene.scene import resized
 from ...xla.devices import local_mesh, worthwhile_mesh
 from .. import arguments, limits
 from ..progress import CompileTime, compiled_bar

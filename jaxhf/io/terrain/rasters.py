@@ -134,9 +134,8 @@ def save_raster(path: PathLike, values: Any, like: Terrain, nodata: float | None
         known = ", ".join(np.dtype(kind).name for kind in kinds)
         raise ArgumentError("save_raster", "values", f"must be of {known} for {ending}, they are {values.dtype}")
     if values.shape[:2] != like.heights.shape or values.shape[2:] not in channels:
-        raise ArgumentError(
-            "save_raster", "values", f"must have the terrain's shape, {like.heights.shape}, theirs is {values.shape}"
-        )
+        rule = f"must have the terrain's shape, {like.heights.shape}, theirs is {values.shape}"
+        raise ArgumentError("save_raster", "values", rule)
     with replacing(path, beside(path, like)) as temporary:
         if ending == ".npy":
             write_npy(temporary, values)

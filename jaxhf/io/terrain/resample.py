@@ -34,10 +34,8 @@ def at_vertices(terrain: Terrain, wanted: Terrain) -> Float[np.ndarray, "ny nx"]
         at = np.where(np.abs(at - vertex) < 1e-6, vertex, at)  # without a share in the next one, which may be a hole
         if at[0] < -0.5 or at[-1] > count - 0.5:
             last, wanted_last = first + (count - 1) * step, wanted_first + (wanted_count - 1) * wanted_step
-            raise FileError(
-                f"it must cover the terrain, whose {name} goes from {wanted_first:.10g} to {wanted_last:.10g}; "
-                f"its own goes from {first:.10g} to {last:.10g}"
-            )
+            rule = f"it must cover the terrain, whose {name} goes from {wanted_first:.10g} to {wanted_last:.10g}"
+            raise FileError(f"{rule}; its own goes from {first:.10g} to {last:.10g}")
         at = np.clip(at, 0, count - 1)
         low, high = np.floor(at).astype(int), np.ceil(at).astype(int)
         share = np.expand_dims(at - low, 1 - axis)

@@ -56,10 +56,8 @@ def _terrain(path: Path, given: Any) -> Terrain:
         raise FileError(f"{path}: what is written must be a Terrain, whose place goes with it; it is a {type(given).__name__}")
     heights = np.asarray(given)
     if heights.dtype not in (np.float32, np.float64) or heights.ndim != 2:
-        raise FileError(
-            f"{path}: heights must be a Terrain, or float32 or float64 of shape (ny, nx); "
-            f"they are {heights.dtype} of shape {heights.shape}"
-        )
+        rule = "heights must be a Terrain, or float32 or float64 of shape (ny, nx)"
+        raise FileError(f"{path}: {rule}; they are {heights.dtype} of shape {heights.shape}")
     return Terrain(heights)
 
 

@@ -91,7 +91,6 @@ def known_heights(field: Provenance, deviations: bool, path: Path) -> Float[np.n
     holes = np.argwhere(np.isnan(heights))
     if len(holes):
         iy, ix = holes[0].tolist()
-        raise FileError(
-            f"it must have a height everywhere, {len(holes)} of {heights.size} are holes; the first is row {iy} column {ix}"
-        )
+        found = f"{len(holes)} of {heights.size} are holes; the first is row {iy} column {ix}"
+        raise FileError(f"it must have a height everywhere, {found}")
     return heights
