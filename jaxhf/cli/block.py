@@ -30,18 +30,12 @@ _WALLS = (0.27, 0.245, 0.22)
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """What a terrain is shown in.
+    """What a terrain is shown in."""
 
-    Attributes:
-      azimuth, altitude: of the sun, degrees clockwise from north and above the horizon.
-      haze: the share of light that haze takes over the length of the terrain, 0 to 1.
-      samples: rays a pixel, a square number; with more than one, mountains hide parts of the sky.
-    """
-
-    azimuth: float = 315.0
+    azimuth: float = 315.0  # of the sun, degrees clockwise from north
     altitude: float = 45.0
-    haze: float = 0.15
-    samples: int = 9
+    haze: float = 0.15  # the share of light that it takes over the length of the terrain, 0 to 1
+    samples: int = 9  # rays a pixel, a square number; with more than one, mountains hide parts of the sky
 
     def __post_init__(self):
         if not 0 < self.altitude <= 90:
@@ -51,11 +45,8 @@ class Look:
 
 
 def exaggeration(heights: Float[np.ndarray, "ny nx"], dx: float, dy: float) -> float:
-    """A round factor for heights with which a terrain looks neither flat nor like a wall.
-
-    Its relief, without a hundredth at either end, is then 0.06 of the shorter side at least and 0.6 at most; 1 where it is so
-    without.
-    """
+    """A round factor for heights, 1 where it can be, with which the relief, without a hundredth at either end, is from 0.06 to
+    0.6 of the shorter side: a terrain looks neither flat nor like a wall."""
     known = heights[np.isfinite(heights)]
     low, high = np.percentile(known, (1, 99))
     ny, nx = heights.shape
@@ -88,12 +79,9 @@ def block(
     base: float | None,
     material: Callable[[ImageTexture], Material] = Matte,
 ) -> Scene:
-    """A terrain with walls and a floor, under the sun and a sky.
+    """A terrain with walls and a floor at the level `base`, under the sun and a sky.
 
-    Args:
-      colours: linear, 0 to 1: of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
-      base: the level of the floor; None: neither walls nor a floor.
-      material: of the terrain, from these colours.
+    The colours are linear, 0 to 1: of each vertex (ny, nx, 3), or a picture over all of it (h, w, 3), southern row first.
     """
     at_vertices = colours.shape[:2] == field.heights.shape
     albedo = ImageTexture(jnp.asarray(colours, field.heights.dtype), at_vertices=at_vertices, wrap="clamp")

@@ -8,25 +8,15 @@ from .arguments import Option, choice, number, option, real_number, whole
 
 @dataclass(frozen=True)
 class Command:
-    """One word after `jaxhf`.
-
-    Attributes:
-      name: the word.
-      line: about it, in `jaxhf --help`.
-      examples: what may stand after its name.
-      options: the title of each group and what is in it, with positional arguments; "": without a title.
-      module: of `commands`, whose `run` does it; "": that of its name.
-      about: what its own --help says besides.
-      placed: whether files beside an output that is a map say where it lies.
-    """
+    """One word after `jaxhf`."""
 
     name: str
-    line: str
-    examples: Sequence[str]
-    options: Mapping[str, Sequence[Option]]
-    module: str = ""
-    about: str = ""
-    placed: bool = True
+    line: str  # about it, in `jaxhf --help`
+    examples: Sequence[str]  # of what may stand after its name
+    options: Mapping[str, Sequence[Option]]  # with positional arguments, by the titles of their groups; "": without a title
+    module: str = ""  # of `commands`, whose `run` does it; "": that of its name
+    about: str = ""  # what its own --help says besides
+    placed: bool = True  # whether files beside an output that is a map say where it lies
 
 
 # What several take.

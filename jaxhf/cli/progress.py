@@ -58,7 +58,10 @@ def compiled_bar(**options: Any) -> Iterator[Callable[[int, int], None]]:
 
 @contextlib.contextmanager
 def told(line: Callable[[], str]) -> Iterator[None]:
-    """Says each second on a terminal, elsewhere once a minute, what work of unknown length has come to, asked in a thread."""
+    """Says what work of unknown length has come to: each second on a terminal, elsewhere once a minute on standard error.
+
+    The line is asked for in a thread of its own.
+    """
     ended = threading.Event()
     with bar(bar_format="{desc}", desc=line()) as shown:
 

@@ -31,10 +31,7 @@ def sheet(
 ) -> Any:
     """A map in colours as a figure of matplotlib's.
 
-    Args:
-      terrain: as its file has it, maybe in degrees, with row 0 in the south.
-      metres: the same with the lengths that count.
-      contours: how far apart contour lines are, in the unit of the heights; None: there are none.
+    `metres` is the terrain with lengths where its file has degrees; contour lines stand so far apart, None: there are none.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize

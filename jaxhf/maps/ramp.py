@@ -31,19 +31,12 @@ _NOTHING: Colour = (0, 0, 0, 0)
 
 
 class Ramp(NamedTuple):
-    """Heights in rising order with their colours.
-
-    Attributes:
-      heights: shape (n,).
-      colours: shape (n, 4): red, green, blue and opacity, 0 to 255.
-      nodata: the colour where there is no height.
-      default: the colour of heights without an entry, where only entries count.
-    """
+    """Heights in rising order with their colours."""
 
     heights: Float[np.ndarray, " n"]
-    colours: UInt8[np.ndarray, "n 4"]
-    nodata: Colour = _NOTHING
-    default: Colour = _NOTHING
+    colours: UInt8[np.ndarray, "n 4"]  # red, green, blue and opacity
+    nodata: Colour = _NOTHING  # where there is no height
+    default: Colour = _NOTHING  # of heights without an entry, where only entries count
 
 
 def ramp_of(entries: Iterable[tuple[float, tuple[int, ...]]], nodata: Colour = _NOTHING, default: Colour = _NOTHING) -> Ramp:

@@ -10,17 +10,11 @@ _OFF = 1e-9  # cells: more than rounding moves a ray
 
 
 class _Light(NamedTuple):
-    """A light's direction on a grid that is turned so that it stands ahead, where rows grow, and not towards lower columns.
+    """A light's direction on a grid that is turned so that it stands ahead, where rows grow, and not towards lower columns."""
 
-    Attributes:
-      across: columns by which a ray moves while it crosses a row, 0 to 1.
-      rise: of the ray meanwhile.
-      falling: whether cells are split along (i, j + 1)-(i + 1, j), and not along (i, j)-(i + 1, j + 1).
-    """
-
-    across: float
-    rise: float
-    falling: bool
+    across: float  # columns by which a ray moves while it crosses a row, 0 to 1
+    rise: float  # of the ray meanwhile
+    falling: bool  # whether cells are split along (i, j + 1)-(i + 1, j), and not along (i, j)-(i + 1, j + 1)
 
 
 def lit(
@@ -52,17 +46,12 @@ def lit(
 
 
 class _Edges(NamedTuple):
-    """Which edges have a triangle beside them, shapes (rows, columns): each one counts for the vertex with its lowest numbers.
+    """Which edges have a triangle beside them; each one counts for the vertex with its lowest numbers."""
 
-    Attributes:
-      along, up, diagonal: from a vertex along its row, to the next row, and across the cell.
-      vertex: whether a triangle touches the vertex.
-    """
-
-    along: Bool[np.ndarray, "rows columns"]
-    up: Bool[np.ndarray, "rows columns"]
-    diagonal: Bool[np.ndarray, "rows columns"]
-    vertex: Bool[np.ndarray, "rows columns"]
+    along: Bool[np.ndarray, "rows columns"]  # from a vertex along its row
+    up: Bool[np.ndarray, "rows columns"]  # to the next row
+    diagonal: Bool[np.ndarray, "rows columns"]  # across the cell
+    vertex: Bool[np.ndarray, "rows columns"]  # whether a triangle touches it
 
 
 def _edges(z: Float[np.ndarray, "rows columns"]) -> _Edges:

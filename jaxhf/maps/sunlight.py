@@ -21,16 +21,12 @@ _LEAST_STEP = np.timedelta64(60, "s")
 
 
 class Suns(NamedTuple):
-    """What comes from the sun in a time, outside of the air.
+    """What comes from the sun in a time, outside of the air; None: it does not count."""
 
-    Attributes:
-      light: by sector of azimuth and step of altitude, the sum over its suns of their light times the direction towards them
-        or, where only their time counts, of that: kWh/m² or hours. Shape (c, k, altitudes), c = 3 or 1; None: they do not
-        count.
-      sky: what an even sky sends on level ground from which all of it is seen, kWh/m²; None: it does not count.
-    """
-
+    # By sector of azimuth and step of altitude, the sum over its suns of their light times the direction towards them (c = 3),
+    # kWh/m², or, where only their time counts, of that (c = 1), hours.
     light: Float[AnyArray, "c k altitudes"] | None
+    # What an even sky sends on level ground from which all of it is seen, kWh/m².
     sky: ScalarLeaf | None
 
 
@@ -76,14 +72,10 @@ def suns_of(
 
 
 class Sunlight(eqx.Module):
-    """What arrives in a time, on heights at even steps.
+    """What arrives in a time, see `Suns`, on heights at even steps."""
 
-    Attributes:
-      suns: see `Suns`: for each of these heights, and by sector and altitude, the sum over the suns that stand higher, those of
-        one step of altitudes being spread evenly over it; shape (c, heights, k, altitudes + 1).
-      sky: as there.
-    """
-
+    # For each of these heights, by sector and altitude, the sum over the suns that stand higher, those of one step of altitudes
+    # being spread evenly over it: one altitude more than there.
     suns: Float[jax.Array, "c heights k altitudes"] | None
     sky: ScalarLeaf | None
 
@@ -109,10 +101,8 @@ def received(
 ) -> Float[jax.Array, "*at"]:
     """What arrives at places by their horizons' slopes, in azimuths at even steps from north on, and by their own slope.
 
-    Args:
-      slopes: at least 0; where they are nan what is returned means nothing.
-      light: see `through_air`.
-      ground: the upward unit normals, and how far each height is from the lowest to the highest, 0 to 1.
+    Slopes are at least 0, or nan, where what is returned means nothing; of the ground these are the upward unit normals, and
+    how far each height is from the lowest to the highest, 0 to 1.
     """
     normal, share = ground
     k, dtype = slopes.shape[0], slopes.dtype

@@ -17,18 +17,12 @@ _MOST = 1e30  # of a number: beyond, sums of heights overflow in single precisio
 
 
 class Surface(NamedTuple):
-    """Heights with their spacing, checked.
+    """Heights with their spacing, checked; times `scale` it can be compared with heights."""
 
-    Attributes:
-      heights: shape (ny, nx), nan where there is none; row 0 in the south.
-      dx, dy: the spacing, times `scale` if heights are to be compared with it.
-      scale: vertical units in a horizontal one.
-    """
-
-    heights: Float[np.ndarray, "ny nx"]
+    heights: Float[np.ndarray, "ny nx"]  # nan where there is none; row 0 in the south
     dx: float
     dy: float
-    scale: float
+    scale: float  # vertical units in a horizontal one
 
 
 def surface(

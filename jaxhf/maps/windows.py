@@ -23,12 +23,8 @@ def over_windows(
     """The formula's value at each vertex: shape (ny, nx), of the type of `nodata`.
 
     Where a neighbour is missing there is no value. With `compute_edges` a missing neighbour inside has the height of the
-    centre; beyond the border heights go on in a straight line, and at a corner those of the border's row are repeated.
-
-    Args:
-      heights: row 0 in the south, nan where there is none. They count in float32, in which GDAL reads all but short integers.
-      formula: of a window's nine arrays; is called from several threads.
-      nodata: stands where there is no value.
+    centre; beyond the border heights go on in a straight line, and at a corner those of the border's row are repeated. Heights
+    count in float32, in which GDAL reads all but short integers. The formula is called from several threads.
     """
     z = fitted(heights, np.float32)[::-1]  # in the order of GDAL's rows
     result = np.full(z.shape, nodata)

@@ -22,21 +22,15 @@ _ROUNDING = 16  # units in the last place by which the height of a wall's rim ma
 
 
 class Ground(eqx.Module):
-    """A height field as one of its rays sees it.
+    """A height field, see `HField`, as one of its rays sees it."""
 
-    Attributes:
-      rows: the data, row after row.
-      size, pos, quat: as in `HField`.
-      shape: (nrow, ncol).
-      grid: for the search of a triangle alone, cells by cells by data; None where no ray searches. Where `rows` hold several
-        height fields, so do its arrays, and `grid.first` is the place of this one's first number in both.
-    """
-
-    rows: Float[jax.Array, " vertices"]
+    rows: Float[jax.Array, " vertices"]  # the data, row after row
     size: Float[jax.Array, "4"]
     pos: Vector
     quat: Float[jax.Array, "4"]
-    shape: tuple[int, int] = eqx.field(static=True)
+    shape: tuple[int, int] = eqx.field(static=True)  # (nrow, ncol)
+    # For the search of a triangle alone, cells by cells by data; None where no ray searches. Where `rows` hold several height
+    # fields, so do its arrays, and `grid.first` is the place of this one's first number in both.
     grid: Grid | None
 
     @property

@@ -55,19 +55,12 @@ def nested(*fields: Heightfield, blend: int | None = None) -> tuple[Heightfield,
 
 
 class _Along(NamedTuple):
-    """How a fine terrain lies within a coarser one along an axis.
+    """How a fine terrain lies within a coarser one along an axis."""
 
-    Attributes:
-      times: fine cells in a coarse one.
-      begin: the first fine post on a coarse line.
-      cells: whole coarse cells in the fine terrain from there on.
-      before, after: coarse cells beyond them.
-    """
-
-    times: int
-    begin: int
-    cells: int
-    before: int
+    times: int  # fine cells in a coarse one
+    begin: int  # the first fine post on a coarse line
+    cells: int  # whole coarse cells in the fine terrain from there on
+    before: int  # coarse cells before them
     after: int
 
     @property

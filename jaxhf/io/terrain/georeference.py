@@ -27,36 +27,22 @@ WGS84_DEGREES = (
 
 
 class CoordinateSystem(NamedTuple):
-    """The reference system of x and y.
+    """The reference system of x and y."""
 
-    Attributes:
-      degrees: whether they are degrees of longitude and latitude, or lengths.
-      globe: that the degrees are measured on; None: it is not known.
-      code: the EPSG code; None: it is not known.
-    """
-
-    degrees: bool = False
-    globe: Ellipsoid | None = None
-    code: int | None = None
+    degrees: bool = False  # of longitude and latitude, or lengths
+    globe: Ellipsoid | None = None  # on which the degrees are measured; None: it is not known
+    code: int | None = None  # of EPSG; None: it is not known
 
 
 class Georeference(NamedTuple):
-    """Where a terrain lies in the coordinates of its file: file = offset + scale * terrain, for x and for y.
+    """Where a terrain lies in the coordinates of its file: file = offset + scale * terrain, for x and for y."""
 
-    Attributes:
-      wkt: the file's reference system as well-known text (ISO 19162, or GDAL's older form); "": not known.
-      scale, offset: each for x and y.
-      nodata: the stored value that means no height there; None: there is none.
-      point: whether a pixel is said to be a point, PixelIsPoint in GeoTIFF; a height stands at its centre either way.
-      z_unit: the name of the heights' unit, where the file says it apart from its reference system; "": it does not.
-    """
-
-    wkt: str = ""
+    wkt: str = ""  # the file's reference system as well-known text (ISO 19162, or GDAL's older form); "": not known
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
-    nodata: float | None = None
-    point: bool = False
-    z_unit: str = ""
+    nodata: float | None = None  # the stored value that means no height there
+    point: bool = False  # whether a pixel is said to be one, PixelIsPoint in GeoTIFF; a height stands at its centre either way
+    z_unit: str = ""  # of the heights, where the file names it apart from its reference system
 
     @property
     def name(self) -> str:

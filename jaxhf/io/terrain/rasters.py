@@ -26,15 +26,10 @@ from .terrain import Box, Nodata, Terrain, heights_of, places_within
 
 
 class Rows(NamedTuple):
-    """A terrain whose heights are read when they are needed.
+    """A terrain whose heights are read when they are needed."""
 
-    Attributes:
-      place: the terrain with zeros for heights, which take no memory.
-      read: the heights of some rows, counted from the south, of each `step`-th row and column.
-    """
-
-    place: Terrain
-    read: Callable[[slice, int], Terrain]
+    place: Terrain  # with zeros for heights, which take no memory
+    read: Callable[[slice, int], Terrain]  # some rows, counted from the south, of each `step`-th row and column
 
     def whole(self) -> Terrain:
         """All of it; FileError where that is too much."""

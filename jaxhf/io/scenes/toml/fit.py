@@ -72,29 +72,19 @@ _ARGUMENTS = {("fit",): _FIT, ("fit", "prior"): _PRIOR, ("fit", "unknown"): _UNK
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Case:
-    """What a file asks `fit` for.
-
-    Attributes:
-      scenes, targets, weights, settings: as `fit` takes them; a grey picture has shape (h, w).
-      noise: of each picture a number, or the arguments of its `Noise`; None: it is not known.
-      options: `start`, `draws` and `max_steps` of `fit`, those that the file gives.
-      prior, unknown: the same of `Prior` and `Unknown`; empty: there is no such table.
-      names: the pictures' files, as written.
-      like: the GeoTIFF whose georeference the heights have; None: there is none.
-      part: the file, for errors.
-    """
+    """What a file asks `fit` for, as that takes it; a grey picture has shape (h, w)."""
 
     scenes: tuple[Scene, ...]
     targets: tuple[np.ndarray, ...]
     weights: tuple[np.ndarray | None, ...]
-    noise: tuple[float | dict[str, float | int], ...] | None
+    noise: tuple[float | dict[str, float | int], ...] | None  # numbers, or the arguments of `Noise`; None: it is not known
     settings: Settings
-    options: dict[str, Any]
-    prior: dict[str, Any]
-    unknown: dict[str, Any]
-    names: tuple[str, ...]
-    like: Path | None
-    part: Part
+    options: dict[str, Any]  # `start`, `draws` and `max_steps`, those that the file gives
+    prior: dict[str, Any]  # the same of `Prior`; empty: there is no such table
+    unknown: dict[str, Any]  # and of `Unknown`
+    names: tuple[str, ...]  # the pictures' files, as written
+    like: Path | None  # the GeoTIFF whose georeference the heights have
+    part: Part  # the file, for errors
 
     def located(self, error: ArgumentError) -> UserError:
         """An error about an argument of `fit`, `Prior` or `Unknown`, on the line where that stands; others as they are."""

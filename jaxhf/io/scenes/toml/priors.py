@@ -17,23 +17,15 @@ from ...terrain.terrain import Terrain
 
 @dataclasses.dataclass(frozen=True)
 class Provenance:
-    """Where a heightfield is from, as far as other files of heights depend on it.
+    """Where a heightfield is from, as far as other files of heights depend on it."""
 
-    Attributes:
-      placed: where the scene puts it; None: there is no heightfield.
-      stored: its file, in that file's coordinates; None: there is none.
-      path: that file.
-      like: that, where it is a GeoTIFF whose georeference the heights have: the table moves it by none of dx, dy, x0 and y0.
-      z_scale, nodata: of its table, or their defaults.
-      posts: the rows and the columns of its grid that the heightfield has, see `nested`; None: all.
-    """
-
-    placed: Terrain | None = None
-    stored: Terrain | None = None
-    path: Path | None = None
-    like: Path | None = None
+    placed: Terrain | None = None  # where the scene puts it; None: there is no heightfield
+    stored: Terrain | None = None  # its file, in that file's coordinates; None: there is none
+    path: Path | None = None  # that file
+    like: Path | None = None  # that, if it is a GeoTIFF whose georeference counts: its table has none of dx, dy, x0 and y0
     z_scale: float = 1.0
     nodata: float | None = None
+    # The rows and the columns of its grid that the heightfield has, see `nested`; None: all.
     posts: tuple[Int[np.ndarray, " ny"], Int[np.ndarray, " nx"]] | None = None
 
     @classmethod
