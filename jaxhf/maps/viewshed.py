@@ -27,7 +27,7 @@ from ..xla.compilation import compiled
 from ..xla.devices import chosen_mesh, map_over, on_every_device, takes_numbers
 from ..xla.kernel import one_kernel
 from .choices import WANTED
-from .surface import Surface, require_positive, surface, with_spacing
+from .surface import Surface, require_positive, surface
 
 _ROUNDING = 1e-9  # cells
 _BEFORE = 0.35  # cells: no edge that does not touch a vertex is crossed nearer to it than twice as far away
@@ -74,9 +74,8 @@ def viewshed(
     Raises:
       ValueError: an argument has a value that it cannot have, or an observer stands beside the terrain or in a hole.
     """
-    terrain = _with_place(terrain)
-    ground = surface("viewshed", terrain, dx, dy)
-    cells = cells_of("viewshed", "observers", observers, ground.heights.shape, *_frame(terrain, dx, dy))
+    ground, *frame = _placed("viewshed", terrain, dx, dy)
+    cells = cells_of("viewshed", "observers", observers, ground.heights.shape, *frame)
     return seen_from(ground, cells, "observers", height, target_height, wanted, radius, progress, mesh)
 
 
@@ -205,8 +204,7 @@ def line_of_sight(
     """
     owner = "line_of_sight"
     _require_line(owner, height, target_height, radius)
-    terrain = _with_place(terrain)
-    ground, frame = surface(owner, terrain, dx, dy), _frame(terrain, dx, dy)
+    ground, *frame = _placed(owner, terrain, dx, dy)
     z, places, ends = ground.heights.astype(np.float64), [], []
     for name, point in (("observer", observer), ("target", target)):
         cells = cells_of(owner, name, point, z.shape, *frame)
@@ -246,18 +244,16 @@ def _require_line(owner: str, height: float, target_height: float, radius: float
 _AT_LEAST_0 = Number("be at least 0 and finite", lambda value: (value >= 0) & (value < np.inf))
 
 
-def _with_place(terrain: Any) -> Any:
+def _placed(
+    owner: str, terrain: Any, dx: float | None, dy: float | None
+) -> tuple[Surface, tuple[float, float], tuple[float, float]]:
+    """The surface; where its vertex (0, 0) stands in the terrain's own coordinates, and how far apart vertices are there."""
     if isinstance(terrain, Heightfield):
-        return Terrain(np.asarray(terrain.heights), terrain.dx, terrain.dy, terrain.x0, terrain.y0)
-    return terrain
-
-
-def _frame(terrain: Any, dx: float | None, dy: float | None) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Where vertex (0, 0) stands in a terrain's own coordinates, and how far apart vertices are."""
+        terrain = Terrain(np.asarray(terrain.heights), terrain.dx, terrain.dy, terrain.x0, terrain.y0)
+    ground = surface(owner, terrain, dx, dy)
     if isinstance(terrain, Terrain):
-        return (terrain.x0, terrain.y0), (terrain.dx, terrain.dy)
-    _, *step = with_spacing("", terrain, dx, dy)
-    return (0.0, 0.0), (step[0], step[1])
+        return ground, (terrain.x0, terrain.y0), (terrain.dx, terrain.dy)
+    return ground, (0.0, 0.0), (ground.dx, ground.dy)
 
 
 def cells_of(
