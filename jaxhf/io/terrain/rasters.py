@@ -57,8 +57,9 @@ def raster_rows(path: Path, nodata: Nodata, band: int | None = None, box: Box | 
         if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
             raise FileError(f"its scale and offset must be finite, the scale not zero; they are {scale} and {offset}")
         used = nodata(dataset.nodatavals[number - 1])
-        whole, north_first, east_first = _place(dataset, used)
+        whole, north_first, east_first = _place(dataset, used, dataset.units[number - 1] or "")
         rows, columns = places_within(box, whole.heights.shape, (whole.x0, whole.y0), (whole.dx, whole.dy))
+        place = whole.within(box)
         left = dataset.width - columns.stop if east_first else columns.start
         masked = any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[number - 1])
 
@@ -73,13 +74,6 @@ def raster_rows(path: Path, nodata: Nodata, band: int | None = None, box: Box | 
             heights = heights[:: -1 if north_first else 1, :: -1 if east_first else 1]
             return dataclasses.replace(place, heights=heights, y0=place.y0 + part.start * place.dy)
 
-        nothing = np.broadcast_to(np.float32(0), (rows.stop - rows.start, columns.stop - columns.start))
-        place = dataclasses.replace(
-            whole, heights=nothing, x0=whole.x0 + columns.start * whole.dx, y0=whole.y0 + rows.start * whole.dy
-        )
-        if place.georeference is not None:
-            named = place.georeference._replace(z_unit=dataset.units[number - 1] or "")
-            place = dataclasses.replace(place, georeference=named)
         yield Rows(place, read)
 
 
@@ -93,7 +87,7 @@ def placed_like(terrain: Terrain, like: Path) -> Terrain:
     return dataclasses.replace(place, heights=terrain.heights)
 
 
-def _place(dataset: Any, nodata: float | None) -> tuple[Terrain, bool, bool]:
+def _place(dataset: Any, nodata: float | None, z_unit: str = "") -> tuple[Terrain, bool, bool]:
     """A terrain of no heights where GDAL's geotransform puts the pixels' centres, and whether the file's rows begin in the
     north and its columns in the east."""
     a, b, c, d, e, f = dataset.transform[:6]
@@ -107,7 +101,7 @@ def _place(dataset: Any, nodata: float | None) -> tuple[Terrain, bool, bool]:
         return Terrain(nothing), True, False
     x0, y0 = c + (0.5 if a > 0 else nx - 0.5) * a, f + (0.5 if e > 0 else ny - 0.5) * e
     point = dataset.tags().get("AREA_OR_POINT") == "Point"
-    place = Georeference(wkt, nodata=nodata, point=point)
+    place = Georeference(wkt, nodata=nodata, point=point, z_unit=z_unit)
     return Terrain(nothing, abs(a), abs(e), x0, y0, coordinate_system(wkt), place), e < 0, a < 0
 
 
