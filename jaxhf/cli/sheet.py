@@ -51,7 +51,7 @@ def sheet(
     if contours is not None:
         every = slice(None, None, math.ceil(max(ny, nx) / _DRAWN))
         _draw_contours(axis, x[every], y[every], terrain.heights[every, every], contours, (low, high))
-    degrees = bool(place.wkt) and coordinate_system(place.wkt).degrees  # in the file: here lengths are metres all the same
+    degrees = coordinate_system(place.wkt).degrees  # in the file: here lengths are metres all the same
     in_metres = degrees or place.unit.lower() in ("metre", "meter", "m")
     shown = ListedColormap(coloured(ramp, np.linspace(low, high, 256)[None], entries)[0] / 255)
     unit = place.height_unit or ("m" if degrees else "")
