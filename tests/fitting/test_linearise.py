@@ -10,7 +10,8 @@ from test_expansion import CAMERAS, SUN, scene_of, waves
 
 import jaxhf
 from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
-from jaxhf.fitting.model.linearise import _sampling_error, can_be_linearised
+from jaxhf.fitting.model.linearise import _sampling_error
+from jaxhf.fitting.model.pictures import can_be_linearised
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import make_world
 from jaxhf.trace.grid import Grid

@@ -29,7 +29,7 @@ def test_a_whole_step_solves_the_linear_problem():
     step, left, basis = whole_step(here), in_row(here.left()), here.problem.basis
     roots = 1 / (1 + (left / 3) ** 2)
     by_pictures, by_priors, free = dense(here, roots)
-    images, priors = residuals(here.unknowns, (here.problem, here.linearised))[0]
+    images, priors = residuals(here.unknowns, here)[0]
     off = np.concatenate([np.ravel(part) for part in priors])
     gradient, matrix = by_pictures.T @ (roots * left) + by_priors.T @ off, by_pictures.T @ by_pictures + by_priors.T @ by_priors
     expected = np.zeros(free.size)

@@ -14,7 +14,7 @@ from ...preparation.world import make_world, resolve_settings
 from ...scene.scene import Scene
 from ...scene.skirt import Skirt
 from ...xla.compilation import compiled
-from .linearise import can_be_linearised
+from .pictures import can_be_linearised
 
 _SAMPLES = 4  # a pixel, at least
 EDGE_SAMPLES = (2048, 32768)  # at least, at most

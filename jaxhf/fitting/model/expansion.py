@@ -19,13 +19,13 @@ from ...rendering.render import render_each
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device
-from .linearise import Linearised, can_be_linearised, changing_pixels, linearise_each, moved_each
-from .pictures import Group, with_albedo, with_material
+from .linearise import Linearised, changing_pixels, linearise_each
+from .pictures import Group, can_be_linearised, with_albedo, with_material
 from .problem import Problem
 from .products import picture_each
 from .robust import soften
 from .surface import Basis, Unknowns
-from .view import KNOWN, View
+from .view import KNOWN, View, moved_each
 
 Rows = list[Float[Array, "_ _ _ _"]]
 """A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""
@@ -60,7 +60,7 @@ class Expansion(eqx.Module):
 
     def pictures(self) -> Rows:
         """As they would be measured."""
-        return _pictures(*on_every_device((self.unknowns, self.problem, self.linearised), self.problem.mesh))
+        return _pictures(on_every_device(self, self.problem.mesh))
 
     def left(self) -> Rows:
         """(picture - target) / noise."""
@@ -105,24 +105,22 @@ def expand(unknowns: Unknowns, problem: Problem) -> Expansion:
     return Expansion(problem, unknowns, _linearised(unknowns, problem))
 
 
-def residuals(unknowns: Unknowns, about: tuple[Problem, tuple[Linearised | None, ...]]) -> tuple[Any, None]:
+def residuals(unknowns: Unknowns, about: Expansion) -> tuple[Any, None]:
     """All residuals, whose half squares add up to the loss; the second value is optimistix's auxiliary output.
 
     Those of the pictures pass through `soften`, so that a solver that accepts steps by the loss needs to know nothing of
     reweighting. (Steps by reweighted least squares left the terrain's border in a wrong place: far outliers pull.)
     """
-    problem, linearised = about
-    images = _simulate(unknowns, problem, linearised, problem.basis.heights(unknowns.coefficients))
-    pairs = zip(problem.groups, images, strict=True)
+    problem = about.problem
+    pairs = zip(problem.groups, _simulate(unknowns, about, problem.basis.heights(unknowns.coefficients)), strict=True)
     parts = [soften(group.weights * (image - group.targets), problem.loss_scale) for group, image in pairs]
     return (parts, prior_residuals(unknowns, problem)), None
 
 
 def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
     """How far the unknowns are from what is known of them without the pictures, in standard deviations."""
-    basis, terms = problem.basis, problem.terms
-    parts = [terms.surface.of_surface(unknowns.coefficients, basis)]
-    return [*parts, *(term.residual(values) for term, values in terms.others(unknowns))]
+    surface = problem.terms.surface.of_surface(unknowns.coefficients, problem.basis)
+    return [surface, *(term.residual(values) for term, values in problem.terms.others(unknowns))]
 
 
 @functools.partial(compiled, jit=eqx.filter_jit, newer=None)
@@ -133,32 +131,26 @@ def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
 
 @functools.partial(compiled, jit=eqx.filter_jit)
 def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
-    heights, factors = problem.basis.heights(unknowns.coefficients), problem.factors(unknowns)
-
     def of(group: Group) -> Linearised | None:
-        if not can_be_linearised(group.scenes, problem.settings):
-            return None
-        moves = _moves(unknowns, problem, group)
-        return linearise_each(group, heights, problem.settings, problem.mesh, moves, factors)
+        return linearise_each(group, unknowns, problem) if can_be_linearised(group.scenes, problem.settings) else None
 
     return on_every_device(tuple(map(of, problem.groups)), problem.mesh)
 
 
 @functools.partial(compiled, jit=eqx.filter_jit, newer=None)
-def _pictures(unknowns: Unknowns, problem: Problem, linearised: tuple[Linearised | None, ...]) -> Rows:
-    return _simulate(unknowns, problem, linearised, problem.basis.heights(unknowns.coefficients))
+def _pictures(expansion: Expansion) -> Rows:
+    return _simulate(expansion.unknowns, expansion, expansion.heights)
 
 
 def _by_surface(expansion: Expansion) -> tuple[Callable[[Float[Array, "my mx"], Unknowns], Rows], Surface]:
     """Pictures in units of the noise as a function of the surface and the other unknowns, and these."""
     problem, unknowns = expansion.problem, expansion.unknowns
-    others = unknowns.without_modes()
 
     def pictures(surface: Float[Array, "my mx"], others: Unknowns) -> Rows:
-        images = _simulate(others, problem, expansion.linearised, problem.basis.crop(surface))
+        images = _simulate(others, expansion, problem.basis.crop(surface))
         return [group.weights * image for group, image in zip(problem.groups, images, strict=True)]
 
-    return pictures, (problem.basis.surface(unknowns.coefficients), others)
+    return pictures, (problem.basis.surface(unknowns.coefficients), unknowns.without_modes())
 
 
 @functools.partial(compiled, jit=eqx.filter_jit, newer=None)
@@ -173,20 +165,14 @@ def _pull(expansion: Expansion, rows: Rows) -> Surface:
     return jax.vjp(pictures, *here)[1](rows)
 
 
-def _simulate(
-    unknowns: Unknowns,
-    problem: Problem,
-    linearised: Sequence[Linearised | None],
-    heights: Float[Array, "ny nx"],
-) -> Rows:
+def _simulate(unknowns: Unknowns, about: Expansion, heights: Float[Array, "ny nx"]) -> Rows:
     """The pictures as they would be measured: with their exposures and offsets; a grey one is the mean of the channels."""
-    images, factors = [], problem.factors(unknowns)
-    for group, known in zip(problem.groups, linearised, strict=True):
+    problem, images = about.problem, []
+    for group, known in zip(problem.groups, about.linearised, strict=True):
         if known is not None:
-            moves = _moves(unknowns, problem, group)
-            image = picture_each(known, group, heights, problem.settings, problem.mesh, moves, factors)
+            image = picture_each(known, group, heights, unknowns, problem)
         else:
-            seen = _common(unknowns, problem)
+            factors, seen = problem.factors(unknowns), _common(unknowns, problem)
             complete = functools.partial(group.complete, heights=heights, factors=factors, numbers=seen)
             image = render_each(_views(unknowns, problem, group), complete, problem.settings, problem.mesh)
             if group.targets.shape[-1] == 1:
@@ -199,12 +185,6 @@ def _simulate(
     return images
 
 
-def _moves(unknowns: Unknowns, problem: Problem, group: Group) -> View:
-    """By what the light and the camera of each picture of a group are `moved`."""
-    which = np.array(group.indices)  # what pictures share has one row for all
-    return jax.tree.map(lambda values, unit: values[which % len(values)] * unit[None], unknowns.view, problem.view_unit)
-
-
 def _common(unknowns: Unknowns, problem: Problem) -> View:
     """By what a material's numbers are moved in all pictures."""
     material, unit = unknowns.view.material, problem.view_unit.material
@@ -213,7 +193,7 @@ def _common(unknowns: Unknowns, problem: Problem) -> View:
 
 def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
     """`group.scenes` under the lights and from the cameras that are sought."""
-    return moved_each(group.scenes, _moves(unknowns, problem, group))
+    return moved_each(group.scenes, problem.moves(unknowns, group))
 
 
 def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:

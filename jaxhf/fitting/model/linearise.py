@@ -27,17 +27,19 @@ from ...core.types import AnyArray
 from ...preparation.world import World, make_world
 from ...rendering.samples import PictureSamples
 from ...scene.camera import Camera
-from ...scene.light import Light, Sun
+from ...scene.light import Light
 from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
-from ...shade.radiance import direct, has_mirrors
+from ...shade.radiance import direct
 from ...trace.hit import Hit
 from ...trace.triangle import Corners, triangle_vertices
 from ...xla.devices import Spread, map_and_spread, map_over, on_every_device
 from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
 from .pictures import Group, albedo_of
+from .problem import Problem
+from .surface import Unknowns
 from .view import KNOWN, View, moved, with_numbers
 
 # Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
@@ -125,46 +127,16 @@ def changing_pixels(known: Linearised) -> Bool[np.ndarray, "n h w"]:
     return found
 
 
-def can_be_linearised(scene: Scene, settings: Settings) -> bool:
-    """Whether each sample depends on one triangle alone: where no mirror shows another one, and none makes a penumbra.
-
-    How much of a `Sky` with `occlusion` the terrain hides is taken as it is at each step, without its derivative: it changes
-    slowly, and points on edges are worth more.
-    """
-    if any(isinstance(light, Sun) for light in scene.lights):
-        return False
-    return not has_mirrors((obj.material for obj in scene.objects), settings)
-
-
-def linearise_each(
-    group: Group,
-    heights: Float[jax.Array, "ny nx"],
-    settings: Settings,
-    mesh: Mesh,
-    view: View,
-    factors: Float[jax.Array, "ty tx k"] | None,
-) -> Linearised:
-    """The pictures of a group whose scenes `can_be_linearised`, one after the other, and their derivatives in the heights, and
-    in what moves lights and cameras; leaves have a leading axis of n pictures.
-
-    Args:
-      view: by what the light and the camera of each are `moved`, (n, 2) and (n, 6), if that is sought.
-      factors: by which the albedo of the first heightfield is multiplied, if they are sought.
-    """
+def linearise_each(group: Group, unknowns: Unknowns, problem: Problem) -> Linearised:
+    """The pictures of a group whose scenes `can_be_linearised`, one after the other, and their derivatives in the heights and
+    in what else is sought; leaves have a leading axis of n pictures."""
+    heights, factors = problem.basis.heights(unknowns.coefficients), problem.factors(unknowns)
 
     def one(seen: tuple[Scene, View]) -> Linearised:
-        scene, view = on_every_device((group.complete(seen[0], heights, factors), seen[1]), mesh)
-        return _linearise(_Seen.of(scene, view, settings), mesh, group.targets.shape[-1], factors)
+        scene, view = on_every_device((group.complete(seen[0], heights, factors), seen[1]), problem.mesh)
+        return _linearise(_Seen.of(scene, view, problem.settings), problem.mesh, group.targets.shape[-1], factors)
 
-    return lax.map(one, (group.scenes, view))
-
-
-def moved_each(scenes: Scene, view: View) -> Scene:
-    """Stacked scenes with their lights and cameras `moved`."""
-    if not jax.tree.leaves(view):
-        return scenes
-    found = lax.map(lambda seen: moved(*seen), (scenes.lights, scenes.camera, view))
-    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), scenes, found)
+    return lax.map(one, (group.scenes, problem.moves(unknowns, group)))
 
 
 class _Seen(NamedTuple):

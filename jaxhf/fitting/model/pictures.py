@@ -17,9 +17,11 @@ from ...core.settings import Settings
 from ...core.types import AnyArray
 from ...preparation.localise import localise
 from ...preparation.world import resolve_settings
+from ...scene.light import Sun
 from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
+from ...shade.radiance import has_mirrors
 from ..given import Noise, has_detector, noise_of_each
 from .view import KNOWN, View, with_numbers
 
@@ -59,6 +61,17 @@ class Group(eqx.Module):
         material whose numbers are moved."""
         scene = with_material(_with_heights(eqx.combine(scene, self.shared), heights), numbers)
         return scene if factors is None else with_albedo(scene, factors)
+
+
+def can_be_linearised(scene: Scene, settings: Settings) -> bool:
+    """Whether each sample depends on one triangle alone: where no mirror shows another one, and none makes a penumbra.
+
+    How much of a `Sky` with `occlusion` the terrain hides is taken as it is at each step, without its derivative: it changes
+    slowly, and points on edges are worth more.
+    """
+    if any(isinstance(light, Sun) for light in scene.lights):
+        return False
+    return not has_mirrors((obj.material for obj in scene.objects), settings)
 
 
 def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> None:

@@ -73,6 +73,11 @@ class Problem(eqx.Module):
         """What the albedo is multiplied by; None where it is known."""
         return unknowns.albedo if self.albedo is None or unknowns.albedo is None else self.albedo.factors(unknowns.albedo)
 
+    def moves(self, unknowns: Unknowns, group: Group) -> View:
+        """By what the light and the camera of each picture of a group are `moved`."""
+        which = np.array(group.indices)  # what pictures share has one row for all
+        return jax.tree.map(lambda values, unit: values[which % len(values)] * unit[None], unknowns.view, self.view_unit)
+
     @property
     def least_noise(self) -> Float[np.ndarray, " pictures"]:
         """Below which no estimate of the noise may fall."""

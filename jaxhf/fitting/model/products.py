@@ -5,17 +5,17 @@ import math
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.sharding import Mesh
 from jaxtyping import Float, Int
 
 from ...core.autodiff import with_tangent
-from ...core.settings import Settings
 from ...preparation.world import World, make_world, resolve_settings
 from ...rendering.samples import PictureSamples
 from ...scene.scene import Scene
 from ...xla.devices import on_every_device, over_spread
 from .linearise import Linearised, LinearisedEdges, SampleRows
 from .pictures import Group
+from .problem import Problem
+from .surface import Unknowns
 from .view import View
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
@@ -24,16 +24,11 @@ _LEAST_FACTOR = 1e-6  # of an albedo, about which a relative change is taken
 
 
 def picture_each(
-    known: Linearised,
-    group: Group,
-    heights: Float[jax.Array, "ny nx"],
-    settings: Settings,
-    mesh: Mesh,
-    view: View,
-    factors: Float[jax.Array, "ty tx k"] | None,
+    known: Linearised, group: Group, heights: Float[jax.Array, "ny nx"], unknowns: Unknowns, problem: Problem
 ) -> Float[jax.Array, "n h w c"]:
     """The pictures that are known, with their derivatives in the heights, in what moves lights and cameras, and in the albedo's
-    factors, whose values must be those at which `linearise_each` was called."""
+    factors; all of these must have the values at which `linearise_each` was called."""
+    settings, mesh, view, factors = problem.settings, problem.mesh, problem.moves(unknowns, group), problem.factors(unknowns)
 
     def values(scene: Scene) -> Float[jax.Array, "vertices n"]:
         return vertex_values(make_world(on_every_device(group.complete(scene, heights, factors), mesh), settings))
@@ -46,7 +41,10 @@ def picture_each(
         at_vertices = each.reshape(-1, each.shape[-1])
     else:
         at_vertices, first = values(jax.tree.map(lambda leaf: leaf[0], scenes)), jnp.int32(0)
-    relative = None if factors is None else factors / _apart_from_zero(lax.stop_gradient(factors))
+    relative = None
+    if factors is not None:
+        here = lax.stop_gradient(factors)
+        relative = factors / jnp.where(jnp.abs(here) < _LEAST_FACTOR, _LEAST_FACTOR, here)
     # All pictures at once: a loop over them would copy what it reads of each.
     of_samples = over_spread(mesh, _of_samples, (at_vertices, first, view, relative), known.samples)
     light = None
@@ -133,7 +131,3 @@ def _with_view(change: Float[jax.Array, "chunks n c"], slopes: View, numbers: Vi
         for k in range(values.shape[0]):
             change = change + jnp.moveaxis(slope[:, :, k] * values[k], 1, -1)
     return change
-
-
-def _apart_from_zero(factors: Float[jax.Array, "..."]) -> Float[jax.Array, "..."]:
-    return jnp.where(jnp.abs(factors) < _LEAST_FACTOR, _LEAST_FACTOR, factors)

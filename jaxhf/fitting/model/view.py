@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Float
 
 from ...core.affine import affine
@@ -73,6 +74,14 @@ def moved(lights: tuple[Light, ...], camera: Camera, view: View) -> tuple[tuple[
         matrix = jnp.asarray(camera.world_from_camera).at[:3].set(jnp.stack(columns, axis=1))
         camera = eqx.tree_at(lambda camera: camera.world_from_camera, camera, matrix)
     return lights, camera
+
+
+def moved_each(scenes: Scene, view: View) -> Scene:
+    """Stacked scenes with their lights and cameras `moved`."""
+    if not jax.tree.leaves(view):
+        return scenes
+    found = lax.map(lambda seen: moved(*seen), (scenes.lights, scenes.camera, view))
+    return eqx.tree_at(lambda scenes: (scenes.lights, scenes.camera), scenes, found)
 
 
 def _brighter(sky: Sky, times: Any) -> Sky:

@@ -137,10 +137,9 @@ def first_position(expansion: Expansion) -> Any:
     """
 
     def first(expansion: Expansion) -> Any:
-        others = expansion.unknowns.without_modes()
-        solver, about = LevenbergMarquardt(0, others), (expansion.problem, expansion.linearised)
-        shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, about)
-        return solver.init(residuals, expansion.unknowns, about, _OPTIONS, shape, None, _TAGS)
+        solver = LevenbergMarquardt(0, expansion.unknowns.without_modes())
+        shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, expansion)
+        return solver.init(residuals, expansion.unknowns, expansion, _OPTIONS, shape, None, _TAGS)
 
     return eqx.filter_eval_shape(first, expansion)
 
@@ -191,7 +190,7 @@ def _advance(
     solver, unknowns, rest, expansion = kept
     problem, position = expansion.problem, eqx.combine(of_j, rest)
     with jax.numpy_dtype_promotion("standard"):
-        new, state, _ = solver.step(residuals, unknowns, (problem, expansion.linearised), _OPTIONS, position, _TAGS)
+        new, state, _ = solver.step(residuals, unknowns, expansion, _OPTIONS, position, _TAGS)
     step = jax.tree.map(lambda to, here: to - here, state.y_eval, new)
     moved = problem.basis.heights(new.coefficients) - problem.basis.heights(unknowns.coefficients)
     outcome = Outcome(
