@@ -1,5 +1,6 @@
 """A part of a terrain and of its pictures, for a fit of that part within the terrain that goes on around it."""
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
@@ -67,23 +68,18 @@ def surroundings(scenes: Sequence[Scene], heights: tuple[float, float], windows:
     """For each window of a terrain the part of it that may hide the window from a light or a camera, all of one size.
 
     Beyond it all rays from the window to lights and cameras are above the highest height. Where light comes from all around, or
-    a mirror shows any place, it is the whole terrain.
-
-    Args:
-      heights: the lowest and the highest that the terrain may have, in its own frame.
+    a mirror shows any place, it is the whole terrain. `heights`: the lowest and the highest that it may have, in its own frame.
     """
     field = scenes[0].heightfields[0]
     shape, steps = np.array(field.heights.shape), np.array([field.dy, field.dx])
     low, high = heights
     ends = []  # of each window: first and last row and column
     for window in windows:
-        first = np.array([window.y, window.x])
-        last = np.array([window.y + window.ny - 1, window.x + window.nx - 1])
-        corners = np.array([[y, x] for y in (first[0], last[0]) for x in (first[1], last[1])])
-        ends.append([corners.min(0), corners.max(0)])
-        for scene in scenes:
-            for end in _ends_of_rays(scene, corners * steps, low, high):
-                ends[-1] = [np.minimum(ends[-1][0], end.min(0) / steps), np.maximum(ends[-1][1], end.max(0) / steps)]
+        rows, columns = (window.y, window.y + window.ny - 1), (window.x, window.x + window.nx - 1)
+        corners = np.array(list(itertools.product(rows, columns)))
+        rays = [end / steps for scene in scenes for end in _ends_of_rays(scene, corners * steps, low, high)]
+        reached = np.concatenate([corners, *rays])
+        ends.append([reached.min(0), reached.max(0)])
     first, last = np.moveaxis(np.array(ends), 1, 0)
     first, last = (np.clip(found, 0, shape - 1) for found in (np.floor(first) - _MARGIN, np.ceil(last) + _MARGIN))
     size = (last - first).max(0).astype(int) + 1

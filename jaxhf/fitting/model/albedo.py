@@ -8,7 +8,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .surface import dct_matrix
+from .surface import dct_matrix, laplacian
 
 
 class AlbedoField(eqx.Module):
@@ -45,8 +45,7 @@ def make_albedo_field(shape: tuple[int, ...], spacing: tuple[float, ...], std: f
     That is Matérn's of smoothness 1/2, as patches with sharp borders have it; heights are smoother. The amplitudes of its modes
     go as (1 + (length · frequency)²)^(-3/4).
     """
-    steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, spacing, strict=True)]
-    amplitude = (1 + length**2 * (steps[0][:, None] + steps[1][None, :])) ** -0.75
+    amplitude = (1 + length**2 * laplacian(shape, spacing)) ** -0.75
     amplitude = std * amplitude / np.sqrt(np.sum(amplitude**2))  # the squares of all modes add up to the field's variance
     rows, columns = (jnp.asarray(np.sqrt(n) * dct_matrix(n), dtype) for n in shape)
     return AlbedoField(rows, columns, jnp.asarray(1 / amplitude[:, :, None], dtype))

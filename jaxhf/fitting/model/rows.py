@@ -156,13 +156,8 @@ def _slopes(heights: Float[Array, "ny nx"], unknowns: Unknowns, problem: Problem
 def _vertices_by_heights(
     slopes: Float[np.ndarray, "9 vertices m"], scene: Scene, near: Bool[np.ndarray, "ny nx"] | None
 ) -> Sparse:
-    """The derivative of what stands at the vertices, number by number, in the heights; that beyond the last stays.
-
-    Args:
-      slopes: `_slopes`.
-      scene: whose first heightfield it is.
-      near: which vertices matter; None: all.
-    """
+    """The derivative of what stands at the vertices, number by number, in the heights, by `_slopes`; that beyond the last
+    stays. `near`: which vertices of the scene's first heightfield matter; None: all."""
     numbers, (ny, nx) = slopes.shape[2], scene.heightfields[0].heights.shape[-2:]
     chosen = np.arange(ny * nx) if near is None else np.flatnonzero(near)
     at = np.divmod(chosen, nx)

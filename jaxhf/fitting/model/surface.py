@@ -1,6 +1,7 @@
 """What a fit varies: the DCT modes of a surface, and what else is unknown about the pictures."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -131,15 +132,8 @@ def make_basis(
     cutoff: float = 1.0,
     free: Any = None,
 ) -> Basis:
-    """The modes up to a share `cutoff` of the highest frequency, about `base`.
-
-    Args:
-      field: whose heights they are; only their shape and precision count.
-      base: may be padded, see `pad`.
-      units: the height of each mode whose coefficient is 1.
-      cutoff: modes above are not varied; nor is the mean of all heights, unless it is 1.
-      free: see `Basis`.
-    """
+    """The modes up to a share `cutoff` of the highest frequency about `base`, which may be padded; without the mean of all
+    heights, unless the share is 1. `units`: the height of each mode whose coefficient is 1; `free`: see `Basis`."""
     (ny, nx), dtype = base.shape, field.heights.dtype
     padding = ((ny - field.heights.shape[0]) // 2, (nx - field.heights.shape[1]) // 2)
     varied = (np.arange(ny)[:, None] < max(2, cutoff * ny)) & (np.arange(nx)[None, :] < max(2, cutoff * nx))
@@ -176,6 +170,12 @@ def dct_matrix(n: int) -> Float[np.ndarray, "n n"]:
     matrix = np.sqrt(2 / n) * np.cos(np.pi / n * k[:, None] * (k[None, :] + 0.5))
     matrix[0] /= np.sqrt(2)
     return matrix
+
+
+def laplacian(shape: tuple[int, ...], spacing: Sequence[float]) -> Float[np.ndarray, "my mx"]:
+    """Minus the Laplacian of each DCT mode over that mode, the Laplacian being that of second differences; spacing (y, x)."""
+    y, x = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, spacing, strict=True)]
+    return y[:, None] + x[None, :]
 
 
 def make_heights(owner: str, name: str, value: Any, field: Heightfield) -> Float[np.ndarray, "ny nx"]:

@@ -13,7 +13,7 @@ from ...core.precision import numbers
 from ...scene.heightfield import Heightfield
 from ..given import Prior, Unknown
 from .albedo import AlbedoField
-from .surface import Basis, Unknowns, dct_matrix, make_heights, pad, padding, slope_units
+from .surface import Basis, Unknowns, dct_matrix, laplacian, make_heights, pad, padding, slope_units
 from .view import View
 
 
@@ -119,7 +119,7 @@ def _prior_term(field: Heightfield, prior: Prior) -> Term:
         weight = np.where(std > 0, 1 / std, 0)
     spectrum = np.ones(mean.shape)
     if prior.length is not None:
-        spectrum = _whittle(field, mean.shape, prior.length)
+        spectrum = 1 + prior.length**2 * laplacian(mean.shape, (field.dy, field.dx))  # Whittle's
         rows, columns = (dct_matrix(n) ** 2 for n in mean.shape)
         weight = pad(np.broadcast_to(weight, shape), border) * np.sqrt(rows.T @ spectrum**-2 @ columns)
     return Term(*(jnp.asarray(values, dtype) for values in (mean, weight, spectrum)))
@@ -136,9 +136,3 @@ def _require_plausible(field: Heightfield, length: float) -> None:
             f"must lie from one cell to the terrain's longer side, {cell:.6g} to {side:.6g}; it is {length:.6g}, or "
             f"{length / cell:.3g} cells. It is in the unit of dx and dy: {length:.6g} cells would be {length * cell:.6g}",
         )
-
-
-def _whittle(field: Heightfield, shape: tuple[int, ...], length: float) -> Float[np.ndarray, "my mx"]:
-    """1 - length² · Laplacian of each DCT mode, the Laplacian being that of second differences."""
-    steps = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, (field.dy, field.dx), strict=True)]
-    return 1 + length**2 * (steps[0][:, None] + steps[1][None, :])

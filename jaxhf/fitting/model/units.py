@@ -38,11 +38,8 @@ def _balanced_units(
     """Units of the modes in which the loss has the same curvature along each of them, and that curvature.
 
     It is the median of those in units of one slope. Along the mean of all heights, which pictures hardly show, the curvature in
-    units of one slope is ten thousand times less than along other modes.
-
-    Args:
-      units: `slope_units`.
-      curvature: of the loss along each mode, for a mode of unit height; 0: unknown.
+    units of one slope is ten thousand times less than along other modes. `units`: `slope_units`; `curvature`: of the loss, for
+    modes of unit height, 0 where it is unknown.
     """
     per_slope = curvature * units**2
     if not (per_slope > 0).any():
@@ -55,10 +52,8 @@ def _balanced_units(
 def mode_curvature(problem: Problem, gradients: Float[np.ndarray, "k ny nx"]) -> Float[np.ndarray, "my mx"]:
     """The curvature of the loss along each DCT mode of unit height.
 
-    That of the pictures, the diagonal of JᵀJ, is the mean square of Jᵀz over draws of z, and over neighbouring modes; in that
-    of the prior, weights count by their mean square.
-
-    `gradients`: Jᵀz in the heights, see `Expansion.random_gradients`.
+    That of the pictures, the diagonal of JᵀJ, is the mean square of the `random_gradients` Jᵀz over draws of z, and over
+    neighbouring modes; in that of the prior, weights count by their mean square.
     """
     basis, term = problem.basis, problem.terms.surface
     rows, columns = np.asarray(basis.rows, np.float64), np.asarray(basis.columns, np.float64)

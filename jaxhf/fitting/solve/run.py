@@ -202,10 +202,8 @@ def _estimated(here: Expansion, state: State, order: Sequence[Stage], repeats: b
     """The state with what the next stage takes for the noise of each picture, where none is given, for how heights vary, where
     their prior does not say how its errors hang together, and for the loss's scale; unchanged where it would hardly change.
 
-    Args:
-      here: where the stage before ended.
-      order: of all stages.
-      repeats: whether the same modes were varied before; if not, what is left is mostly for shorter ones to explain.
+    By what the stage before left, `here`. If it did not vary the same modes (`repeats`), that is mostly for shorter ones to
+    explain.
     """
     stage, posed, spread = order[state.stage + 1], here.problem, spreads(here)
     before = Estimate(state.noise, state.widths)

@@ -117,10 +117,8 @@ def load_state(path: Path, like: State, fingerprint: str) -> State:
 def fingerprint(problem: Problem, unknowns: Unknowns, given: Given) -> str:
     """A hash of all that decides on the steps: fits of the same fingerprint take the same ones, in whatever process.
 
-    Args:
-      problem, unknowns: those at the start; the structure of their pytrees says of what classes and sizes all parts are, and
-        how many samples a scene asks for. The mesh does not count: another machine may go on.
-      given: for what is not in the problem.
+    The structure of the problem and the unknowns at the start says of what classes and sizes all parts are, and how many
+    samples a scene asks for. The mesh does not count: another machine may go on.
     """
     parts = {field.name: getattr(problem, field.name) for field in dataclasses.fields(problem) if field.name != "mesh"}
     settings = parts.pop("settings")

@@ -158,12 +158,10 @@ def position_at(form: Any, unknowns: Unknowns, step_size: Float[Array, ""]) -> A
 def advance(
     unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int
 ) -> tuple[Unknowns, Any, Outcome]:
-    """One step: new unknowns, which are the old ones if the step is rejected, optimistix's new state, and what it did.
+    """One step from the last one's unknowns and optimistix's state, with the expansion at `position.y_eval`, after so many
+    rejections in a row: new unknowns, which are the old ones if it is rejected, a new state, and what it did.
 
-    Args:
-      unknowns, position: of the step before. What the state holds of J makes room for that of the new one: it is gone.
-      expansion: at `position.y_eval`.
-      rejections: how many steps before were rejected in a row.
+    What the old state holds of J makes room for that of the new one: it is gone.
     """
     exactly = (_TOLERANCE, _ITERATIONS) if expansion.problem.albedo is None else (_FIELD_TOLERANCE, _FIELD_ITERATIONS)
     solver = LevenbergMarquardt(rejections, others, exactly)

@@ -45,11 +45,8 @@ class Boundaries:
     def displacements(
         self, response: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
     ) -> tuple[float, list[Float[np.ndarray, "ny nx"]]]:
-        """τ, and draws of what that makes of the heights; none where it is 0.
-
-        Args:
-          response: from an error of the pictures, in units of their noise, to that of the heights and to what is left of it.
-        """
+        """τ, and draws of what that makes of the heights; none where it is 0. `response` takes an error of the pictures, in
+        units of their noise, to that of the heights and to what is left of it."""
         if self.rows.size == 0 or self._size(self.residuals, 0.0) <= self._mean_size(self.left, 0.0):
             return 0.0, []
         heights, moved = [], []

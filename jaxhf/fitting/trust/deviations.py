@@ -78,7 +78,6 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
     if boundaries is not None:
 
         def response(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            """What an error of the pictures, in units of their noise, makes of the heights, and what is left of it."""
             alone = Noise(matrix.roots * error, np.zeros(matrix.shape), np.zeros_like(matrix.others_weight))
             change = matrix.solved(matrix.gathered(alone), tolerance)
             return matrix.heights_of(change), error - matrix.seen(change) / matrix.roots
@@ -97,11 +96,8 @@ def with_unexplained(
     An M-estimate's covariance is f² (JᵀWJ)⁻¹, with f² = N / (N - p) · mean(ψ²) · mean(w) / mean(ψ')² over the N residuals r in
     units of the noise, ψ = ρ', w = ψ / r, p unknowns (Huber, Robust statistics, 1981, section 7.6; for least squares it is
     chi2 by degree of freedom, Birge's ratio squared, Physical Review 40, 207, 1932). The noise is multiplied by f, the scale of
-    the loss divided, so that W stays; the prior keeps its own deviations.
-
-    Args:
-      residuals: of the pictures, in units of the noise, without those of a background that is explained.
-      free: (N - p) / N, see `Freedom`; None: p is how many heights there are.
+    the loss divided, so that W stays; the prior keeps its own deviations. A background that is explained has no part in the
+    residuals. `free`: (N - p) / N, see `Freedom`; None: p is how many heights there are.
     """
     problem = expansion.problem
     if len(residuals) == 0:

@@ -234,11 +234,8 @@ def misfit_of_length(problem: Problem, given: Given) -> str | None:
 
 
 def shows_mean(gradients: Float[np.ndarray, "k ny nx"]) -> bool:
-    """Whether pictures change as all heights move up together; orthophotos do not.
-
-    Args:
-      gradients: Jᵀz for normal z, see `Expansion.random_gradients`: their sums are normal, with the deviation |J 1|.
-    """
+    """Whether pictures change as all heights move up together; orthophotos do not. The sums of `random_gradients` are normal,
+    with the deviation |J 1|."""
     sums = gradients.sum(axis=(1, 2))
     return float(np.linalg.norm(sums)) > _RELATIVE * float(np.linalg.norm(gradients))
 
@@ -291,12 +288,7 @@ def _light_vector(scene: Scene) -> Float[np.ndarray, "3"]:
 
 
 def why_noise_is_unsure(problem: Problem, unknowns: int, freedom: Freedom | None) -> str | None:
-    """Why an estimate of the noise may be too small, in words; None: it is sure.
-
-    Args:
-      unknowns: how many numbers were sought.
-      freedom: None: it is not known.
-    """
+    """Why an estimate of the noise beside so many unknown numbers may be too small, in words; None: it is sure."""
     if freedom is not None:
         worst = int(np.argmax(freedom.explained))
         if freedom.explained[worst] <= _MOST_EXPLAINED:
@@ -318,10 +310,7 @@ def chi_squared(
     about its residual from the fit to all other values; times 1 - h, that has the size of the residual by least squares (Cook
     and Weisberg, Residuals and influence in regression, 1982, section 2.2).
 
-    Args:
-      residuals: in units of the noise, picture after picture.
-      counts: how many of them each picture has.
-      freedom: None: heights are few, and explain nothing of the noise.
+    `counts`: how many of the residuals each picture has. Without `freedom` heights are few, and explain nothing of the noise.
     """
     if residuals.size == 0 or freedom is None:
         return (float(np.mean(residuals**2)) if residuals.size else 0.0), None

@@ -44,11 +44,8 @@ class Region(NamedTuple):
 
 
 def worst_regions(residuals: Sequence[Float[np.ndarray, "h w c"]]) -> tuple[Region, ...]:
-    """The three blocks, of a sixteenth of a picture's side, with the largest residuals; they do not overlap.
-
-    Args:
-      residuals: of each picture, in standard deviations of the noise; 0 where a pixel does not count.
-    """
+    """The three blocks, of a sixteenth of a picture's side, with the largest residuals, 0 where a pixel does not count; they do
+    not overlap."""
     found = []
     for number, residual in enumerate(residuals):
         squares = np.mean(np.square(residual, dtype=np.float64), axis=-1)
