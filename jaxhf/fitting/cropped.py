@@ -20,33 +20,12 @@ from ..scene.light import Directional, Point, Sky, Sun
 from ..scene.material import Mirror, map_textures
 from ..scene.scene import Object, Scene
 from ..scene.texture import ImageTexture
+from .model.surface import Window
 
 _MARGIN = 2  # cells from the rim, where normals lack their neighbours; and pixels that a moving rim may come to
 _LEAST_SIDE = 16  # of a picture, pixels
 
 ndimage: Any = scipy.ndimage  # whose stubs miss much
-
-
-class Window(NamedTuple):
-    """Heights of a terrain: ny rows from row y on, nx columns from column x on."""
-
-    y: int
-    x: int
-    ny: int
-    nx: int
-
-    @property
-    def place(self) -> tuple[slice, slice]:
-        return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
-
-    def rim(self, shape: tuple[int, ...], depth: int) -> Bool[np.ndarray, "ny nx"]:
-        """Where it is at most so many vertices from a side beyond which a terrain of that shape goes on."""
-        found = np.zeros((self.ny, self.nx), bool)
-        found[:depth] |= self.y > 0
-        found[self.ny - depth :] |= self.y + self.ny < shape[0]
-        found[:, :depth] |= self.x > 0
-        found[:, self.nx - depth :] |= self.x + self.nx < shape[1]
-        return found
 
 
 class Seen(NamedTuple):

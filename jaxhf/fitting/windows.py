@@ -17,13 +17,13 @@ from ..core.settings import Settings
 from ..io.checkpoint import load_arrays, load_facts_of, save_checkpoint
 from ..preparation.localise import localise
 from ..scene.scene import Scene
-from .cropped import Seen, Window, cropped, surroundings
+from .cropped import Seen, cropped, surroundings
 from .fit import fit
 from .given import Checkpoint, Prior
 from .history import Draws, Step
 from .model.defaults import EDGE_SAMPLES, choose_edge_samples, choose_samples
 from .model.pictures import checked_pictures
-from .model.surface import make_heights, with_seam
+from .model.surface import Window, make_heights, with_seam
 from .solve.state import digest
 from .trust.judge import Fit
 

@@ -18,6 +18,7 @@ from jaxhf.fitting.model.linearise import LinearisedEdges
 from jaxhf.fitting.model.near_inverse import near_inverse
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
 from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
+from jaxhf.fitting.model.surface import Window
 from jaxhf.fitting.trust.boundaries import Boundaries
 from jaxhf.fitting.trust.deviations import standard_deviations
 
@@ -66,27 +67,27 @@ def test_it_is_the_square_of_the_derivative(prior, rounding):
         assert np.count_nonzero(~free) == (0 if "held" not in prior else np.count_nonzero(matrix.free == 0))
 
 
-PLACE = (slice(0, 8), slice(4, 12))
+WINDOW = Window(0, 4, 8, 8)
 
 
 @pytest.mark.parametrize("prior", ["correlated", "independent, some held"])
 def test_a_part_of_the_pictures_depends_on_a_part_of_the_heights(prior):
     """On no others, and as all pictures do; so do its products, but for the prior of heights beyond."""
     here = expanded(scenes(TRUTH), pictures(), prior=PRIORS[prior], **OPTIONS)
-    whole, (part, values) = pictures_by_heights(here), part_by_heights(here, PLACE)
+    whole, (part, values) = pictures_by_heights(here), part_by_heights(here, WINDOW)
     assert whole is not None
     inside = np.zeros(TRUTH.shape, bool)
-    inside[PLACE] = True
+    inside[WINDOW.place] = True
     rows = whole.toarray()[values]
     assert not rows[:, ~inside.ravel()].any()
     np.testing.assert_array_equal(part.toarray(), rows[:, inside.ravel()])
     # All that is seen of these cells but the outermost: a picture shows 12 x 12 vertices in 24 x 24 pixels.
     assert values.size > 0.6 * VALUES * (7 * 7) / (11 * 11)
     roots = np.random.default_rng(1).uniform(0.5, 1.0, VALUES)
-    matrix = NormalMatrix(here, roots[values], part, PLACE)
+    matrix = NormalMatrix(here, roots[values], part, WINDOW)
     x = np.zeros(here.problem.basis.base.shape)
     change = np.random.default_rng(0).standard_normal(matrix.shape)
-    here.problem.basis.crop(x)[PLACE] = change
+    here.problem.basis.crop(x)[WINDOW.place] = change
     np.testing.assert_allclose(matrix.seen(change.ravel()), NormalMatrix(here, roots, whole).seen(x.ravel())[values])
     matrix.inverse = near_inverse(matrix)
     right = matrix.gathered(matrix.drawn(0))

@@ -7,8 +7,8 @@ import pytest
 
 import jaxhf
 from jaxhf.fitting import windows as _windows
-from jaxhf.fitting.cropped import Window, _fields, cropped, surroundings
-from jaxhf.fitting.model.surface import with_seam
+from jaxhf.fitting.cropped import _fields, cropped, surroundings
+from jaxhf.fitting.model.surface import Window, with_seam
 from jaxhf.fitting.windows import divided, fit_windows
 from jaxhf.scene.procedural import fractal
 

@@ -14,13 +14,11 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from .expansion import Expansion, surface_of
-from .surface import Unknowns
+from .surface import Unknowns, Window
 
 linalg: Any = scipy.sparse.linalg  # whose stubs miss much
 fft: Any = scipy.fft
 Flat = Float[np.ndarray, " n"]
-Place = tuple[slice, slice]
-"""Rows and columns of heights, without padding."""
 MOST_OTHERS = 64
 """Unknowns besides heights whose columns of J are kept, and that are eliminated."""
 _MOST_ITERATIONS = 300
@@ -46,17 +44,17 @@ class NormalMatrix:
       expansion: all of whose modes are varied.
       roots: of the weights of the pictures' residuals, flat as `in_row`.
       rows: `pictures_by_heights` there, with which products take a tenth of the time; None: by JAX.
-      place: of heights without padding, whose `part_by_heights` rows and roots are: all else counts as known.
+      window: whose `part_by_heights` rows and roots are: all else counts as known.
     """
 
-    def __init__(self, expansion: Expansion, roots: Float[np.ndarray, " rows"], rows: Any = None, place: Place | None = None):
+    def __init__(self, expansion: Expansion, roots: Float[np.ndarray, " rows"], rows: Any = None, window: Window | None = None):
         self.expansion, self.roots, self.rows = expansion, roots, rows
         self.inverse: Callable[[Flat], Flat] = self._by_modes
         unknowns, basis, terms = expansion.unknowns, expansion.problem.basis, expansion.problem.terms
 
         def here(values: Any) -> Float[np.ndarray, "..."]:
             values = np.asarray(values, np.float64)
-            return values if place is None or values.ndim == 0 else basis.crop(values)[place]
+            return values if window is None or values.ndim == 0 else basis.crop(values)[window.place]
 
         self.weight, self.free = here(terms.surface.weight), here(1.0 if basis.free is None else basis.free)
         self.off = here(surface_of(unknowns, basis)) - here(terms.surface.mean)
@@ -64,7 +62,7 @@ class NormalMatrix:
         self.shape, self.dtype = self.off.shape, unknowns.coefficients.dtype
         self.inside = np.asarray(basis.crop(np.arange(self.off.size).reshape(self.shape))).ravel()
         sought, besides = unknowns.without_modes(), terms.others(unknowns)
-        if place is not None:
+        if window is not None:
             # That of a part of a terrain has the density of the whole one's modes.
             at = [np.arange(n) * (m / n) for n, m in zip(self.shape, self.spectrum.shape, strict=True)]
             at = np.meshgrid(*at, indexing="ij")

@@ -21,11 +21,10 @@ from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, on_host
 from .expansion import Expansion
-from .normal_matrix import Place
 from .pictures import Group
 from .problem import Problem
 from .products import vertex_values
-from .surface import Unknowns
+from .surface import Unknowns, Window
 
 sp: Any = scipy.sparse  # whose stubs miss much
 Sparse = Any
@@ -69,21 +68,19 @@ def first_vertices(expansion: Expansion) -> Int[np.ndarray, " rows"]:
     return np.concatenate([part.ravel() for part in found])
 
 
-def _inside(shape: tuple[int, ...], place: Place, rim: int) -> Bool[np.ndarray, "ny nx"]:
+def _inside(shape: tuple[int, ...], window: Window, rim: int) -> Bool[np.ndarray, "ny nx"]:
     """Which heights are these, without so many at sides beyond which the terrain goes on."""
-    pairs = zip(place, shape, strict=True)
-    rows, columns = (slice(side.start + rim * (side.start > 0), side.stop - rim * (side.stop < n)) for side, n in pairs)
     found = np.zeros(shape, bool)
-    found[rows, columns] = True
+    found[window.place] = ~window.rim(shape, rim)
     return found
 
 
-def part_by_heights(expansion: Expansion, place: Place | None) -> tuple[Sparse, Int[np.ndarray, " rows"]]:
+def part_by_heights(expansion: Expansion, window: Window | None) -> tuple[Sparse, Int[np.ndarray, " rows"]]:
     """The derivative in such heights, as that of `pictures_by_heights`, of the values that depend on no others, but for those
     of pixels that a boundary crosses; and these values' places in the order of `in_row`, rising. None: of all."""
     problem, heights = expansion.problem, expansion.heights
     slopes = _slopes(*on_every_device((heights, expansion.unknowns, problem), problem.mesh))
-    near, core = (None if place is None else _inside(heights.shape, place, rim) for rim in (0, 1))
+    near, core = (None if window is None else _inside(heights.shape, window, rim) for rim in (0, 1))
     blocks, values, first = [], [], 0
     for group, known, here in zip(problem.groups, expansion.linearised, slopes, strict=True):
         assert known is not None

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ...core.errors import ArgumentError
 from ...core.precision import numbers, require_fit
@@ -56,6 +56,28 @@ class Unknowns(eqx.Module):
     @property
     def count(self) -> int:
         return sum(leaf.size for leaf in jax.tree.leaves(self))
+
+
+class Window(NamedTuple):
+    """Heights of a terrain: ny rows from row y on, nx columns from column x on."""
+
+    y: int
+    x: int
+    ny: int
+    nx: int
+
+    @property
+    def place(self) -> tuple[slice, slice]:
+        return slice(self.y, self.y + self.ny), slice(self.x, self.x + self.nx)
+
+    def rim(self, shape: tuple[int, ...], depth: int) -> Bool[np.ndarray, "ny nx"]:
+        """Where it is at most so many vertices from a side beyond which a terrain of that shape goes on."""
+        found = np.zeros((self.ny, self.nx), bool)
+        found[:depth] |= self.y > 0
+        found[self.ny - depth :] |= self.y + self.ny < shape[0]
+        found[:, :depth] |= self.x > 0
+        found[:, self.nx - depth :] |= self.x + self.nx < shape[1]
+        return found
 
 
 class Basis(eqx.Module):
@@ -173,7 +195,7 @@ def dct_matrix(n: int) -> Float[np.ndarray, "n n"]:
 
 
 def laplacian(shape: tuple[int, ...], spacing: Sequence[float]) -> Float[np.ndarray, "my mx"]:
-    """Minus the Laplacian of each DCT mode over that mode, the Laplacian being that of second differences; spacing (y, x)."""
+    """The eigenvalue of each DCT mode for minus the Laplacian, by second differences over this spacing (y, x)."""
     y, x = [(2 - 2 * np.cos(np.pi * np.arange(n) / n)) / d**2 for n, d in zip(shape, spacing, strict=True)]
     return y[:, None] + x[None, :]
 

@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float, Int
 
 from ..model.expansion import Expansion
 from ..model.near_inverse import near_inverse, normal_matrix
-from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, Place, in_row
+from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row
 from ..model.problem import Problem
 from ..model.rows import can_have_rows, first_vertices, part_by_heights
+from ..model.surface import Window
 
 _FAR = 6.0  # times the median: four standard deviations of normal errors; what is farther off is not explained
 _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
@@ -162,34 +163,31 @@ class Restricted:
 def _told(expansion: Expansion, labels: Labels) -> tuple[Int[np.ndarray, " values"], NormalMatrix]:
     """Which values are to tell the noise, and the normal matrix of their residuals, all of weight 1, with its inverse if there
     is one: of all values or, of many heights, of those that show a block of them, as a part of the data tells it as well."""
-    place, shape = None, expansion.problem.basis.base.shape
+    block, shape = None, expansion.problem.basis.base.shape
     few_others = expansion.unknowns.count - math.prod(shape) <= MOST_OTHERS
     if can_have_rows(expansion) and max(shape) > _MOST_SIDE and few_others:
-        place = _block(expansion, labels)
-    if place is None:
+        block = _block(expansion, labels)
+    if block is None:
         return np.arange(labels.size), normal_matrix(expansion, np.ones(labels.size))
-    rows, values = part_by_heights(expansion, place)
-    matrix = NormalMatrix(expansion, np.ones(values.size), rows, place)
+    rows, values = part_by_heights(expansion, block)
+    matrix = NormalMatrix(expansion, np.ones(values.size), rows, block)
     matrix.inverse = near_inverse(matrix)
     return values, matrix
 
 
-def _block(expansion: Expansion, labels: Labels) -> Place | None:
+def _block(expansion: Expansion, labels: Labels) -> Window | None:
     """Heights that many values show of each picture that tells of its noise; None: there is no block that shows enough."""
     shape, vertices = expansion.problem.field.heights.shape, first_vertices(expansion)
     shown, told = (vertices >= 0) & (labels >= 0), np.unique(labels[labels >= 0])
     y, x = np.divmod(vertices, shape[1])
-    begins = [np.arange(0, max(n - _BLOCK, 0) + 1, _BLOCK // 2) for n in shape]
+    begins = [range(0, max(n - _BLOCK, 0) + 1, _BLOCK // 2) for n in shape]
     best, most = None, _LEAST_TOLD
     for row, column in itertools.product(*begins):
         here = shown & (y >= row) & (y < row + _BLOCK) & (x >= column) & (x < column + _BLOCK)
         least = np.bincount(labels[here], minlength=expansion.problem.count)[told].min(initial=labels.size)
         if least > most:
-            best, most = (row, column), least
-    if best is None:
-        return None
-    row, column = (slice(int(begin), int(min(begin + _BLOCK, n))) for begin, n in zip(best, shape, strict=True))
-    return row, column
+            best, most = Window(row, column, *(min(_BLOCK, n) for n in shape)), least
+    return best
 
 
 class _Simulated(NamedTuple):
