@@ -72,8 +72,8 @@ class SampleRows(NamedTuple):
     """The derivatives of the samples of a picture, chunk by chunk; the last chunk may be there several times.
 
     Attributes:
-      slopes: of each sample, (chunks, c, 3 or 12, samples): in the three heights, then, vertex by vertex, in the normals.
-      vertices: the numbers of those three vertices, (chunks, 3, samples).
+      slopes: k = 3 or 12 of each sample: in the heights of three vertices, then, vertex by vertex, in the normals.
+      vertices: the numbers of those vertices.
       view: in the numbers of the light and of the camera that are sought, see `moved`, (chunks, c, 2 or 6, samples).
       albedo: in the factors of the albedo that are sought; None where it is known.
     """
@@ -85,13 +85,8 @@ class SampleRows(NamedTuple):
 
 
 class AlbedoRows(NamedTuple):
-    """The part of the factors of an albedo.
-
-    Attributes:
-      slopes: derivatives of each sample in the factors' relative changes at four texels, channel by channel of these or,
-        where the picture's share them, of the picture, (chunks, k, 4, samples).
-      texels: their numbers, row by row, (chunks, 4, samples).
-    """
+    """Derivatives of each sample in the relative changes of an albedo's factors at four texels, channel by channel of these or,
+    where the picture's share them, of the picture; and the texels' numbers, row by row."""
 
     slopes: Float[jax.Array, "*n chunks k 4 samples"]
     texels: Int[jax.Array, "*n chunks 4 samples"]
@@ -101,8 +96,7 @@ class LinearisedEdges(eqx.Module):
     """The boundary term's part of a linearised picture.
 
     Attributes:
-      slopes: derivatives of the light in five heights, (chunks, c, 5, size).
-      vertices: the numbers of their vertices, (chunks, 5, size).
+      slopes, vertices: derivatives of the light in five heights, and the numbers of their vertices.
       pixel: which pixel each boundary sample is in; they are numbered row by row.
       kind: 0 where a sample does not count, 1 where its edge is seen where it stands, 2 where its shadow is.
       resampled: the pixels that are resampled, by samples after the picture's.

@@ -79,11 +79,8 @@ def vertex_values(world: World) -> Float[jax.Array, "vertices n"]:
 def _of_samples(
     shared: tuple[Float[jax.Array, "vertices m"], jax.Array, View, Float[jax.Array, "ty tx k"] | None], rows: SampleRows
 ) -> Float[jax.Array, "n chunks samples c"]:
-    """What samples of n pictures change by: their rows times what stands at the vertices, moves light and camera, and is the
-    relative change of the albedo's factors.
-
-    `shared`: these; the second is the number of the first vertex of each picture.
-    """
+    """What samples of n pictures change by: their rows times what they share: what stands at the vertices (and the number of
+    each picture's first one), what moves light and camera, and the relative change of the albedo's factors."""
     at_vertices, first, view, relative = shared
     n, chunks, channels, k, size = rows.slopes.shape
     of_one = at_vertices.shape[0] // (n if first.ndim else 1)

@@ -23,14 +23,8 @@ _TOLERANCE = 1e-3  # of the linear problem
 
 
 class WholeStep(NamedTuple):
-    """The Gauss-Newton step from where an expansion is.
-
-    Attributes:
-      change: of the unknowns.
-      length: of the heights' change, root mean square.
-      predicted: by how much it would lower the loss, were pictures linear.
-      loss: where it begins.
-    """
+    """The Gauss-Newton step from where an expansion is: the change of the unknowns, that of the heights, root mean square, by
+    how much it would lower the loss, were pictures linear, and the loss where it begins."""
 
     change: Unknowns
     length: float

@@ -43,12 +43,8 @@ class Estimate(NamedTuple):
 
 
 class Freedom(NamedTuple):
-    """How much of the noise of each picture a fit leaves, and how much goes into what it seeks.
-
-    Attributes:
-      free: mean square of the residuals that a fit leaves of noise of deviation 1, shape (pictures,).
-      explained: trace of the hat matrix over the number of values, shape (pictures,).
-    """
+    """Of each picture the mean square of what a fit leaves of noise of deviation 1, and how much of the noise goes into what it
+    seeks: the trace of the hat matrix over the number of values."""
 
     free: Float[np.ndarray, " pictures"]
     explained: Float[np.ndarray, " pictures"]
@@ -96,10 +92,8 @@ class Restricted:
         self._rows, self._weights = in_row(expansion.left())[self._values], _weights(expansion.problem)[self._values]
 
     def noise(self, sought: bool, before: Float[np.ndarray, " octaves"]) -> Estimate:
-        """The noise of each picture; where it is not `sought`, only how the heights vary.
-
-        `before`: how many times as wide as its owner said the prior is already.
-        """
+        """The noise of each picture; where it is not `sought`, only how the heights vary. `before`: how many times as wide as
+        its owner said the prior is already."""
         problem, labels, bands = self._expansion.problem, self._labels, octaves(self._matrix.shape)
         widths = np.ones(OCTAVES)
         noise, far, change, draws = problem.noise.copy(), np.zeros(labels.size, bool), None, [None] * _draws(labels)
@@ -191,14 +185,8 @@ def _block(expansion: Expansion, labels: Labels) -> Window | None:
 
 
 class _Simulated(NamedTuple):
-    """A fit to noise.
-
-    Attributes:
-      noise: of deviation 1, in the pictures.
-      left: what it leaves of this noise.
-      told: of each mode of the heights' prior, an estimate of the share that the pictures tell, shape (my, mx).
-      change: what is found of all unknowns.
-    """
+    """A fit to noise of deviation 1 in the pictures: the noise, what is left of it, for each mode of the heights' prior an
+    estimate of the share that the pictures tell, and the change of all unknowns."""
 
     noise: Float[np.ndarray, " rows"]
     left: Float[np.ndarray, " rows"]
@@ -209,10 +197,8 @@ class _Simulated(NamedTuple):
 def _simulated(
     matrix: NormalMatrix, seed: int, widths: float | Float[np.ndarray, "my mx"], begin: Flat | None = None
 ) -> _Simulated:
-    """What is left of noise in a fit of heights that differ from their prior by so many times its deviations.
-
-    `begin`: what was found in a problem like this one.
-    """
+    """What is left of noise in a fit of heights that differ from their prior by so many times its deviations; `begin`: the
+    change in a problem like this one."""
     noise = matrix.drawn(seed, widths)
     change = matrix.solved(matrix.gathered(noise), _TOLERANCE, begin)
     left = noise.pictures - matrix.seen(change)

@@ -36,13 +36,8 @@ class Ended(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """What belongs to a `State` and follows from it, so that no checkpoint holds it.
-
-    Attributes:
-      expansion: of the problem of its stage, at its unknowns.
-      position: optimistix's state; None where the stage's steps are by factors.
-      whole_step: from the expansion, where they are.
-    """
+    """What belongs to a `State` and follows from it, so that no checkpoint holds it: the expansion at its unknowns, and
+    optimistix's state or, where the stage's steps are by factors, the step from there."""
 
     expansion: Expansion
     position: Any = None

@@ -32,12 +32,9 @@ class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
     """The step argmin |J d + r|² + λ |d|², as far as it is needed: an inexact Newton method (Eisenstat and Walker, SIAM
     Journal on Scientific Computing 17, 16, 1996).
 
-    The modes have balanced units, which is Jacobi's preconditioner; of the other unknowns it is divided by their curvature.
-
-    Attributes:
-      tolerance: of the gradient of the damped model, as a share of that at the beginning.
-      iterations: at most.
-      others: the curvature along the unknowns besides the modes, over that along these: what preconditions them.
+    Until the gradient of the damped model is a share `tolerance` of that at the beginning. The modes have balanced units, which
+    is Jacobi's preconditioner; the other unknowns are preconditioned by `others`, the curvature along them over that along the
+    modes.
     """
 
     tolerance: Float[Array, ""]
@@ -108,15 +105,8 @@ def _silent(**_: Any) -> None:
 
 
 class Outcome(NamedTuple):
-    """What one step did.
-
-    Attributes:
-      loss: half the sum of squared residuals at the unknowns.
-      accepted: whether these changed.
-      predicted: by how much the linear model of the next step lowers the loss.
-      step_size: 1 / λ of the next step.
-      change: of the heights, root mean square.
-    """
+    """What one step did: the loss after it, whether it was accepted, by how much the next one is to lower the loss, 1 / λ of
+    that one, and the change of the heights, root mean square."""
 
     loss: Scalar | float
     accepted: Flag | bool

@@ -21,13 +21,8 @@ _NEAR_TOLERANCE = 1e-4  # the same, with an inverse that is near
 
 
 class Deviations(NamedTuple):
-    """See `standard_deviations`.
-
-    Attributes:
-      samples: draws of the heights' errors, shape (draws, ny, nx), height units; fewer than asked for after Ctrl-C.
-      displacement: τ of `Boundaries`, height units; 0 where residuals are as small as the noise says.
-      raised: by which factor, root mean square, that made the deviations larger.
-    """
+    """Draws of the heights' errors, height units, fewer than asked for after Ctrl-C; τ of `Boundaries`, 0 where residuals are
+    as small as the noise says; and by which factor, root mean square, that made the deviations larger."""
 
     samples: Float[np.ndarray, "draws ny nx"]
     displacement: float

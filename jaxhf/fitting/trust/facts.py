@@ -42,14 +42,8 @@ _WIDER = 1.2  # the spread of residuals over the noise, above which that may be 
 
 
 class Left(NamedTuple):
-    """What a fit leaves of one picture.
-
-    Attributes:
-      image: as it would be measured, (h, w, c).
-      residual: in standard deviations of the noise; 0 where it does not count.
-      informing: which values depend on the heights.
-      noise, brightness: see `Problem`.
-    """
+    """A picture as it would be measured, its target, and their difference in standard deviations of the noise, 0 where it does
+    not count; which values depend on the heights; noise and brightness as in `Problem`."""
 
     image: Float[np.ndarray, "h w c"]
     target: Float[np.ndarray, "h w c"]
@@ -77,10 +71,8 @@ def neighbour_correlation(residual: Float[np.ndarray, "h w c"], counts: Bool[np.
 
 
 def unlike_noise(pictures: Sequence[Left], given: Given) -> str | None:
-    """What is left of pictures although it is no noise, in words; None: nothing.
-
-    An estimate of the noise takes it for noise, and chi2 is about 1.
-    """
+    """What is left of pictures although it is no noise, in words; None: nothing. An estimate of the noise takes it for noise,
+    and chi2 is about 1."""
     found = []
     for number, left in enumerate(pictures):
         alike, spread = neighbour_correlation(left.residual, left.informing)

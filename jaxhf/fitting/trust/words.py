@@ -59,12 +59,10 @@ def worst_regions(residuals: Sequence[Float[np.ndarray, "h w c"]]) -> tuple[Regi
 
 
 class Places(NamedTuple):
-    """Where a picture's boundaries are, (h, w) each; where a fit takes no points on edges, `shadows` is None.
+    """The pixels of a picture at the terrain's border and at silhouettes, and those at the edges of shadows.
 
-    Attributes:
-      silhouettes: pixels at the terrain's border and at silhouettes. Without points on edges: beside what does not depend on
-        the heights, be it background or in shadow.
-      shadows: pixels at the edges of shadows.
+    Where a fit takes no points on edges `shadows` is None, and the others are what does not depend on the heights, be it
+    background or in shadow.
     """
 
     silhouettes: Bool[np.ndarray, "h w"]
