@@ -14,7 +14,9 @@ import jaxhf
 from jaxhf.fitting.given import Given
 from jaxhf.fitting.model.expansion import Expansion, expand, prior_residuals
 from jaxhf.fitting.model.normal_matrix import in_row
-from jaxhf.fitting.model.problem import make_problem
+from jaxhf.fitting.model.pictures import checked_pictures
+from jaxhf.fitting.model.problem import Problem, make_problem
+from jaxhf.fitting.model.surface import Unknowns
 from jaxhf.fitting.model.units import balanced
 from jaxhf.scene.procedural import fractal
 
@@ -47,9 +49,15 @@ def given(**options) -> Given:
     return Given(**{**{field.name: known[field.name] for field in dataclasses.fields(Given)}, **defaults, **options})
 
 
+def posed(scenes: Any, targets: Any, given: Given) -> tuple[Problem, Unknowns]:
+    """As `fit` poses it."""
+    targets, weights, noise = checked_pictures(scenes, targets, given.weights, given.noise)
+    return make_problem(scenes, targets, dataclasses.replace(given, weights=weights, noise=noise))
+
+
 def expanded(scenes: list[jaxhf.Scene], targets: list[np.ndarray], **options) -> Expansion:
     """About where a fit starts, in units of one curvature as at its end, but for the errors of samples."""
-    problem, unknowns = make_problem(scenes, targets, given(**options))
+    problem, unknowns = posed(scenes, targets, given(**options))
     here = expand(unknowns, problem)
     scale = jnp.asarray(balanced(here)[0], problem.basis.scale.dtype)
     return here.of(dataclasses.replace(problem, basis=dataclasses.replace(problem.basis, scale=scale)))

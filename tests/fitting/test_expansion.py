@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_fits import SETTINGS, SIZE, TRUTH, expanded, given, rms, scenes
+from small_fits import SETTINGS, SIZE, TRUTH, expanded, given, posed, rms, scenes
 
 import jaxhf
 from jaxhf.fitting.model.expansion import Expansion, expand
 from jaxhf.fitting.model.normal_matrix import in_row
-from jaxhf.fitting.model.problem import make_problem
 from jaxhf.fitting.model.rows import pictures_by_heights
 from jaxhf.fitting.model.surface import Unknowns
 from jaxhf.fitting.model.view import moved
@@ -60,7 +59,7 @@ def moved_expansion(settings: jaxhf.Settings, channels: tuple[int, ...], unknown
     targets = [rng.uniform(0.1, 0.3, (22, camera.width, c)) for camera, c in zip(CAMERAS, channels, strict=False)]
     weights = [rng.uniform(0.5, 2.0, target.shape) for target in targets]
     options = given(settings=settings, unknown=unknown, noise=0.01, weights=weights)
-    problem, unknowns = make_problem([scene_of(k, len(channels) > 1, unknown) for k in range(len(targets))], targets, options)
+    problem, unknowns = posed([scene_of(k, len(channels) > 1, unknown) for k in range(len(targets))], targets, options)
     rng, leaves, tree = np.random.default_rng(7), *jax.tree.flatten(unknowns)
     leaves = [leaf + jnp.asarray(0.02 * rng.standard_normal(leaf.shape), leaf.dtype) for leaf in leaves]
     return expand(jax.tree.unflatten(tree, leaves), problem)

@@ -13,12 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_fits import given
+from small_fits import given, posed
 
 import jaxhf
 from jaxhf.fitting import coarser as _coarser, fit as _fit
 from jaxhf.fitting.model.expansion import Expansion, found_scenes
-from jaxhf.fitting.model.problem import make_problem
 from jaxhf.fitting.solve import run as _run, steps as _steps
 from jaxhf.fitting.solve.state import fingerprint as state_fingerprint
 from jaxhf.fitting.solve.steps import Outcome
@@ -309,7 +308,7 @@ def fingerprint(size=(4, 6), material: jaxhf.Matte | jaxhf.Mirror | None = None,
     terrain = jaxhf.Object(jaxhf.Heightfield(np.zeros((3, 3))), material or jaxhf.Matte(0.5))
     scene = jaxhf.Scene([terrain], camera, [jaxhf.Directional((1, 2, 3))], samples=samples)
     chosen = given(**options)
-    return state_fingerprint(*make_problem([scene], [np.zeros(size)], chosen), chosen)
+    return state_fingerprint(*posed([scene], [np.zeros(size)], chosen), chosen)
 
 
 def test_a_fingerprint_tells_problems_apart_that_hold_the_same_numbers():

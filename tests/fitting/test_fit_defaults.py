@@ -6,14 +6,13 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_fits import CAMERA, SETTINGS, TRUTH, expanded, given, off_in_shape, pictures, scenes
+from small_fits import CAMERA, SETTINGS, TRUTH, expanded, given, off_in_shape, pictures, posed, scenes
 
 import jaxhf
 from jaxhf.fitting.history import Draws
 from jaxhf.fitting.model import defaults as _defaults
 from jaxhf.fitting.model.defaults import choose_edge_samples, choose_samples
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
-from jaxhf.fitting.model.problem import make_problem
 from jaxhf.fitting.solve.noise import spreads
 from jaxhf.fitting.trust.deviations import standard_deviations, with_unexplained
 from jaxhf.fitting.trust.facts import (
@@ -72,7 +71,7 @@ def test_a_grey_picture_with_three_channels_is_one_measurement():
     colour = np.stack([grey[0], 0.5 * grey[0], grey[0]], axis=-1)
     holed = np.where(np.arange(24)[:, None, None] > 2, np.stack(3 * [grey[2]], axis=-1), [0.1, 0.2, np.nan])
     weights = [None, None, np.repeat((np.arange(24) > 2)[:, None], 24, axis=1)]
-    problem, _ = make_problem(scenes(), [colour, np.stack(3 * [grey[1]], axis=-1), holed], given(weights=weights))
+    problem, _ = posed(scenes(), [colour, np.stack(3 * [grey[1]], axis=-1), holed], given(weights=weights))
     channels = {k: group.targets.shape[-1] for group in problem.groups for k in group.indices}
     assert channels == {0: 3, 1: 1, 2: 1}
 
@@ -106,7 +105,7 @@ def test_edges_take_part_where_the_measured_pictures_show_shadows():
     dark = [picture.copy() for picture in pictures()]
     dark[1][:3, :3] = 0.0
     lit, shown, sky = (
-        make_problem(views, measured, given())[0].settings.edge_samples
+        posed(views, measured, given())[0].settings.edge_samples
         for views, measured in (
             (scenes(), pictures()), (scenes(), dark),
             ([scene.with_lights([*scene.lights, jaxhf.Sky(0.1)]) for scene in scenes()], dark),
@@ -116,7 +115,7 @@ def test_edges_take_part_where_the_measured_pictures_show_shadows():
 
 
 def test_the_users_choice_is_kept():
-    problem, _ = make_problem(scenes(), pictures(), given(settings=jaxhf.Settings(samples=9, edge_samples=77)))
+    problem, _ = posed(scenes(), pictures(), given(settings=jaxhf.Settings(samples=9, edge_samples=77)))
     assert (problem.settings.samples, problem.settings.edge_samples) == (9, 77)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.fft
 import scipy.special
-from small_fits import SETTINGS, SIZE, TRUTH, given as given_with, pictures, scenes
+from small_fits import SETTINGS, SIZE, TRUTH, given as given_with, pictures, posed, scenes
 
 import jaxhf
 from jaxhf.core.errors import ArgumentError
@@ -18,7 +18,7 @@ from jaxhf.fitting import fit as _fit
 from jaxhf.fitting.coarser import coarser, factors
 from jaxhf.fitting.model.expansion import prior_residuals
 from jaxhf.fitting.model.pictures import with_albedo
-from jaxhf.fitting.model.problem import Problem, make_problem
+from jaxhf.fitting.model.problem import Problem
 from jaxhf.fitting.model.robust import influence_function, soften
 from jaxhf.fitting.model.surface import make_basis, resample, slope_units
 from jaxhf.fitting.model.terms import make_terms
@@ -35,7 +35,7 @@ def basis_of(field: jaxhf.Heightfield, base: np.ndarray, cutoff: float = 1.0):
 def test_what_is_known_beforehand_counts_in_standard_deviations():
     """The prior at each height in modes of length 1, factors about 1, offsets about 0, and angles in degrees."""
     unknown = jaxhf.Unknown(albedo="constant", albedo_std=0.5, exposures=True, offsets=True, light_std=2.0)
-    problem, unknowns = make_problem(scenes(TRUTH), pictures(), given_with(prior=jaxhf.Prior(TRUTH - 1, 4.0), unknown=unknown))
+    problem, unknowns = posed(scenes(TRUTH), pictures(), given_with(prior=jaxhf.Prior(TRUTH - 1, 4.0), unknown=unknown))
     light = jnp.full((3, 2), np.float32(np.radians(1.0)))
     moved = dataclasses.replace(
         unknowns, albedo=jnp.full((1, 1, 1), 1.5), exposures=jnp.full(3, 1.1), offsets=jnp.full(3, 0.2), view=View(light)
@@ -55,7 +55,7 @@ def test_heights_are_held_where_the_surface_goes_on():
     ring = np.ones((12, 12), bool)
     ring[2:-2, 2:-2] = False
     for prior in (None, jaxhf.Prior(0.2, 0.1)):
-        problem, unknowns = make_problem(within, pictures(), given_with(start=0.3, prior=prior))
+        problem, unknowns = posed(within, pictures(), given_with(start=0.3, prior=prior))
         assert problem.basis.free is not None
         np.testing.assert_array_equal(problem.basis.free, ~ring)
         found = problem.basis.heights(jnp.ones_like(unknowns.coefficients))
@@ -112,7 +112,7 @@ def test_pictures_share_what_is_the_same(factors):
     """And no more: each picture's scene comes out as it was given; the sought heights take no room."""
     texels = np.random.default_rng(0).uniform(0.2, 0.9, (4, 5, 3))
     given = [scenes(albedo=jaxhf.ImageTexture(factor * texels))[k] for k, factor in enumerate(factors)]
-    problem, _ = make_problem(given, [np.zeros((SIZE, SIZE))] * 3, given_with(start=0.0))
+    problem, _ = posed(given, [np.zeros((SIZE, SIZE))] * 3, given_with(start=0.0))
     (group,) = problem.groups
     alike = len(set(factors)) == 1
     stacked, shared = ([leaf.shape for leaf in jax.tree.leaves(part)] for part in (group.scenes, group.shared))
@@ -188,7 +188,7 @@ def test_resampling_keeps_a_plane():
 
 
 def problems_of(*shapes: tuple[int, int]) -> list[Problem]:
-    return [make_problem(scenes(np.zeros(shape)), BLACK, given_with(settings=SETTINGS))[0] for shape in shapes]
+    return [posed(scenes(np.zeros(shape)), BLACK, given_with(settings=SETTINGS))[0] for shape in shapes]
 
 
 def test_stages_double_from_eight_modes():

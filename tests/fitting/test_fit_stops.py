@@ -10,11 +10,10 @@ import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
-from small_fits import SETTINGS as SMALL, SIZE, given as given_with, scenes
+from small_fits import SETTINGS as SMALL, SIZE, given as given_with, posed, scenes
 
 import jaxhf
 from jaxhf.fitting.history import Pace, printed_progress
-from jaxhf.fitting.model.problem import make_problem
 from jaxhf.fitting.model.surface import Unknowns
 from jaxhf.fitting.solve.stages import why_ended
 from jaxhf.fitting.solve.state import first_state
@@ -113,7 +112,7 @@ LAST, BY_FACTORS = 3, 4  # the number of a stage
 )
 def test_a_fit_ends_where_no_step_counts_any_more(stage, factors, steps, predicted, stop):
     """Losses of accepted steps, None for those that were rejected."""
-    problem, unknowns = make_problem(scenes(), [np.zeros((SIZE, SIZE))] * 3, given_with(settings=SMALL))
+    problem, unknowns = posed(scenes(), [np.zeros((SIZE, SIZE))] * 3, given_with(settings=SMALL))
     history, loss = [], 0.0
     for number, given in enumerate(steps, 1):
         loss = loss if given is None else given

@@ -6,11 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from small_fits import SETTINGS as SMALL, SIZE, TRUTH, expanded, given, scenes as small_scenes
+from small_fits import SETTINGS as SMALL, SIZE, TRUTH, expanded, given, posed, scenes as small_scenes
 
 import jaxhf
 from jaxhf.fitting.model.linearise import LinearisedEdges, changing_pixels
-from jaxhf.fitting.model.problem import make_problem
 from jaxhf.fitting.solve import noise as _noise, run as _run
 from jaxhf.fitting.solve.noise import OCTAVES, Restricted
 from jaxhf.fitting.trust.facts import misfit_of_length
@@ -93,7 +92,7 @@ def test_a_prior_length_that_does_not_fit_is_named(length, fits):
     """Such as one in cells where it is in metres: too short for what the prior is off by, which is smooth."""
     smooth = 0.6 * np.sin(np.arange(N) / 5)[:, None] * np.cos(np.arange(N) / 6)
     options = given(prior=jaxhf.Prior(0.0, float(smooth.std()), length))
-    problem, _ = make_problem(scenes(smooth, 1), [np.zeros((N - 1, N - 1))], options)
+    problem, _ = posed(scenes(smooth, 1), [np.zeros((N - 1, N - 1))], options)
     said = misfit_of_length(problem, options)
     assert said is None if fits else "its length, 1 or 1 cells, may be too short" in str(said)
 

@@ -34,6 +34,7 @@ def linearised(heights: jax.Array) -> list[jax.Array]:
         scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(HEIGHTS))], CAMERA, [SUN])
         known = {name: item.default for name, item in inspect.signature(jaxhf.fit).parameters.items()}
         known |= {"settings": jaxhf.Settings(edge_samples=300), "unknown": jaxhf.Unknown(albedo="map")}
+        known |= {"weights": [np.ones((30, 40))]}
         given = Given(**{name: known[name] for name in Given.__dataclass_fields__})
         made, unknowns = make_problem([scene], [np.zeros((30, 40), np.float32)], given)
     made = eqx.tree_at(lambda problem: problem.basis.base, made, heights)

@@ -1,6 +1,7 @@
 """The pictures of a fit, checked and gathered into those that one program renders."""
 
 import dataclasses
+import functools
 import os
 from collections.abc import Sequence
 from typing import Any
@@ -76,14 +77,13 @@ def can_be_linearised(scene: Scene, settings: Settings) -> bool:
 
 def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> None:
     """Checks that there is a scene for each picture, and that all have the same first heightfield but for its heights."""
-    if len(scenes) == 0:
+    count = len(scenes)
+    if count == 0:
         raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
-    if len(targets) != len(scenes):
-        raise ArgumentError(
-            "fit", "targets", f"must hold a picture for each of the {len(scenes)} scenes, they are {len(targets)}"
-        )
-    if weights is not None and len(weights) != len(scenes):
-        raise ArgumentError("fit", "weights", f"must hold one for each of the {len(scenes)} scenes, they are {len(weights)}")
+    if len(targets) != count:
+        raise ArgumentError("fit", "targets", f"must hold a picture for each of the {count} scenes, they are {len(targets)}")
+    if weights is not None and len(weights) != count:
+        raise ArgumentError("fit", "weights", f"must hold one for each of the {count} scenes, they are {len(weights)}")
     for k, scene in enumerate(scenes):
         _require_alike(k, scene, scenes[0])
 
@@ -97,49 +97,34 @@ def checked_pictures(
     That of a `Noise` is the root mean square of its values' deviations; weights say by how much each differs from that.
     """
     require_scenes(scenes, targets, weights)
-    if not has_detector(noise):
-        pairs = [_checked_picture(k, *pair, weights) for k, pair in enumerate(zip(scenes, targets, strict=True))]
-    else:
-        detectors = noise_of_each(noise, len(scenes))
-        known = enumerate(zip(scenes, targets, detectors, strict=True))
-        triples = [_by_detector(one, *_checked_picture(k, scene, target, weights, one)) for k, (scene, target, one) in known]
-        pairs, noise = [(values, weight) for values, weight, _ in triples], np.array([number for *_, number in triples])
-    kept = [np.where(weight > 0, values, np.nan) for values, weight in pairs]
-    return tuple(map(np.reshape, kept, map(np.shape, targets))), [weight for _, weight in pairs], noise
+    detectors = noise_of_each(noise, len(scenes)) if has_detector(noise) else [None] * len(scenes)
+    kept, given, in_numbers = [], [], []
+    for k, (scene, target, detector) in enumerate(zip(scenes, targets, detectors, strict=True)):
+        values, weight = _checked_picture(k, scene, target, weights, detector)
+        if isinstance(detector, Noise):
+            weight, detector = _by_detector(detector, values, weight)
+        kept.append(np.where(weight > 0, values, np.nan).reshape(np.shape(target)))
+        given.append(weight)
+        in_numbers.append(detector)
+    return tuple(kept), given, np.array(in_numbers, np.float64) if has_detector(noise) else noise
 
 
 def make_groups(
-    scenes: Sequence[Scene],
-    targets: Sequence[Any],
-    weights: Sequence[Any] | None,
-    settings: Settings,
+    scenes: Sequence[Scene], targets: Sequence[np.ndarray], weights: Sequence[np.ndarray], settings: Settings
 ) -> tuple[Group, ...]:
-    """Checks pictures, and gathers those that one program can render with these settings; their noise is 1."""
+    """`checked_pictures`, those together that one program can render with these settings; their noise is 1."""
     found: dict[Any, list[tuple[int, Scene, Any, Any]]] = {}
-    for k, scene in enumerate(scenes):
-        target, weight = _picture(*_checked_picture(k, scene, targets[k], weights))
+    for k, (scene, *pair) in enumerate(zip(scenes, targets, weights, strict=True)):
+        target, weight = _picture(*(values.reshape(*values.shape[:2], -1) for values in pair))
         local = _with_heights(localise(scene), None)
         leaves, structure = jax.tree.flatten(local)
-        kind = (
-            structure,
-            resolve_settings(settings, scene).samples,
-            tuple(leaf.shape for leaf in leaves),
-            target.shape,
-        )
+        kind = structure, resolve_settings(settings, scene).samples, tuple(leaf.shape for leaf in leaves), target.shape
         found.setdefault(kind, []).append((k, local, target, weight))
-    dtype = scenes[0].heights.dtype
-    groups = []
+    dtype, groups = scenes[0].heights.dtype, []
     for members in found.values():
-        given = jnp.asarray(np.stack([weight for *_, weight in members]), dtype)
-        groups.append(
-            Group(
-                *_stacked([local for _, local, _, _ in members]),
-                jnp.asarray(np.stack([target for *_, target, _ in members]), dtype),
-                given,
-                given,
-                tuple(k for k, *_ in members),
-            )
-        )
+        indices, views, *pictures = zip(*members, strict=True)
+        target, given = (jnp.asarray(np.stack(values), dtype) for values in pictures)
+        groups.append(Group(*_stacked(views), target, given, given, indices))
     return tuple(groups)
 
 
@@ -193,27 +178,24 @@ def _stacked(scenes: Sequence[Scene]) -> tuple[Scene, Scene]:
 
 def _require_alike(k: int, scene: Scene, first: Scene) -> None:
     """All scenes have the same first heightfield, but for the heights."""
+    wrong = functools.partial(ArgumentError, "fit", f"scenes[{k}]")
     if not isinstance(scene, Scene):
-        raise ArgumentError("fit", f"scenes[{k}]", f"must be a Scene, it is a {type(scene).__name__}")
+        raise wrong(f"must be a Scene, it is a {type(scene).__name__}")
     if not scene.heightfields:
-        raise ArgumentError("fit", f"scenes[{k}]", "must have a heightfield, there is none among its objects")
+        raise wrong("must have a heightfield, there is none among its objects")
     field, other = scene.heightfields[0], first.heightfields[0]
     for name in ("shape", "dtype"):
         mine, theirs = getattr(field.heights, name), getattr(other.heights, name)
         if mine != theirs:
-            raise ArgumentError(
-                "fit", f"scenes[{k}]", f": the heights must have the {name} of the first scene's, {theirs}; it is {mine}"
-            )
+            raise wrong(f": the heights must have the {name} of the first scene's, {theirs}; it is {mine}")
     for name in ("dx", "dy", "x0", "y0"):
         mine, theirs = getattr(field, name), getattr(other, name)
         if mine != theirs:
-            raise ArgumentError(
-                "fit", f"scenes[{k}]", f": {name} must be that of the first scene's heightfield, {theirs}; it is {mine}"
-            )
+            raise wrong(f": {name} must be that of the first scene's heightfield, {theirs}; it is {mine}")
     if field.seam is not other.seam and not (
         field.seam is not None and other.seam is not None and np.array_equal(field.seam, other.seam, equal_nan=True)
     ):
-        raise ArgumentError("fit", f"scenes[{k}]", ": the seam must be that of the first scene's heightfield, it is another")
+        raise wrong(": the seam must be that of the first scene's heightfield, it is another")
 
 
 def _checked_picture(
@@ -221,42 +203,36 @@ def _checked_picture(
 ) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w c"]]:
     """Target and weight of one picture; 0 where a `Noise` says that it is no measurement."""
     size = (scene.camera.height, scene.camera.width)
+    wrong_target, wrong_weight = (functools.partial(ArgumentError, "fit", f"{name}[{k}]") for name in ("targets", "weights"))
     if isinstance(target, str | os.PathLike):
-        raise ArgumentError("fit", f"targets[{k}]", f"must be an image, it is a name: jaxhf.load_image({os.fspath(target)!r})")
+        raise wrong_target(f"must be an image, it is a name: jaxhf.load_image({os.fspath(target)!r})")
     given = np.asarray(target).dtype
     if given.kind not in "fV":  # the latter are bfloat16 and its like
         rule = f"must hold linear radiance in floats, 1 being white; it holds {given} (load_image decodes a picture)"
-        raise ArgumentError("fit", f"targets[{k}]", rule)
+        raise wrong_target(rule)
     target = numbers(target).astype(np.float64)
     if target.shape not in (size, (*size, 1), (*size, 3)):
-        raise ArgumentError(
-            "fit", f"targets[{k}]", f"must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}"
-        )
+        raise wrong_target(f"must have shape {size} or {(*size, 3)}, as its camera says; it is {target.shape}")
     target = target.reshape(*size, -1)
     weight = np.ones(size) if weights is None or weights[k] is None else numbers(weights[k])
     if weight.dtype.kind not in "biuf":
-        raise ArgumentError("fit", f"weights[{k}]", f"must hold numbers, it holds {weight.dtype}")
+        raise wrong_weight(f"must hold numbers, it holds {weight.dtype}")
     weight = weight.astype(np.float64)
     if weight.shape not in (size, target.shape):
-        raise ArgumentError("fit", f"weights[{k}]", f"must have shape {size}, its shape is {weight.shape}")
+        raise wrong_weight(f"must have shape {size}, its shape is {weight.shape}")
     if not np.isfinite(weight).all() or weight.min() < 0 or weight.max() == 0:
-        raise ArgumentError(
-            "fit", f"weights[{k}]", f"must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}"
-        )
+        raise wrong_weight(f"must be finite, from 0 on, not all 0; they are {weight.min()} to {weight.max()}")
     weight = np.broadcast_to(weight.reshape(*size, -1), target.shape)
     if isinstance(noise, Noise):
         weight = np.where(_is_measured(noise, target, given), weight, 0)
         if not weight.any():
             limits = f"saturation, {noise.saturation!r}, and other than nodata, {noise.nodata!r}"
-            rule = f"must have values with a weight that are below its Noise's {limits}; it has none"
-            raise ArgumentError("fit", f"targets[{k}]", rule)
+            raise wrong_target(f"must have values with a weight that are below its Noise's {limits}; it has none")
     bad = ~np.isfinite(target) & (weight > 0)
     if bad.any():
         y, x, c = np.argwhere(bad)[0]
-        rule = (
-            f"must be finite where it has a weight; row {y} column {x} channel {c} is {target[y, x, c]}; a weight of 0 masks it"
-        )
-        raise ArgumentError("fit", f"targets[{k}]", rule)
+        where = f"row {y} column {x} channel {c} is {target[y, x, c]}"
+        raise wrong_target(f"must be finite where it has a weight; {where}; a weight of 0 masks it")
     return target, weight
 
 
@@ -273,15 +249,13 @@ def _is_measured(noise: Noise, target: Float[np.ndarray, "h w c"], dtype: np.dty
 
 
 def _by_detector(
-    noise: Noise | float, target: Float[np.ndarray, "h w c"], weight: Float[np.ndarray, "h w c"]
-) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w c"], float]:
-    """Target and weight of one picture, and its noise at weight 1."""
-    if not isinstance(noise, Noise):
-        return target, weight, float(noise)
+    noise: Noise, target: Float[np.ndarray, "h w c"], weight: Float[np.ndarray, "h w c"]
+) -> tuple[Float[np.ndarray, "h w c"], float]:
+    """The weight of each value of a picture by its noise, and its noise at weight 1."""
     counts = weight > 0
     variance = float(noise.read) ** 2 + float(noise.gain) * np.maximum(np.where(counts, target, 0), 0)
     mean = np.mean(variance[counts])
-    return target, weight * np.sqrt(mean / variance), float(np.sqrt(mean))
+    return weight * np.sqrt(mean / variance), float(np.sqrt(mean))
 
 
 def _picture(

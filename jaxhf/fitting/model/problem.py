@@ -40,14 +40,11 @@ class Problem(eqx.Module):
     Attributes:
       groups: the pictures.
       basis: from DCT coefficients to heights; another for each stage.
-      terms: the priors.
       loss_scale: the size, in standard deviations, above which a residual counts less; changes with the stage.
       noise: standard deviation of each picture's values at weight 1, by which the groups' weights are divided.
       brightness: of each picture, the value that 1 % of it exceeds.
       bright: the unit of `Unknowns.offsets`, radiance.
       view_unit: of the numbers of `Unknowns.view`, radians and world units, shapes (2,) and (6,).
-      settings: how to render.
-      mesh: the devices that share the work.
       field: the heightfield that is sought, for its size and spacing.
       albedo: the prior of an albedo whose factors are not independent; None: there is none such.
       albedo_shape: of `Unknowns.albedo`.
@@ -139,12 +136,9 @@ class Problem(eqx.Module):
         return dataclasses.replace(self, groups=tuple(groups), noise=noise)
 
 
-def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) -> tuple[Problem, Unknowns]:
-    """The problem, and the unknowns from which a fit starts.
-
-    Raises:
-      ValueError: scenes, targets and arguments do not belong together.
-    """
+def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: Given) -> tuple[Problem, Unknowns]:
+    """The problem, and the unknowns from which a fit starts; targets, weights and noise are those of `checked_pictures`.
+    ArgumentError where scenes, targets and arguments do not belong together."""
     first = scenes[0]
     field, dtype = first.heightfields[0], first.heights.dtype
     length = None if given.prior is None else given.prior.length
@@ -161,7 +155,9 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
     base = pad(heights, padding(field, length))
     basis = make_basis(field, base, slope_units(base.shape, field.dx, field.dy)[0], free=free)
     settings = choose_samples(scenes, given.settings)
+    _require_shown(scenes, given.unknown)
     brightness, view_unit = _brightness(targets), _view_unit(scenes, given.unknown)
+    assert given.weights is not None
     groups = make_groups(scenes, targets, given.weights, settings)
     unknowns = _first_unknowns(scenes, basis, max(group.targets.shape[-1] for group in groups), given.unknown, view_unit)
     albedo = _albedo_field(field, unknowns, given.unknown)
@@ -185,20 +181,15 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[Any], given: Given) 
 
 
 def _view_unit(scenes: Sequence[Scene], unknown: Unknown) -> View:
-    """The units of what is sought of lights and cameras; ArgumentError where there is no such light, or the camera may be
-    farther off than the terrain is long, as by a deviation in another unit.
+    """The units of what is sought of lights and cameras; ArgumentError where the camera may be farther off than the terrain is
+    long, as by a deviation in another unit.
 
     A radian, and for cameras a quarter of the terrain: so they change pictures about as much as modes of one slope do. In units
     of deviations of 1 degree a light's columns of J were 20 to 40 times smaller, and a fit of 15 steps took 58 and stopped
     short.
     """
-    field, light, camera = scenes[0].heightfields[0], None, None
+    field, camera = scenes[0].heightfields[0], None
     dtype = field.heights.dtype
-    if unknown.light_std is not None:
-        for k, scene in enumerate(scenes):
-            if sun(scene.lights) is None:
-                raise ArgumentError("Unknown", "light_std", f"must stand with Directional lights, scenes[{k}] has none")
-        light = jnp.ones(2, dtype)
     if unknown.camera_std is not None:
         side = max((n - 1) * d for n, d in zip(field.heights.shape, (field.dy, field.dx), strict=True))
         position = unknown.camera_std[0]
@@ -209,21 +200,27 @@ def _view_unit(scenes: Sequence[Scene], unknown: Unknown) -> View:
             )
             raise ArgumentError("Unknown", "camera_std", rule)
         camera = jnp.asarray([side / 4] * 3 + [1 / 4] * 3, dtype)
-    if unknown.sky_std is not None:
-        for k, scene in enumerate(scenes):
-            if not any(isinstance(light, Sky) for light in scene.lights):
-                raise ArgumentError("Unknown", "sky_std", f"must stand with a Sky, scenes[{k}] has none")
-    sky, names = None if unknown.sky_std is None else jnp.ones(1, dtype), tuple(unknown.material_std or ())
-    material = jnp.asarray([(unknown.material_std or {})[name] for name in names], dtype) if names else None
+    light = None if unknown.light_std is None else jnp.ones(2, dtype)
+    sky = None if unknown.sky_std is None else jnp.ones(1, dtype)
+    deviations = unknown.material_std or {}
+    material = jnp.asarray([*deviations.values()], dtype) if deviations else None
+    return View(light, camera, sky, material, tuple(deviations))
+
+
+def _require_shown(scenes: Sequence[Scene], unknown: Unknown) -> None:
+    """ArgumentError where a scene does not have the light or the numbers of a material that are sought."""
     for k, scene in enumerate(scenes):
+        if unknown.light_std is not None and sun(scene.lights) is None:
+            raise ArgumentError("Unknown", "light_std", f"must stand with Directional lights, scenes[{k}] has none")
+        if unknown.sky_std is not None and not any(isinstance(light, Sky) for light in scene.lights):
+            raise ArgumentError("Unknown", "sky_std", f"must stand with a Sky, scenes[{k}] has none")
         kind = scene.objects[scene.first_heightfield].material
         known = [field.name for field in dataclasses.fields(kind) if _is_number(getattr(kind, field.name))]
-        for name in names:
+        for name in unknown.material_std or ():
             if name not in known:
                 rule = f"must name numbers of the material of scenes[{k}], {type(kind).__name__}: {known}; it names {name!r}"
                 rule += ", which is None: give it a number" if getattr(kind, name, known) is None else ""
                 raise ArgumentError("Unknown", "material_std", rule)
-    return View(light, camera, sky, material, names)
 
 
 def _is_number(leaf: Any) -> bool:
@@ -245,12 +242,8 @@ def _without_holes(heights: Float[np.ndarray, "ny nx"]) -> Float[np.ndarray, "ny
     holes = np.argwhere(~np.isfinite(heights))
     if len(holes):
         iy, ix = holes[0]
-        raise ArgumentError(
-            "fit",
-            "scenes[0]",
-            f": the heights must have no holes where there is no start, row {iy} column {ix} is "
-            f"{heights[iy, ix]}; fill them, or give a start without holes",
-        )
+        where = f"row {iy} column {ix} is {heights[iy, ix]}; fill them, or give a start without holes"
+        raise ArgumentError("fit", "scenes[0]", f": the heights must have no holes where there is no start, {where}")
     return heights
 
 
@@ -273,7 +266,7 @@ def _noise(given: Any, brightness: Float[np.ndarray, " pictures"]) -> Float[np.n
     return np.broadcast_to(noise, brightness.shape).copy()
 
 
-def _brightness(targets: Sequence[Any]) -> Float[np.ndarray, " pictures"]:
+def _brightness(targets: Sequence[np.ndarray]) -> Float[np.ndarray, " pictures"]:
     """Of each picture, the value that 1 % of it exceeds; 1 for a black one."""
     bright = [np.nanpercentile(np.asarray(target, np.float64), 99) for target in targets]
     return np.where(np.asarray(bright) > 0, bright, 1.0)
