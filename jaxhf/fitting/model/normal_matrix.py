@@ -24,8 +24,8 @@ MOST_OTHERS = 64
 _MOST_ITERATIONS = 300
 
 
-class Noise(NamedTuple):
-    """Independent N(0, 1) for all residuals: of the pictures, of the modes of the surface's prior, and of the other priors."""
+class Residuals(NamedTuple):
+    """A number for each residual: of the pictures, of the modes of the surface's prior, and of the other priors."""
 
     pictures: Float[np.ndarray, " rows"]
     modes: Float[np.ndarray, "my mx"]
@@ -119,19 +119,19 @@ class NormalMatrix:
 
     def gradient(self, pictures: Float[np.ndarray, " rows"]) -> Flat:
         """Of half the squares of all residuals: those of the pictures are given, times the roots, those of the priors known."""
-        return self.gathered(Noise(pictures, self._prior_push(self.off), self.others_off))
+        return self.gathered(Residuals(pictures, self._prior_push(self.off), self.others_off))
 
-    def gathered(self, residuals: Noise) -> Flat:
+    def gathered(self, residuals: Residuals) -> Flat:
         """Jᵀ times a number for each residual."""
         result = self._pulled(residuals.pictures * self.roots)
         result[: residuals.modes.size] += self._prior_pull(residuals.modes).ravel()
         result[residuals.modes.size :] += self.others_weight * residuals.others
         return result
 
-    def drawn(self, seed: int, widths: float | Float[np.ndarray, "my mx"] = 1.0) -> Noise:
-        """Noise whose modes of the surface's prior are `widths` times as large."""
+    def drawn(self, seed: int, widths: float | Float[np.ndarray, "my mx"] = 1.0) -> Residuals:
+        """N(0, 1) for each residual, `widths` times as much for the modes of the surface's prior."""
         rng = np.random.default_rng(seed)
-        return Noise(
+        return Residuals(
             rng.standard_normal(self.roots.size),
             rng.standard_normal(self.shape) * widths,
             rng.standard_normal(self.others_weight.size),

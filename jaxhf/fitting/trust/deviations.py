@@ -12,7 +12,7 @@ from jaxtyping import Float
 from ..history import Draws
 from ..model.expansion import Expansion
 from ..model.near_inverse import robust_matrix
-from ..model.normal_matrix import Noise
+from ..model.normal_matrix import Residuals
 from ..model.robust import influence_function
 from .boundaries import Boundaries
 
@@ -73,7 +73,7 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
     if boundaries is not None:
 
         def response(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            alone = Noise(matrix.roots * error, np.zeros(matrix.shape), np.zeros_like(matrix.others_weight))
+            alone = Residuals(matrix.roots * error, np.zeros(matrix.shape), np.zeros_like(matrix.others_weight))
             change = matrix.solved(matrix.gathered(alone), tolerance)
             return matrix.heights_of(change), error - matrix.seen(change) / matrix.roots
 

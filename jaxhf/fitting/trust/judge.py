@@ -17,21 +17,8 @@ from ..model.problem import Problem
 from ..solve.noise import Freedom, Restricted, explains_noise
 from ..solve.run import Ended
 from ..solve.stages import varies_all
+from . import facts
 from .deviations import standard_deviations, with_unexplained
-from .facts import (
-    Left,
-    boundary_places,
-    chi_squared,
-    dependent_channels,
-    have_same_light,
-    have_same_view,
-    misfit_of_length,
-    shows_mean,
-    strayed,
-    unlike_noise,
-    what_may_help,
-    why_noise_is_unsure,
-)
 from .words import FAR_FROM_ONE, Findings, Region, warnings, where_residuals_are, worst_regions
 
 _OFF = 3.0  # standard deviations of the noise by which a background must be off to count
@@ -103,8 +90,8 @@ def judged(
     in_noise = [picture.residual for picture in left]
     counts = [picture.informing | (np.abs(picture.residual) > _OFF) for picture in left]
     counted = np.concatenate([values[which] for values, which in zip(in_noise, counts, strict=True)]).astype(np.float64)
-    regions, where = worst_regions(in_noise), where_residuals_are(in_noise, boundary_places(expansion))
-    chi2, share = chi_squared(problem, counted, [int(which.sum()) for which in counts], free)
+    regions, where = worst_regions(in_noise), where_residuals_are(in_noise, facts.boundary_places(expansion))
+    chi2, share = facts.chi_squared(problem, counted, [int(which.sum()) for which in counts], free)
     gradients, _ = expansion.random_gradients()
     seen, heights = (gradients != 0).any(axis=0), np.asarray(expansion.heights, np.float64)
     std, samples, scaled, displaced, parts = None, None, None, None, None
@@ -122,17 +109,17 @@ def judged(
         noise_given=given.noise is not None,
         where=where,
         regions=regions,
-        help=what_may_help(expansion, left, given) if chi2 > FAR_FROM_ONE else "",
-        unlike_noise=unlike_noise(left, given),
-        channels=dependent_channels(left),
-        strayed=strayed(problem, heights, seen, given),
+        help=facts.what_may_help(expansion, left, given) if chi2 > FAR_FROM_ONE else "",
+        unlike_noise=facts.unlike_noise(left, given),
+        channels=facts.dependent_channels(left),
+        strayed=facts.strayed(problem, heights, seen, given),
         seen=seen,
-        mean_shown=shows_mean(gradients),
+        mean_shown=facts.shows_mean(gradients),
         noise_share=float(np.min(problem.noise / problem.brightness)),
-        same_light=have_same_light(found),
-        same_view=have_same_view(found),
-        unsure_noise=None if given.noise is not None else why_noise_is_unsure(problem, expansion.unknowns.count, free),
-        length=misfit_of_length(problem, given),
+        same_light=facts.have_same_light(found),
+        same_view=facts.have_same_view(found),
+        unsure_noise=None if given.noise is not None else facts.why_noise_is_unsure(problem, expansion.unknowns.count, free),
+        length=facts.misfit_of_length(problem, given),
         scaled=scaled,
         displaced=displaced,
         draws=(0, 0) if samples is None else (given.draws, len(samples)),
@@ -181,7 +168,7 @@ def _restricted(ended: Ended, fitted: bool, given: Given) -> tuple[Expansion, Fr
     return expansion, restricted.freedom(estimate)
 
 
-def _left(expansion: Expansion) -> list[Left]:
+def _left(expansion: Expansion) -> list[facts.Left]:
     """What is left of each picture."""
     problem, groups = expansion.problem, expansion.problem.groups
     rows = expansion.pictures(), [group.targets for group in groups], [group.weights for group in groups], expansion.informing()
@@ -189,7 +176,7 @@ def _left(expansion: Expansion) -> list[Left]:
     pairs = zip(images, targets, weights, strict=True)
     off = [np.where(weight > 0, image - target, 0) * weight for image, target, weight in pairs]
     numbers = problem.noise.tolist(), problem.brightness.tolist()
-    return list(map(Left, images, targets, off, informing, *numbers))
+    return list(map(facts.Left, images, targets, off, informing, *numbers))
 
 
 def _in_shape(image: Float[np.ndarray, "h w c"], shape: tuple[int, ...]) -> np.ndarray:
