@@ -29,13 +29,8 @@ ndimage: Any = scipy.ndimage  # whose stubs miss much
 
 
 class Seen(NamedTuple):
-    """A part of a picture that shows a window.
-
-    Attributes:
-      scene: the window as its first heightfield, the terrain around it as its last object.
-      target, weight: of the pixels of its camera; those without weight show what is not sought.
-      number: of the picture among all.
-    """
+    """A part of a picture that shows a window: a scene with the window as its first heightfield and the terrain around it as
+    its last object, target and weight of each pixel, 0 where it shows something else, and the picture's number among all."""
 
     scene: Scene
     target: Float[np.ndarray, "h w *c"]
@@ -105,11 +100,8 @@ def cropped(
     window: Window,
     around: Window,
 ) -> list[Seen]:
-    """What the pictures show of a window of a terrain.
-
-    Scenes, targets and weights are those of the whole terrain, a weight for each value; `terrain`: its heights as far as they
-    are known; `off`: by how much they may be off there; `around`: see `surroundings`.
-    """
+    """What the pictures of a terrain show of a window of it, a weight for each value; `terrain`: its heights as far as they are
+    known; `off`: by how much they may be off in the window; `around`: see `surroundings`."""
     field, whole = scenes[0].heightfields[0], Window(0, 0, *terrain.shape)
 
     def within(place: Window) -> list[Scene]:

@@ -128,8 +128,7 @@ def fit_windows(
     require("fit_windows", "overlap", overlap, Whole(_LEAST_OVERLAP, window // 2))
     mean, std = (make_heights("Prior", name, getattr(prior, name), field) for name in ("heights", "std"))
     known = Prior(mean, std, prior.length)
-    begin = make_heights("fit", "start", field.heights if start is None else start, field)
-    begin = with_seam(field, begin)
+    begin = with_seam(field, make_heights("fit", "start", field.heights if start is None else start, field))
     terrain = Mosaic(with_seam(field, np.where(std > 0, begin, mean)), std.copy(), np.zeros(shape, bool), ())
     order = divided(shape, window, overlap)
     options = {**options, "settings": _settings(scenes, options.get("settings") or Settings(), len(order))}
@@ -138,8 +137,7 @@ def fit_windows(
     around = surroundings(scenes, (float(known_heights.min()) - off, float(known_heights.max()) + off), order)
     path = None if checkpoint is None else Path(checkpoint.path)
     values = scenes, targets, weights, mean, std, begin, noise
-    choices = prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)
-    name = digest(choices, values)
+    name = digest((prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)), values)
     if path is not None and path.exists():
         terrain = _load(path, terrain, name)
     for number in range(len(terrain.windows), len(order)):
@@ -147,19 +145,13 @@ def fit_windows(
         here = place.place
         off = _REACH * std[here] + np.where(std[here] > 0, np.abs(mean[here] - terrain.heights[here]), 0)
         seen = cropped(scenes, targets, weights, terrain.heights, float(off.max()), place, around[number])
-        tell = None if progress is None else lambda done, number=number: progress(number, len(order), done)
-        found = _fit(seen, terrain, known, place, noise, tell or False, options) if seen else None
+        tell = False if progress is None else lambda done, number=number: progress(number, len(order), done)
+        found = _fit(seen, terrain, known, place, noise, tell, options) if seen else None
         done = Fitted(*place, len(seen))
         if found is not None:
             terrain, seam = _joined(terrain, known, found, place, overlap)
-            done = done._replace(
-                result=found.result.value,
-                steps=int(found.stats["steps"]),
-                seconds=float(found.stats["seconds"]),
-                chi2=float(found.stats["chi2"]),
-                seam=seam,
-                warnings=found.warnings,
-            )
+            stats = {key: found.stats[key] for key in ("steps", "seconds", "chi2")}
+            done = done._replace(result=found.result.value, seam=seam, warnings=found.warnings, **stats)
         terrain = dataclasses.replace(terrain, windows=(*terrain.windows, done))
         if path is not None:
             facts = {"fingerprint": name, "windows": [list(done) for done in terrain.windows]}
@@ -212,7 +204,7 @@ def _joined(terrain: Mosaic, prior: Prior, found: Fit, window: Window, overlap: 
     here, done = window.place, prior.std == 0
     for before in terrain.windows:
         if before.result:
-            done[before.y : before.y + before.ny, before.x : before.x + before.nx] = True
+            done[Window(*before[:4]).place] = True
     done = done[here]
     # From 0 at sides in windows before to 1, where these end; what is at the right was fitted in the row before.
     rows = _ramp(window.y > 0, False, window.ny, overlap)

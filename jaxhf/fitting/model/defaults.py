@@ -30,12 +30,10 @@ def choose_samples(scenes: Sequence[Scene], settings: Settings) -> Settings:
 
 
 def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: bool = False) -> int:
-    """As many points on edges as the boundaries in the longest of these pictures are long; 0 where there are none, and beside
-    a skirt.
+    """As many points on edges as the longest boundaries in one of these `localise`d pictures ask for; 0 where there are none,
+    and beside a skirt. A power of two, so that pictures that differ little share a program.
 
-    A power of two, so that pictures that differ little share a program.
-
-    `views` are `localise`d; `shadows`: whether the measured pictures show shadows, whatever these scenes do.
+    `shadows`: whether the measured pictures show shadows, whatever these scenes do.
     """
     has_skirt = any(isinstance(obj.shape, Skirt) for view in views for obj in view.objects)  # with points it is refused
     if has_skirt or not all(can_be_linearised(view, settings) for view in views):

@@ -35,11 +35,8 @@ _PROBES = 8  # of the pictures' curvature
 
 
 class Expansion(eqx.Module):
-    """A problem about some unknowns.
-
-    Attributes:
-      linearised: the pictures of each group with their derivatives; None: there are none such, see `can_be_linearised`.
-    """
+    """A problem about some unknowns, and there the pictures of each group with their derivatives; None where these are not
+    kept, see `can_be_linearised`."""
 
     problem: Problem
     unknowns: Unknowns
@@ -174,7 +171,8 @@ def _simulate(unknowns: Unknowns, about: Expansion, heights: Float[Array, "ny nx
         else:
             factors, seen = problem.factors(unknowns), _common(unknowns, problem)
             complete = functools.partial(group.complete, heights=heights, factors=factors, numbers=seen)
-            image = render_each(_views(unknowns, problem, group), complete, problem.settings, problem.mesh)
+            views = moved_each(group.scenes, problem.moves(unknowns, group))
+            image = render_each(views, complete, problem.settings, problem.mesh)
             if group.targets.shape[-1] == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
         if unknowns.exposures is not None:
@@ -191,17 +189,13 @@ def _common(unknowns: Unknowns, problem: Problem) -> View:
     return KNOWN if material is None or unit is None else View(material=material[0] * unit, names=unknowns.view.names)
 
 
-def _views(unknowns: Unknowns, problem: Problem, group: Group) -> Scene:
-    """`group.scenes` under the lights and from the cameras that are sought."""
-    return moved_each(group.scenes, problem.moves(unknowns, group))
-
-
 def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) -> tuple[Scene, ...]:
     """The scenes as they were given, with all that was found; positions keep double precision."""
     heights, found = problem.basis.crop(surface_of(unknowns, problem.basis)), list(scenes)
     factors = problem.factors(unknowns)
     for group in problem.groups:
-        new, old = ((part.lights, part.camera) for part in (_views(unknowns, problem, group), group.scenes))
+        views = moved_each(group.scenes, problem.moves(unknowns, group))
+        new, old = ((part.lights, part.camera) for part in (views, group.scenes))
         change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)
         for n, k in enumerate(group.indices):
             scene = with_material(scenes[k].with_heights(heights), jax.tree.map(np.asarray, _common(unknowns, problem)))

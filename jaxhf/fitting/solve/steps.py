@@ -37,12 +37,9 @@ class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
     modes.
     """
 
-    tolerance: Float[Array, ""]
-    iterations: Int[Array, ""]
+    tolerance: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    iterations: Int[Array, ""] = eqx.field(converter=jnp.asarray)
     others: Any
-
-    def __init__(self, tolerance: float, iterations: int, others: Any):
-        self.tolerance, self.iterations, self.others = jnp.asarray(tolerance), jnp.asarray(iterations), others
 
     def init(self, y: Unknowns, f_info_struct: Any) -> Any:
         return _empty(f_info_struct)
