@@ -76,8 +76,10 @@ def _inside(shape: tuple[int, ...], window: Window, rim: int) -> Bool[np.ndarray
 
 
 def part_by_heights(expansion: Expansion, window: Window | None) -> tuple[Sparse, Int[np.ndarray, " rows"]]:
-    """The derivative in such heights, as that of `pictures_by_heights`, of the values that depend on no others, but for those
-    of pixels that a boundary crosses; and these values' places in the order of `in_row`, rising. None: of all."""
+    """The part of `pictures_by_heights` of a window, None: all of it; and its rows' places in the order of `in_row`, rising.
+
+    Its columns are the window's heights, its rows the values that depend on no others, without pixels that a boundary crosses.
+    """
     problem, heights = expansion.problem, expansion.heights
     slopes = _slopes(*on_every_device((heights, expansion.unknowns, problem), problem.mesh))
     near, core = (None if window is None else _inside(heights.shape, window, rim) for rim in (0, 1))

@@ -155,8 +155,8 @@ class Restricted:
 
 
 def _told(expansion: Expansion, labels: Labels) -> tuple[Int[np.ndarray, " values"], NormalMatrix]:
-    """Which values are to tell the noise, and the normal matrix of their residuals, all of weight 1, with its inverse if there
-    is one: of all values or, of many heights, of those that show a block of them, as a part of the data tells it as well."""
+    """The values that are to tell the noise, and the normal matrix of their residuals, all of weight 1: all values or, where
+    heights are many, those that show a block of them, as a part of the data tells the noise as well."""
     block, shape = None, expansion.problem.basis.base.shape
     few_others = expansion.unknowns.count - math.prod(shape) <= MOST_OTHERS
     if can_have_rows(expansion) and max(shape) > _MOST_SIDE and few_others:

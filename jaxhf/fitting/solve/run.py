@@ -197,8 +197,8 @@ def _estimated(here: Expansion, state: State, order: Sequence[Stage], repeats: b
     """The state with what the next stage takes for the noise of each picture, where none is given, for how heights vary, where
     their prior does not say how its errors hang together, and for the loss's scale; unchanged where it would hardly change.
 
-    By what the stage before left, `here`. If it did not vary the same modes (`repeats`), that is mostly for shorter ones to
-    explain.
+    They are estimated from what the stage before left (`here`). Unless that one varied the same modes (`repeats`), most of it
+    is for shorter modes to explain.
     """
     stage, posed, spread = order[state.stage + 1], here.problem, spreads(here)
     before = Estimate(state.noise, state.widths)

@@ -112,10 +112,6 @@ class Outcome(NamedTuple):
     change: Scalar | float
 
 
-_OPTIONS: dict[str, Any] = {}
-_TAGS: frozenset[object] = frozenset()
-
-
 def first_position(expansion: Expansion) -> Any:
     """The form of optimistix's state of a fit, with `jax.ShapeDtypeStruct`s for its arrays.
 
@@ -126,7 +122,7 @@ def first_position(expansion: Expansion) -> Any:
     def first(expansion: Expansion) -> Any:
         solver = LevenbergMarquardt(0, expansion.unknowns.without_modes())
         shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, expansion)
-        return solver.init(residuals, expansion.unknowns, expansion, _OPTIONS, shape, None, _TAGS)
+        return solver.init(residuals, expansion.unknowns, expansion, {}, shape, None, frozenset())
 
     return eqx.filter_eval_shape(first, expansion)
 
@@ -175,7 +171,7 @@ def _advance(
     solver, unknowns, rest, expansion = kept
     problem, position = expansion.problem, eqx.combine(of_j, rest)
     with jax.numpy_dtype_promotion("standard"):
-        new, state, _ = solver.step(residuals, unknowns, expansion, _OPTIONS, position, _TAGS)
+        new, state, _ = solver.step(residuals, unknowns, expansion, {}, position, frozenset())
     step = jax.tree.map(lambda to, here: to - here, state.y_eval, new)
     moved = problem.basis.heights(new.coefficients) - problem.basis.heights(unknowns.coefficients)
     outcome = Outcome(
