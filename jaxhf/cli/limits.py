@@ -13,7 +13,7 @@ from .cache import keep_programs
 # (docs/guides/devices.md). Less than that is asked for, so that what might fit is tried.
 _BYTES_A_HEIGHT = 45
 _BYTES_A_PIXEL = 40
-_BYTES_A_HEIGHT_OF_MAPS = 90  # 93 measured, of 4096 x 4096 heights (docs/measurements/maps.md)
+_BYTES_A_HEIGHT_OF = {"viewshed": 90, "insolation": 95, "skyview": 60, "horizon": 55}  # docs/measurements/maps.md
 
 
 def set_up_jax(options: argparse.Namespace) -> None:
@@ -46,10 +46,10 @@ def require_memory(scene: Scene, devices: int) -> None:
     )
 
 
-def require_memory_of_viewshed(heights: int, precision: str) -> None:
-    """UserError where a viewshed of so many heights certainly needs more memory than there is."""
-    needed = _BYTES_A_HEIGHT_OF_MAPS * heights * (2 if precision == "float64" else 1)
-    _require_free(needed, f"viewshed: {heights} heights", "", "--bbox takes a part")
+def require_memory_of_map(command: str, heights: int, precision: str) -> None:
+    """UserError where a map by JAX of so many heights certainly needs more memory than there is."""
+    needed = _BYTES_A_HEIGHT_OF[command] * heights * (2 if precision == "float64" else 1)
+    _require_free(needed, f"{command}: {heights} heights", "", "--bbox takes a part")
 
 
 def _require_free(needed: float | int, what: str, where: str, hint: str) -> None:

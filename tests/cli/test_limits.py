@@ -57,10 +57,14 @@ def test_a_terrain_counts_on_each_device(refused, monkeypatch):
         limits.require_memory(scene, 2)
 
 
-def test_a_viewshed_that_does_not_fit(refused, monkeypatch, tmp_path):
-    monkeypatch.setattr(limits, "available_bytes", lambda: 9e5)
+def test_a_map_that_does_not_fit(refused, monkeypatch, tmp_path):
+    monkeypatch.setattr(limits, "available_bytes", lambda: 8e5)
     jaxhf.save_heights(tmp_path / "in.npz", jaxhf.Terrain(np.zeros((100, 150), np.float32)))
     words = "viewshed", str(tmp_path / "in.npz"), "--observer", "3", "3", "--dx", "1", "--dy", "1"
-    said = "viewshed: 15000 heights take more than 0.00135 GB of memory, 0.0009 GB are free; --bbox takes a part"
+    said = "viewshed: 15000 heights take more than 0.00135 GB of memory, 0.0008 GB are free; --bbox takes a part"
     assert refused(*words) == said
     assert "take more than 0.0027 GB" in refused(*words, "--precision", "float64")
+    day = "--begin", "2026-06-21", "--end", "2026-06-22", "--latitude", "46", "--longitude", "8"
+    for command, more in (("skyview", ()), ("horizon", ("--azimuth", "90")), ("insolation", day)):
+        words = command, str(tmp_path / "in.npz"), "-o", str(tmp_path / "out.npy"), "--dx", "1", "--dy", "1", *more
+        assert refused(*words).startswith(f"{command}: 15000 heights take more than 0.00")

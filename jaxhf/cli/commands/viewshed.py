@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> None:
     cells = cells_of("viewshed", "--observer", options.observers, stored.heights.shape, (x0, y0), (dx, dy))
     if options.line:
         cells = _along(cells, stored.heights)
-    limits.require_memory_of_viewshed(stored.heights.size, options.precision)
+    limits.require_memory_of_map("viewshed", stored.heights.size, options.precision)
     limits.set_up_jax(options)
     begin = time.perf_counter()
     known = arguments.given(options, "height", "target_height", "radius")
