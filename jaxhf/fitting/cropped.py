@@ -23,7 +23,7 @@ from ..scene.texture import ImageTexture
 from .model.surface import Window
 
 _MARGIN = 2  # cells from the rim, where normals lack their neighbours; and pixels that a moving rim may come to
-_LEAST_SIDE = 16  # of a picture, pixels
+_STEP = 16  # pixels, of which the sides of a part of a picture are a multiple
 
 ndimage: Any = scipy.ndimage  # whose stubs miss much
 
@@ -91,6 +91,27 @@ def _ends_of_rays(
             yield starts + np.where(np.array([y, x]) == 0, 0, np.copysign(np.inf, [y, x]))
 
 
+def sides_in_sight(
+    scenes: Sequence[Scene], terrain: Float[np.ndarray, "my mx"], off: float, windows: Sequence[Window]
+) -> tuple[int, int]:
+    """Rows and columns in which each picture of a terrain shows any of these windows; the arguments are those of `cropped`."""
+    field, places = scenes[0].heightfields[0], []
+    for window in windows:
+        part = _part(field, terrain.astype(field.heights.dtype), window)
+        for scene in scenes:
+            k = scene.first_heightfield
+            alone = eqx.tree_at(lambda scene, k=k: scene.objects[k].shape, scene, part)
+            places.append(_in_sight(alone, terrain[window.place], off))
+    return _sides(places)
+
+
+def _sides(places: Sequence["Corners | None"]) -> tuple[int, int]:
+    """Rows and columns of the largest of these places in pictures, rounded up."""
+    seen = [np.subtract(last, first) for first, last in (place for place in places if place is not None)]
+    height, width = (-(-np.max([(1, 1), *seen], axis=0) // _STEP) * _STEP).tolist()
+    return height, width
+
+
 def cropped(
     scenes: Sequence[Scene],
     targets: Sequence[np.ndarray],
@@ -99,9 +120,10 @@ def cropped(
     off: float,
     window: Window,
     around: Window,
+    least: tuple[int, int],
 ) -> list[Seen]:
     """What the pictures of a terrain show of a window of it, a weight for each value; `terrain`: its heights as far as they are
-    known; `off`: by how much they may be off in the window; `around`: see `surroundings`."""
+    known; `off`: by how much they may be off in the window; `around`: see `surroundings`; `least`: see `sides_in_sight`."""
     field, whole = scenes[0].heightfields[0], Window(0, 0, *terrain.shape)
 
     def within(place: Window) -> list[Scene]:
@@ -111,13 +133,13 @@ def cropped(
     parts, everything = within(around), within(whole)
     places = [_in_sight(scene, terrain[window.place], off) for scene in parts]
     # Pictures of one size share a program, those of this window and of the next ones.
-    height, width = (max([1, *(place[1][axis] - place[0][axis] for place in places if place is not None)]) for axis in (0, 1))
+    height, width = np.maximum(_sides(places), least).tolist()
     found = []
     for index, (scene, place) in enumerate(zip(parts, places, strict=True)):
         if place is None:
             continue
         camera = scene.camera
-        sides = min(_rounded(height), camera.height), min(_rounded(width), camera.width)
+        sides = min(height, camera.height), min(width, camera.width)
         y, x = (
             int(np.clip((low + high - side) // 2, 0, most - side))
             for low, high, side, most in zip(*place, sides, (camera.height, camera.width), strict=True)
@@ -134,16 +156,17 @@ def _fields(
     whole: Heightfield, terrain: Float[np.ndarray, "my mx"], window: Window, around: Window
 ) -> tuple[Heightfield, Heightfield]:
     """A window of a terrain, and what is around it, with a hole there."""
-    seam = None if whole.seam is None else np.asarray(whole.seam)
-
-    def part(place: Window, heights: Float[np.ndarray, "ny nx"]) -> Heightfield:
-        corner = whole.x0 + place.x * whole.dx, whole.y0 + place.y * whole.dy
-        return Heightfield(heights, whole.dx, whole.dy, *corner, None if seam is None else seam[place.place])
-
     heights = terrain.astype(whole.heights.dtype)
-    inside = heights[window.place].copy()
+    inside = _part(whole, heights, window)
     heights[window.y + 1 : window.y + window.ny - 1, window.x + 1 : window.x + window.nx - 1] = np.nan
-    return part(window, inside), part(around, heights[around.place])
+    return inside, _part(whole, heights, around)
+
+
+def _part(whole: Heightfield, heights: Float[np.ndarray, "my mx"], place: Window) -> Heightfield:
+    """Of a terrain with these heights."""
+    corner = whole.x0 + place.x * whole.dx, whole.y0 + place.y * whole.dy
+    seam = None if whole.seam is None else np.asarray(whole.seam)[place.place]
+    return Heightfield(heights[place.place].copy(), whole.dx, whole.dy, *corner, seam)
 
 
 def _with_surroundings(scene: Scene, part: Heightfield, beyond: Heightfield, window: Window, around: Window) -> Scene:
@@ -192,12 +215,6 @@ def _in_sight(scene: Scene, heights: Float[np.ndarray, "ny nx"], reach: float) -
             low[axis] = max(low[axis], math.floor(along.min()) - _MARGIN)
             high[axis] = min(high[axis], math.ceil(along.max()) + _MARGIN)
     return None if low[0] >= high[0] or low[1] >= high[1] else ((low[0], low[1]), (high[0], high[1]))
-
-
-def _rounded(count: int) -> int:
-    """The next 2ⁿ or 3 · 2ⁿ."""
-    power = 2 ** math.ceil(math.log2(max(count, _LEAST_SIDE)))
-    return power * 3 // 4 if count <= power * 3 // 4 else power
 
 
 def _sight_of(scene: Scene, window: Window, shape: tuple[int, ...]) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:

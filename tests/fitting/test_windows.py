@@ -1,5 +1,6 @@
 """A terrain that is fitted window by window."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 
 import jaxhf
 from jaxhf.fitting import windows as _windows
-from jaxhf.fitting.cropped import _fields, cropped, surroundings
+from jaxhf.fitting.cropped import _fields, cropped, sides_in_sight, surroundings
 from jaxhf.fitting.model.surface import Window, with_seam
 from jaxhf.fitting.windows import divided, fit_windows
 from jaxhf.scene.procedural import fractal
@@ -77,7 +78,7 @@ def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
     (around,) = surroundings(whole, (0.0, 0.15), [WINDOW])
     assert 24 < around.ny < SIDE
     terrain = TRUTH.astype(np.float64)
-    parts = cropped(whole, images, [np.ones_like(image) for image in images], terrain, 0.0, WINDOW, around)
+    parts = cropped(whole, images, [np.ones_like(image) for image in images], terrain, 0.0, WINDOW, around, (1, 1))
     assert len(parts) == len(whole)
     for part in parts:
         assert part.scene.heightfields[0].heights.shape == (24, 24)
@@ -148,8 +149,8 @@ def test_windows_come_near_the_truth_without_seams():
 class Fits:
     """In place of `fit`: the truth, off by a number of each window's own but where heights are held, with its deviation."""
 
-    def __init__(self, stop: int = -1):
-        self.given, self.stop = [], stop
+    def __init__(self, stop: int = -1, off: float = 0.01):
+        self.given, self.stop, self.off = [], stop, off
 
     def __call__(self, scenes: Any, targets: Any, **given: Any) -> Any:
         if len(self.given) == self.stop:
@@ -157,7 +158,7 @@ class Fits:
         self.given.append((scenes, given))
         prior, field = given["prior"], scenes[0].heightfields[0]
         y, x = round((field.y0 + 2) * (SIDE - 1)), round((field.x0 - 3) * (SIDE - 1))
-        heights = TRUTH[y : y + 32, x : x + 32] + 0.01 * (1 + y + 2 * x)
+        heights = TRUTH[y : y + 32, x : x + 32] + self.off * (1 + y + 2 * x)
         shape = heights.shape
         return jaxhf.Fit(
             heights=np.where(prior.std == 0, prior.heights, heights).astype(np.float32), result=jaxhf.Stop.CONVERGED,
@@ -219,6 +220,20 @@ def test_what_is_around_a_window_may_rise_to_its_prior(monkeypatch):
         sizes.append(fits.given[0][0][0].objects[-1].shape.heights.shape)
     assert sizes[0] == sizes[1]
     assert sizes[2] < sizes[1] < (SIDE, SIDE)
+
+
+def test_pictures_of_all_windows_have_one_size(monkeypatch):
+    """So they share programs, although a window that is nearer to the camera fills more of a picture."""
+    whole = scenes(TRUTH, dataclasses.replace(CAMERA, width=150, height=150))
+    order = divided(TRUTH.shape, 32, 8)
+    alone = {sides_in_sight(whole, TRUTH.astype(float), 0.0, [window]) for window in order}
+    assert len(alone) > 1
+    fits = Fits(off=0.0)
+    monkeypatch.setattr(_windows, "fit", fits)
+    fit_windows(whole, [np.zeros((150, 150), np.float32)] * 3, prior=known(), noise=0.1, **OPTIONS | {"overlap": 8})
+    sizes = {(scene.camera.height, scene.camera.width) for given in fits.given for scene in given[0]}
+    assert len(fits.given) == len(order)
+    assert len(sizes) == 1
 
 
 @pytest.mark.parametrize(
