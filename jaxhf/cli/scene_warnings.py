@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from jaxtyping import Float
 
+from ..maps.viewshed import height_at
 from ..scene.camera import Camera, Perspective
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional
@@ -72,10 +73,7 @@ def _height_at(field: Heightfield, heights: np.ndarray, x: float, y: float) -> f
     ny, nx = heights.shape
     if not (0 <= column <= nx - 1 and 0 <= row <= ny - 1):
         return -np.inf
-    ix, iy = min(int(column), nx - 2), min(int(row), ny - 2)
-    (z00, z10), (z01, z11) = heights[iy : iy + 2, ix : ix + 2].astype(np.float64)
-    fx, fy = column - ix, row - iy
-    return float(z00 + (fx * (z10 - z00) + fy * (z11 - z10) if fx >= fy else fy * (z01 - z00) + fx * (z11 - z01)))
+    return height_at(heights, column, row)
 
 
 def _box(item: Object, field: Heightfield, lowest: float, highest: float) -> Float[np.ndarray, "8 3"]:
