@@ -20,7 +20,7 @@ from jaxhf.preparation import ceiling, sky, world as worlds
 from jaxhf.rendering import aovs as rendering_aovs
 from jaxhf.scene import material as materials, texture
 from jaxhf.shade import lighting, radiance, reflectance
-from jaxhf.trace import cylinder, intersect, normals, search, skirt, skyline
+from jaxhf.trace import cylinder, grid, intersect, normals, search, skirt, skyline
 from jaxhf.xla import masked
 
 CAMERA = jaxhf.Perspective.look_at((0.5, -1, 1), (0.5, 0.5, 0), width=16, height=16)
@@ -154,7 +154,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
     "step budget": (
         "plain",
         case(max_steps=6),
-        [lambda patch, say: patch.setattr(search, "min", saying(min, say, lambda **_: True), raising=False)],
+        [lambda patch, say: patch.setattr(grid, "min", saying(min, say, lambda **_: True), raising=False)],
     ),
     "fixed number of steps": (
         "plain",
