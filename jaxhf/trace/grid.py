@@ -152,7 +152,16 @@ def joined(grids: Grid) -> tuple[Grid, Grid]:
 
     def sizes(grid: Grid) -> tuple[Any, ...]:
         pyramid = grid.pyramid
-        return *grid.cells, *grid.extent, pyramid.width, pyramid.height, pyramid.largest, pyramid.below, pyramid.enough
+        return (
+            *grid.cells,
+            *grid.extent,
+            pyramid.width,
+            pyramid.height,
+            pyramid.log_width,
+            pyramid.largest,
+            pyramid.below,
+            pyramid.enough,
+        )
 
     def of_all(leaf: jax.Array) -> jax.Array:
         return leaf[0] if leaf.ndim == 1 else leaf.reshape(-1, *leaf.shape[2:])

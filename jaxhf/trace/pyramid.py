@@ -28,6 +28,7 @@ class Pyramid(eqx.Module):
     Attributes:
       bounds: level after level, each row padded to the finest's width; first for rays above, then for rays below.
       width, height: of the finest level, cells, rounded up to powers of two.
+      log_width: the power of two.
       largest: cells along a side of the coarsest level's blocks.
       below: where the bounds for rays below begin.
       enough: a number of steps that suffices for any ray, see `enough_steps`.
@@ -38,6 +39,7 @@ class Pyramid(eqx.Module):
     bounds: Float[jax.Array, " n"]
     width: Index
     height: Index
+    log_width: Index
     largest: Index
     below: Index
     enough: Index
@@ -49,7 +51,8 @@ class Pyramid(eqx.Module):
         twice = 2 * self.height
         first_row = twice - lax.shift_right_logical(jnp.broadcast_to(twice, level.shape), level)
         row = first_row + lax.shift_right_logical(iy, level)
-        index = row * self.width + lax.shift_right_logical(ix, level)
+        # By a shift: vectors multiply whole numbers slowly.
+        index = lax.shift_left(row, jnp.broadcast_to(self.log_width, row.shape)) + lax.shift_right_logical(ix, level)
         index = index + jnp.where(above, 0, self.below)
         index = index if self.first is None else index + self.first
         return value_at(self.bounds, index)
@@ -93,6 +96,7 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None
         bounds=jnp.concatenate([above, below]),
         width=jnp.int32(width),
         height=jnp.int32(height),
+        log_width=jnp.int32(width.bit_length() - 1),
         largest=jnp.int32(2**levels),
         below=jnp.int32(above.size),
         enough=jnp.int32(enough_steps(nx - 1, ny - 1, levels)),

@@ -74,7 +74,7 @@ def walk_start(
         nx=grid.nx,
         pyramid=grid.pyramid,
         of_x=2 * width - 1,
-        first_of_y=(35 - lax.clz(width)).astype(jnp.uint32),
+        first_of_y=(4 + grid.pyramid.log_width).astype(jnp.uint32),
         x=x,
         y=y,
         z_ray=z_ray,
