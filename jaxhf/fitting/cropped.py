@@ -24,6 +24,7 @@ from .model.surface import Window
 
 _MARGIN = 2  # cells from the rim, where normals lack their neighbours; and pixels that a moving rim may come to
 _STEP = 16  # pixels, of which the sides of a part of a picture are a multiple
+_COARSENING = 1.4  # by which a part of a picture may be too large along a side, so that it shares programs with others
 
 ndimage: Any = scipy.ndimage  # whose stubs miss much
 
@@ -91,25 +92,40 @@ def _ends_of_rays(
             yield starts + np.where(np.array([y, x]) == 0, 0, np.copysign(np.inf, [y, x]))
 
 
+_Sides = tuple[list[int], list[int]]
+"""Numbers of rows, and of columns, that parts of pictures have; ascending."""
+
+
 def sides_in_sight(
     scenes: Sequence[Scene], terrain: Float[np.ndarray, "my mx"], off: float, windows: Sequence[Window]
-) -> tuple[int, int]:
-    """Rows and columns in which each picture of a terrain shows any of these windows; the arguments are those of `cropped`."""
-    field, places = scenes[0].heightfields[0], []
-    for window in windows:
-        part = _part(field, terrain.astype(field.heights.dtype), window)
-        for scene in scenes:
-            k = scene.first_heightfield
-            alone = eqx.tree_at(lambda scene, k=k: scene.objects[k].shape, scene, part)
-            places.append(_in_sight(alone, terrain[window.place], off))
-    return _sides(places)
+) -> _Sides:
+    """So many as the parts of pictures need that show each of these windows, by few sizes: what needs more than a size over
+    `_COARSENING` has that one. The arguments are those of `cropped`."""
+    found: list[tuple[int, int]] = []
+    for scene in scenes:
+        sight = _Sight.of(scene)
+        places = [sight.of_window(window, terrain[window.place], off) for window in windows]
+        found += [(last[0] - first[0], last[1] - first[1]) for first, last in (place for place in places if place)]
+    rows, columns = ([_rounded(count) for count in counts] for counts in zip(*found, strict=True)) if found else ([], [])
+    return _few(rows), _few(columns)
 
 
-def _sides(places: Sequence["Corners | None"]) -> tuple[int, int]:
-    """Rows and columns of the largest of these places in pictures, rounded up."""
-    seen = [np.subtract(last, first) for first, last in (place for place in places if place is not None)]
-    height, width = (-(-np.max([(1, 1), *seen], axis=0) // _STEP) * _STEP).tolist()
-    return height, width
+def _few(counts: Sequence[int]) -> list[int]:
+    """Of these the largest, the next that is less than that over `_COARSENING`, and so on."""
+    found: list[int] = []
+    for count in sorted(counts, reverse=True):
+        if not found or count * _COARSENING < found[-1]:
+            found.append(count)
+    return found[::-1]
+
+
+def _rounded(count: int) -> int:
+    return math.ceil(max(count, 1) / _STEP) * _STEP
+
+
+def _side(count: int, sides: Sequence[int]) -> int:
+    """The least of these sides that is enough; a rounded one where none is, as heights have come to differ."""
+    return next((side for side in sides if side >= count), _rounded(count))
 
 
 def cropped(
@@ -120,10 +136,10 @@ def cropped(
     off: float,
     window: Window,
     around: Window,
-    least: tuple[int, int],
+    sides: _Sides,
 ) -> list[Seen]:
     """What the pictures of a terrain show of a window of it, a weight for each value; `terrain`: its heights as far as they are
-    known; `off`: by how much they may be off in the window; `around`: see `surroundings`; `least`: see `sides_in_sight`."""
+    known; `off`: by how much they may be off in the window; `around`: see `surroundings`; `sides`: see `sides_in_sight`."""
     field, whole = scenes[0].heightfields[0], Window(0, 0, *terrain.shape)
 
     def within(place: Window) -> list[Scene]:
@@ -131,23 +147,26 @@ def cropped(
         return [_with_surroundings(scene, *fields, window, place) for scene in scenes]
 
     parts, everything = within(around), within(whole)
-    places = [_in_sight(scene, terrain[window.place], off) for scene in parts]
+    places = [_Sight.of(scene).of_window(window, terrain[window.place], off) for scene in scenes]
     # Pictures of one size share a program, those of this window and of the next ones.
-    height, width = np.maximum(_sides(places), least).tolist()
+    height, width = (
+        _side(max((place[1][axis] - place[0][axis] for place in places if place is not None), default=1), sides[axis])
+        for axis in (0, 1)
+    )
     found = []
     for index, (scene, place) in enumerate(zip(parts, places, strict=True)):
         if place is None:
             continue
         camera = scene.camera
-        sides = min(height, camera.height), min(width, camera.width)
+        size = min(height, camera.height), min(width, camera.width)
         y, x = (
             int(np.clip((low + high - side) // 2, 0, most - side))
-            for low, high, side, most in zip(*place, sides, (camera.height, camera.width), strict=True)
+            for low, high, side, most in zip(*place, size, (camera.height, camera.width), strict=True)
         )
-        camera, here = cropped_camera(camera, x, y, sides[1], sides[0]), (slice(y, y + sides[0]), slice(x, x + sides[1]))
+        camera, here = cropped_camera(camera, x, y, size[1], size[0]), (slice(y, y + size[0]), slice(x, x + size[1]))
         shows, other = _sight_of(everything[index].with_camera(camera), window, terrain.shape)
-        weight = np.where(other.reshape(*sides, *(1,) * (weights[index].ndim - 2)), 0, weights[index][here])
-        if (weight.reshape(*sides, -1).any(-1) & shows).any():
+        weight = np.where(other.reshape(*size, *(1,) * (weights[index].ndim - 2)), 0, weights[index][here])
+        if (weight.reshape(*size, -1).any(-1) & shows).any():
             found.append(Seen(scene.with_camera(camera), targets[index][here], weight, index))
     return found
 
@@ -199,22 +218,35 @@ def _cropped_texture(image: ImageTexture, shape: tuple[int, ...], window: Window
 Corners = tuple[tuple[int, int], tuple[int, int]]
 
 
-def _in_sight(scene: Scene, heights: Float[np.ndarray, "ny nx"], reach: float) -> Corners | None:
-    """First and last row and column of the picture between which its first heightfield may be seen; None: it is not."""
-    local, camera = localise(scene), scene.camera
-    field, world = scene.heightfields[0], local.objects[scene.first_heightfield].world_from_object
-    ny, nx = field.heights.shape
-    sides = (0, (nx - 1) * field.dx), (0, (ny - 1) * field.dy), (heights.min() - reach, heights.max() + reach)
-    corners = np.stack([part.ravel() for part in np.meshgrid(*sides)] + [np.ones(8)])
-    p = corners[:3] if world is None else (np.asarray(world, np.float64) @ corners)[:3]
-    film = local.camera.film_from_world()
-    x, y, w, depth = np.asarray(film.linear, np.float64) @ p + np.asarray(film.offset, np.float64)[:, None]
-    low, high = [0, 0], [camera.height, camera.width]
-    if (depth > 0).all():
-        for axis, along in enumerate((y / w, x / w)):
-            low[axis] = max(low[axis], math.floor(along.min()) - _MARGIN)
-            high[axis] = min(high[axis], math.ceil(along.max()) + _MARGIN)
-    return None if low[0] >= high[0] or low[1] >= high[1] else ((low[0], low[1]), (high[0], high[1]))
+class _Sight(NamedTuple):
+    """Where a picture shows a terrain: its first heightfield, where that stands in the world, and a projection from there."""
+
+    scene: Scene
+    world: np.ndarray
+    linear: np.ndarray
+    offset: np.ndarray
+
+    @classmethod
+    def of(cls, scene: Scene) -> "_Sight":
+        local = localise(scene)
+        world, film = local.objects[scene.first_heightfield].world_from_object, local.camera.film_from_world()
+        matrices = np.eye(4) if world is None else world, film.linear, film.offset
+        return cls(scene, *(np.asarray(matrix, np.float64) for matrix in matrices))
+
+    def of_window(self, window: Window, heights: Float[np.ndarray, "ny nx"], reach: float) -> Corners | None:
+        """First and last row and column of the picture between which a window may be seen; None: it is not."""
+        field, camera = self.scene.heightfields[0], self.scene.camera
+        xs, ys = ((first * d, (first + n - 1) * d) for first, n, d in
+                  ((window.x, window.nx, field.dx), (window.y, window.ny, field.dy)))  # fmt: skip
+        box = np.meshgrid(xs, ys, (heights.min() - reach, heights.max() + reach))
+        p = (self.world @ np.stack([part.ravel() for part in box] + [np.ones(8)]))[:3]
+        x, y, w, depth = self.linear @ p + self.offset[:, None]
+        low, high = [0, 0], [camera.height, camera.width]
+        if (depth > 0).all():
+            for axis, along in enumerate((y / w, x / w)):
+                low[axis] = max(low[axis], math.floor(along.min()) - _MARGIN)
+                high[axis] = min(high[axis], math.ceil(along.max()) + _MARGIN)
+        return None if low[0] >= high[0] or low[1] >= high[1] else ((low[0], low[1]), (high[0], high[1]))
 
 
 def _sight_of(scene: Scene, window: Window, shape: tuple[int, ...]) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:

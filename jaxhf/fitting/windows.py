@@ -135,7 +135,7 @@ def fit_windows(
     known_heights = np.stack([terrain.heights, np.where(std > 0, mean, terrain.heights)])
     off = _REACH * float(std.max())
     around = surroundings(scenes, (float(known_heights.min()) - off, float(known_heights.max()) + off), order)
-    least = sides_in_sight(scenes, terrain.heights, off + float(np.ptp(known_heights, axis=0).max()), order)
+    sides = sides_in_sight(scenes, terrain.heights, off + float(np.ptp(known_heights, axis=0).max()), order)
     path = None if checkpoint is None else Path(checkpoint.path)
     values = scenes, targets, weights, mean, std, begin, noise
     name = digest((prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)), values)
@@ -145,7 +145,7 @@ def fit_windows(
         place = order[number]
         here = place.place
         off = _REACH * std[here] + np.where(std[here] > 0, np.abs(mean[here] - terrain.heights[here]), 0)
-        seen = cropped(scenes, targets, weights, terrain.heights, float(off.max()), place, around[number], least)
+        seen = cropped(scenes, targets, weights, terrain.heights, float(off.max()), place, around[number], sides)
         tell = False if progress is None else lambda done, number=number: progress(number, len(order), done)
         found = _fit(seen, terrain, known, place, noise, tell, options) if seen else None
         done = Fitted(*place, len(seen))

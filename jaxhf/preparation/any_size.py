@@ -1,8 +1,9 @@
 """Worlds whose programs serve terrains of many sizes: arrays of few lengths, with sizes that are data."""
 
 import dataclasses
+import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,7 @@ from ..trace.skirt import Walls
 from .ceiling import Ceiling
 from .world import Ceilings, World
 
-_LEAST_CELLS, _MOST_CELLS = 2**14, 2**24  # beyond, room would be gigabytes, and pictures take longer than to compile
+_LEAST_CELLS, _MOST_CELLS = 2**14, 2**22  # beyond, room takes hundreds of megabytes
 _SPARE = 5 / 4  # of the cells' number: vertices and the bins of a `Ceiling` are more
 
 
@@ -58,8 +59,14 @@ def with_room(world: World) -> World:
         for number, walls in enumerate(surfaces):
             if isinstance(walls, Walls) and walls.known_shape == grid.shape:
                 surfaces[number] = dataclasses.replace(walls, tops=_padded(walls.tops, room.border))
-    ceilings = roomy_ceilings(world.surfaces, world.ceilings)
-    return dataclasses.replace(world, surfaces=tuple(surfaces), materials=tuple(materials), ceilings=ceilings, sky=tuple(sky))
+    return dataclasses.replace(
+        world,
+        surfaces=tuple(surfaces),
+        materials=tuple(materials),
+        ceilings=roomy_ceilings(world.surfaces, world.ceilings),
+        sky=tuple(sky),
+        has_room=True,
+    )
 
 
 def roomy_ceilings(surfaces: tuple[Surface, ...], ceilings: Ceilings) -> Ceilings:
@@ -75,21 +82,30 @@ def roomy_ceilings(surfaces: tuple[Surface, ...], ceilings: Ceilings) -> Ceiling
     return tuple(tuple(with_its_room(k, ceiling) for k, ceiling in enumerate(of_light)) for of_light in ceilings)
 
 
-def of_any_size(world: World) -> World:
+def of_any_terrain(world: World) -> World:
     """A world with room whose program need not know how large its terrains are; the same where there is none."""
-    shapes = {grid.shape for _, grid, room in _roomy(world.surfaces) if grid.rows.shape[0] == room.vertices}
+    if not world.has_room:
+        return world
+    leaves, structure = jax.tree.flatten(world)
+    return jax.tree.unflatten(_of_any_terrain(structure), leaves)
 
-    def open_sized(surface: Surface) -> Surface:
+
+@functools.cache  # which is asked for each picture
+def _of_any_terrain(structure: Any) -> Any:
+    world = jax.tree.unflatten(structure, [0] * structure.num_leaves)
+    shapes = {grid.known_shape for _, grid, _ in _roomy(world.surfaces)}
+
+    def opened(surface: Surface) -> Surface:
         sized = isinstance(surface, Grid | Walls) and surface.known_shape in shapes
         return dataclasses.replace(surface, known_shape=None) if sized else surface
 
-    return dataclasses.replace(world, surfaces=tuple(map(open_sized, world.surfaces)))
+    return jax.tree.structure(dataclasses.replace(world, surfaces=tuple(map(opened, world.surfaces))))
 
 
 def _roomy(surfaces: tuple[Surface, ...]) -> list[tuple[int, Grid, _Room]]:
     """The heightfields that may have room, with the numbers of their objects."""
-    grids = ((k, surface) for k, surface in enumerate(surfaces) if isinstance(surface, Grid) and surface.seam is None)
-    found = ((k, grid, _room(grid.shape)) for k, grid in grids if grid.known_shape)
+    grids = ((k, surface) for k, surface in enumerate(surfaces) if isinstance(surface, Grid) and surface.known_shape)
+    found = ((k, grid, _room(grid.shape)) for k, grid in grids if grid.seam is None and grid.fixed_steps is None)
     return [(k, grid, room) for k, grid, room in found if room is not None]
 
 
@@ -105,8 +121,8 @@ def _roomy_grid(grid: Grid, room: _Room) -> Grid:
 
 
 def _roomy_texture(image: ImageTexture, grid: Grid, room: _Room) -> ImageTexture | FlatTexture:
-    """An image of the terrain's own size, as colours at the vertices are; others stay as they are."""
-    if image.texels.shape[:2] != grid.shape:
+    """An image of the terrain's own size, as colours at the vertices are; others, and those of a user's class, stay."""
+    if type(image) is not ImageTexture or image.texels.shape[:2] != grid.shape:
         return image
     flat = FlatTexture.of(image)
     return dataclasses.replace(flat, texels=_padded(flat.texels, room.vertices))

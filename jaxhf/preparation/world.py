@@ -46,6 +46,7 @@ class World(eqx.Module):
         heightfield under a directional light, and where no walk is to be spared.
       sky: for each object, what it leaves to see of the sky at its vertices, see `visible_sky`; None for all but heightfields,
         and where no sky is hidden.
+      has_room: see `with_room`.
       settings: nothing in them is left to the scene, see `resolve_settings`.
     """
 
@@ -55,6 +56,7 @@ class World(eqx.Module):
     ceilings: Ceilings
     sky: tuple[Float[jax.Array, "_ 3"] | None, ...]
     settings: Settings = eqx.field(static=True)
+    has_room: bool = eqx.field(static=True, default=False)
 
     @property
     def grids(self) -> tuple[tuple[int, Grid, int], ...]:

@@ -15,7 +15,7 @@ from ..core.precision import numbers
 from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import array_leaf, float_leaf
-from ..preparation.any_size import of_any_size
+from ..preparation.any_size import of_any_terrain
 from ..preparation.localise import anchor, localise, precision
 from ..preparation.world import World, first_hit, make_world, resolve_settings
 from ..scene.heightfield import Heightfield
@@ -142,9 +142,9 @@ def cast(
     starts = jax.tree.map(lambda leaf: in_a_row(leaf, leaf.shape[axes:]), start)
     rays = starts, in_a_row(d, (3,))
     if isinstance(surface, Scene):
-        shape = of_any_size(prepared_world(localise(surface.with_lights(())), chosen))
+        shape = of_any_terrain(prepared_world(localise(surface.with_lights(())), chosen))
     elif isinstance(surface, Prepared):
-        shape = of_any_size(surface._world)
+        shape = of_any_terrain(surface._world)
     else:
         shape = surface._grid if isinstance(surface, PreparedHeightfield) else _with_one_axis(field)
     hit = (_cast_each if batch else _cast_one)(shape, *rays, chosen)

@@ -15,9 +15,9 @@ from ..boundary.guiding import has_edges
 from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
 from ..core.settings import Settings
-from ..preparation.any_size import of_any_size
+from ..preparation.any_size import of_any_terrain
 from ..preparation.world import World
-from ..scene.camera import Camera, of_any_size as of_any_picture_size
+from ..scene.camera import Camera, of_any_size
 from ..xla.compilation import compiled, is_part_of_more
 from ..xla.devices import everywhere, in_order, map_over, on_every_device, on_host
 from ..xla.kernel import in_turn, one_kernel
@@ -33,9 +33,10 @@ _OF_ITS_SIZE = 64
 
 def picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> dict[str, jax.Array]:
     """The picture ("image") and AOVs, each of shape (h, w, ...)."""
-    if is_part_of_more((world, camera)) or _are_few(Tiling(camera.width, camera.height, world.settings)):
+    is_part = is_part_of_more((world, camera))
+    if is_part or _are_few(Tiling(camera.width, camera.height, world.settings)):
         drawn = on_every_device(key, mesh) if world.settings.edge_samples else None  # else the settings draw nothing
-        seen = world if is_part_of_more((world, camera)) or has_edges(world) else of_any_size(world)
+        seen = world if is_part or has_edges(world) else of_any_terrain(world)
         return trace_picture(seen, camera, aovs, mesh, drawn)
     parts = [part for _, part in _parts(world, camera, aovs, mesh, _at_once(world.settings, mesh))]
     if mesh.devices.size > 1:  # XLA ends the process where a device waits for another one's part for 60 s
@@ -100,7 +101,7 @@ def trace_in_parts(
     tiling = Tiling(camera.width, camera.height, world.settings)
     pixels, parts = tiling.width * tiling.height, []
     if _are_few(tiling):
-        found = jax.device_get(trace_picture(of_any_size(world), camera, aovs, mesh, None))
+        found = jax.device_get(trace_picture(of_any_terrain(world), camera, aovs, mesh, None))
         progress(pixels, pixels)
         return found
     size = min(_at_once(world.settings, mesh), math.ceil(tiling.count / 64))
@@ -116,7 +117,7 @@ def _parts(
     """So many tiles after the other, as `map_first` leaves them, and how many are then done."""
     most = _at_once(world.settings, mesh)
     corners = Tiling(camera.width, camera.height, world.settings).corners()
-    seen = of_any_size(world), of_any_picture_size(camera)
+    seen = of_any_terrain(world), of_any_size(camera)
     for first in range(0, len(corners), size):
         some = corners[first : first + size]
         padded = np.concatenate([some, np.zeros((most - len(some), 2), np.int32)])

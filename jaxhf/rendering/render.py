@@ -100,7 +100,7 @@ class Prepared(eqx.Module):
             return prepare(self.scene.with_lights(scene.lights), self.settings, mesh=self.mesh)
         local = localise_lights(scene.lights, np.array(self._origin), precision(self._form))
         local = on_every_device(local, prepared_mesh("with_lights", self.mesh, None, local))
-        ceilings = _make_ceilings(self._world.surfaces, local, self.settings)
+        ceilings = _make_ceilings(self._world.surfaces, local, self.settings, has_room=self._world.has_room)
         world = dataclasses.replace(self._world, lights=local, ceilings=ceilings)
         return dataclasses.replace(self, _world=world, _given=_Given(self._given.scene and scene))
 
@@ -259,9 +259,10 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
     return lax.map(lambda z: make_grid(Heightfield(z, dx, dy), None, settings), heights)
 
 
-@functools.partial(compiled, static_argnames=("settings",))
-def _make_ceilings(surfaces: tuple[Surface, ...], lights: tuple[Light, ...], settings: Settings) -> Ceilings:
-    return roomy_ceilings(surfaces, make_ceilings(surfaces, lights, settings))
+@functools.partial(compiled, static_argnames=("settings", "has_room"))
+def _make_ceilings(surfaces: tuple[Surface, ...], lights: tuple[Light, ...], settings: Settings, has_room: bool) -> Ceilings:
+    ceilings = make_ceilings(surfaces, lights, settings)
+    return roomy_ceilings(surfaces, ceilings) if has_room else ceilings
 
 
 def _made_world(scene: Scene, settings: Settings, has_room: bool) -> World:

@@ -17,7 +17,7 @@ from ..core.types import MOST_PLACES, Flag, Index, Scalar
 from ..core.vector import floor_to_power_of_two
 from ..scene.heightfield import Heightfield
 from .normals import vertex_normals
-from .pyramid import Pyramid, make_pyramid
+from .pyramid import Pyramid, enough_steps, levels_of, make_pyramid
 from .triangle import Corners, plane_through, triangle_corners
 
 
@@ -37,8 +37,9 @@ class Grid(eqx.Module):
       pyramid: bounds over blocks of cells.
       normals: at the vertices, object frame; None where shading is flat.
       cells, extent: cells along x and along y, the second as numbers of the heights' type.
-      known_shape: (ny, nx); None where a program serves several, see `of_any_size`.
-      max_steps, early_exit: of searches on it, as in `Settings`, see `first_triangle`.
+      known_shape: (ny, nx); None where a program serves several, see `of_any_terrain`.
+      most_steps: of a search on it: as many as suffice for any ray, or `Settings.max_steps` if that is less.
+      fixed_steps: the same, where searches always take all of them; None where they end early, see `Settings.early_exit`.
       perturbation: what is added at the vertices of the triangle that a ray meets, for derivatives of one ray in those
         numbers alone; None: nothing.
       first: the place of the first vertex in `rows` and `normals`; None: 0, else they hold several grids, see `joined`.
@@ -56,8 +57,8 @@ class Grid(eqx.Module):
     cells: tuple[Index, Index]
     extent: tuple[Scalar, Scalar]
     known_shape: tuple[int, int] | None = eqx.field(static=True)
-    max_steps: int | None = eqx.field(static=True)
-    early_exit: bool = eqx.field(static=True)
+    most_steps: Index
+    fixed_steps: int | None = eqx.field(static=True)
     perturbation: Corners | None = None
     first: Index | None = None
     seam: Bool[jax.Array, "ny nx"] | None = None
@@ -78,12 +79,6 @@ class Grid(eqx.Module):
     def nx(self) -> Index:
         """Vertices in a row."""
         return self.cells[0] + 1
-
-    @property
-    def most_steps(self) -> Index:
-        """Of a search: as many as suffice for any ray, or `max_steps` if that is less."""
-        enough = self.pyramid.enough
-        return enough if self.max_steps is None else jnp.minimum(enough, jnp.int32(min(self.max_steps, MOST_PLACES)))
 
 
 def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Settings) -> Grid:
@@ -115,11 +110,15 @@ def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Se
     normals = None
     if settings.shading == "smooth":
         normals = _at_seam(field, vertex_normals(heights, field.dx, field.dy, settings.normals or "six")).reshape(-1, 3)
-    pyramid = make_pyramid(lax.stop_gradient(z), z_top, 0 if settings.traversal == "dda" else None)
+    has_levels = settings.traversal != "dda"
+    levels = levels_of((ny, nx)) if has_levels else 0
+    pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels, has_levels)
+    most = enough_steps(nx - 1, ny - 1, levels)
+    most = most if settings.max_steps is None else min(settings.max_steps, most)
     cells, extent = ((jnp.asarray(nx - 1, kind), jnp.asarray(ny - 1, kind)) for kind in (jnp.int32, dtype))
     return Grid(
         z.reshape(-1), z_top, pyramid, normals, world_from_grid, grid_from_world, object_from_world,
-        cells, extent, (ny, nx), settings.max_steps, settings.early_exit,
+        cells, extent, (ny, nx), jnp.int32(most), None if settings.early_exit else most,
         seam=None if field.seam is None else jnp.isfinite(field.seam[..., 0]),
     )  # fmt: skip
 
@@ -160,7 +159,7 @@ def joined(grids: Grid) -> tuple[Grid, Grid]:
             pyramid.log_width,
             pyramid.largest,
             pyramid.below,
-            pyramid.enough,
+            grid.most_steps,
         )
 
     def of_all(leaf: jax.Array) -> jax.Array:

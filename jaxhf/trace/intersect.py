@@ -144,7 +144,7 @@ def surface_hit(grid: Grid, number: int, ray: Ray, scale: Scalar, found: WalkRes
             normals = _moved(normals, grid.perturbation.normals)
     plane = plane_through(heights, found.upper)
     met = found.status == int(Status.HIT)
-    t, *geometry = only_where(met, _geometry_with(tangents), grid, ray, found, plane, normals, skips=grid.early_exit)
+    t, *geometry = only_where(met, _geometry_with(tangents), grid, ray, found, plane, normals, skips=grid.fixed_steps is None)
     t = jnp.where(met, t / scale, jnp.inf)
     t, p, n, ns, uv, *more = materialise((t, *geometry))
     return Hit(

@@ -31,7 +31,6 @@ class Pyramid(eqx.Module):
       log_width: the power of two.
       largest: cells along a side of the coarsest level's blocks.
       below: where the bounds for rays below begin.
-      enough: a number of steps that suffices for any ray, see `enough_steps`.
       has_levels: whether there may be any above the finest.
       first: where the first bound stands; None: at 0, else `bounds` holds those of several grids, one after the other.
     """
@@ -42,7 +41,6 @@ class Pyramid(eqx.Module):
     log_width: Index
     largest: Index
     below: Index
-    enough: Index
     has_levels: bool = eqx.field(static=True)
     first: Index | None = None
 
@@ -58,18 +56,22 @@ class Pyramid(eqx.Module):
         return value_at(self.bounds, index)
 
 
-def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None) -> Pyramid:
+def levels_of(shape: tuple[int, ...]) -> int:
+    """How many stand above the finest for a grid of this shape, until a block spans its shorter side."""
+    return next_power_of_two(min(shape) - 1).bit_length() - 1
+
+
+def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int, has_levels: bool = True) -> Pyramid:
     """Builds the bounds by dense reductions: no loop on the host, and none over the cells.
 
     Args:
       z: heights, 0 to `z_top`; nan in holes.
       z_top: the largest.
-      levels: how many above the finest; None: until a block spans the shorter side.
+      levels: how many above the finest.
+      has_levels: see `Pyramid`.
     """
     ny, nx = z.shape
     width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)
-    most = min(width, height).bit_length() - 1
-    has_levels, levels = levels != 0, most if levels is None else min(levels, most)
     outwards = 32 * jnp.finfo(z.dtype).eps * z_top
     hole = jnp.isnan(z)
     gone = jnp.pad(hole[:-1] | hole[1:], ((1, 1), (0, 0)), constant_values=True)
@@ -99,7 +101,6 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int | None
         log_width=jnp.int32(width.bit_length() - 1),
         largest=jnp.int32(2**levels),
         below=jnp.int32(above.size),
-        enough=jnp.int32(enough_steps(nx - 1, ny - 1, levels)),
         has_levels=has_levels,
     )
 

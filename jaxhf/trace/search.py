@@ -34,7 +34,7 @@ def first_triangle(
     the distance to each crossing recomputed from the integer cell, as a running sum drifts; with all levels, that of Tevs
     et al. (I3D 2008) over their maximum mipmaps. The loop has a fixed budget of steps, each of which skips up to two blocks and
     visits one cell: the grid's `most_steps`. It ends early, when all rays of the batch have ended; without
-    the grid's `early_exit` it always takes all of them. The search is discrete and under
+    `Settings.early_exit` it always takes all of them. The search is discrete and under
     `stop_gradient`; derivatives begin at the hit, see `surface_hit` in `intersect.py`.
 
     Args:
@@ -49,7 +49,7 @@ def first_triangle(
     """
     grid, ray, leaving, t_max = lax.stop_gradient((grid, ray, leaving, t_max))
     walk, state, valid = walk_start(grid, ray, leaving, number, t_max, active)
-    state, steps = _search(walk, state, count_steps, grid.early_exit)
+    state, steps = _search(walk, state, count_steps, grid.fixed_steps)
     return walk.finish(state, valid, steps)
 
 
@@ -57,18 +57,18 @@ def first_triangle(
 SKIPS = 2
 
 
-def _search(walk: Walk, state: jax.Array, count: bool, early_exit: bool) -> tuple[jax.Array, Index | None]:
+def _search(walk: Walk, state: jax.Array, count: bool, fixed_steps: int | None) -> tuple[jax.Array, Index | None]:
     """The state in which a walk ends, and the number of its steps if they are to be counted.
 
     Under `vmap` the steps are repeated until the last walk of the batch has ended. JAX's own rule for `while_loop` would
     count the steps of each ray and keep the state of an ended walk by a selection; `Walk` does both by itself, so that this
     rule leaves them out (without it a frame takes 1.06 to 1.09 of the time).
     """
-    one = _search_many(jax.tree.map(lambda _: False, walk), count, early_exit)
+    one = _search_many(jax.tree.map(lambda _: False, walk), count, fixed_steps)
     return jax.tree.map(lambda leaf: leaf[0], one(walk, state[None]))
 
 
-def _search_many(of_ray: Walk, count: bool, early_exit: bool) -> Callable[[Walk, jax.Array], Any]:
+def _search_many(of_ray: Walk, count: bool, fixed_steps: int | None) -> Callable[[Walk, jax.Array], Any]:
     """`_search` for a batch of walks, of which `of_ray` says which leaves differ from one to the other.
 
     Under a further `vmap`, as over heightfields each with rays of its own, all become one batch, and grids one array: a loop
@@ -89,7 +89,7 @@ def _search_many(of_ray: Walk, count: bool, early_exit: bool) -> Callable[[Walk,
 
         steps = jnp.zeros(state.shape, jnp.int32) if count else None
         budget = jnp.max(eqx.combine(batched, shared).budget)  # of grids of one shape it is the same
-        return until_ended(advance, (state, steps), budget, early_exit)
+        return until_ended(advance, (state, steps), budget, fixed_steps)
 
     @jax.custom_batching.custom_vmap
     def run(walk: Walk, state: jax.Array):
@@ -101,7 +101,7 @@ def _search_many(of_ray: Walk, count: bool, early_exit: bool) -> Callable[[Walk,
         rays = state.shape[-1]
         flat, differs = _one_batch(walk, of_ray, in_batched[0], axis_size, rays)
         state = jnp.broadcast_to(state, (axis_size, rays)).reshape(-1)
-        ended = _search_many(differs, count, early_exit)(flat, state)
+        ended = _search_many(differs, count, fixed_steps)(flat, state)
         return jax.tree.map(lambda leaf: leaf.reshape(axis_size, rays), ended), jax.tree.map(lambda _: True, ended)
 
     return run
@@ -147,13 +147,13 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
     return flat, with_places(differs, differ, next(given), bounds_differ, next(given))
 
 
-def until_ended(advance: Callable[[Any], Any], carry: Any, budget: Index, early_exit: bool) -> Any:
-    """What a walk carries, `advance`d until it has ended, or `budget` times; without `early_exit` always so many times.
+def until_ended(advance: Callable[[Any], Any], carry: Any, budget: Index, fixed_steps: int | None) -> Any:
+    """What a walk carries, `advance`d until it has ended, or `budget` times; with `fixed_steps` so many times, always.
 
     The first part of `carry` is the state of a walk, or of a batch, where the last one counts.
     """
-    if not early_exit:
-        return lax.fori_loop(0, budget, lambda _, carry: advance(carry), carry)
+    if fixed_steps is not None:
+        return lax.fori_loop(0, fixed_steps, lambda _, carry: advance(carry), carry)
 
     def going(counted):
         step, (state, *_) = counted

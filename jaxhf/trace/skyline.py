@@ -180,7 +180,7 @@ def _outermost_edge(
         return jnp.where(goes_on, state, MISS), slope, jnp.where(found >= 0, found, edge)
 
     init = state, lowest if above else highest, jnp.full_like(leaving.object, -1)
-    state, _, edge = until_ended(advance, init, walk.budget, grid.early_exit)
+    state, _, edge = until_ended(advance, init, walk.budget, grid.fixed_steps)
     return edge, walking(state)
 
 

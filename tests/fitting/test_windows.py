@@ -1,6 +1,7 @@
 """A terrain that is fitted window by window."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,7 @@ def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
     (around,) = surroundings(whole, (0.0, 0.15), [WINDOW])
     assert 24 < around.ny < SIDE
     terrain = TRUTH.astype(np.float64)
-    parts = cropped(whole, images, [np.ones_like(image) for image in images], terrain, 0.0, WINDOW, around, (1, 1))
+    parts = cropped(whole, images, [np.ones_like(image) for image in images], terrain, 0.0, WINDOW, around, ([], []))
     assert len(parts) == len(whole)
     for part in parts:
         assert part.scene.heightfields[0].heights.shape == (24, 24)
@@ -222,18 +223,28 @@ def test_what_is_around_a_window_may_rise_to_its_prior(monkeypatch):
     assert sizes[2] < sizes[1] < (SIDE, SIDE)
 
 
-def test_pictures_of_all_windows_have_one_size(monkeypatch):
+def test_pictures_of_windows_have_few_sizes(monkeypatch):
     """So they share programs, although a window that is nearer to the camera fills more of a picture."""
-    whole = scenes(TRUTH, dataclasses.replace(CAMERA, width=150, height=150))
-    order = divided(TRUTH.shape, 32, 8)
-    alone = {sides_in_sight(whole, TRUTH.astype(float), 0.0, [window]) for window in order}
-    assert len(alone) > 1
+    whole, order = scenes(TRUTH, dataclasses.replace(CAMERA, width=150, height=150)), divided(TRUTH.shape, 32, 8)
+    needed = [sides_in_sight(whole, TRUTH.astype(float), 0.0, [window]) for window in order]
+    assert len({tuple(rows) for rows, _ in needed}) > 1
     fits = Fits(off=0.0)
     monkeypatch.setattr(_windows, "fit", fits)
     fit_windows(whole, [np.zeros((150, 150), np.float32)] * 3, prior=known(), noise=0.1, **OPTIONS | {"overlap": 8})
     sizes = {(scene.camera.height, scene.camera.width) for given in fits.given for scene in given[0]}
     assert len(fits.given) == len(order)
     assert len(sizes) == 1
+
+
+def test_a_window_at_the_camera_does_not_enlarge_the_others():
+    """It is seen all over the picture, or so a box around it behind the camera has it; what needs far less has less."""
+    near = jaxhf.Perspective.look_at((3.1, -1.9, 0.16), (3.5, -1.5, 0.1), fov=60, width=800, height=600)
+    rows, columns = sides_in_sight(scenes(TRUTH, near), TRUTH.astype(float), 0.0, divided(TRUTH.shape, 16, 4))
+    assert (rows[-1], columns[-1]) == (608, 800)
+    assert len(rows) > 1
+    assert rows[0] < 300
+    for sides in (rows, columns):
+        assert all(more > 1.4 * less for less, more in itertools.pairwise(sides))
 
 
 @pytest.mark.parametrize(
