@@ -33,7 +33,7 @@ class Look:
     """What a terrain is shown in."""
 
     azimuth: float = 315.0  # of the sun, degrees clockwise from north
-    altitude: float = 45.0
+    altitude: float = 45.0  # of the sun, degrees above the horizon
     haze: float = 0.15  # the share of light that it takes over the length of the terrain, 0 to 1
     samples: int = 9  # rays a pixel, a square number; with more than one, mountains hide parts of the sky
 
@@ -45,8 +45,10 @@ class Look:
 
 
 def exaggeration(heights: Float[np.ndarray, "ny nx"], dx: float, dy: float) -> float:
-    """A round factor for heights, 1 where it can be, with which the relief, without a hundredth at either end, is from 0.06 to
-    0.6 of the shorter side: a terrain looks neither flat nor like a wall."""
+    """A round factor for heights with which a terrain looks neither flat nor like a wall; 1 where it does so as it is.
+
+    Its relief, without a hundredth at either end, is then from 0.06 to 0.6 of its shorter side.
+    """
     known = heights[np.isfinite(heights)]
     low, high = np.percentile(known, (1, 99))
     ny, nx = heights.shape

@@ -46,9 +46,10 @@ def require_memory(scene: Scene, devices: int) -> None:
     )
 
 
-def require_memory_of_map(command: str, heights: int, precision: str) -> None:
-    """UserError where a map by JAX of so many heights certainly needs more memory than there is."""
-    needed = _BYTES_A_HEIGHT_OF[command] * heights * (2 if precision == "float64" else 1)
+def require_memory_of_map(command: str, heights: int, precision: str, maps: int = 0) -> None:
+    """UserError where a map by JAX of so many heights certainly needs more memory than there is; `maps`: how many are kept to
+    be written into one file, where they stand once more."""
+    needed = (_BYTES_A_HEIGHT_OF[command] + 8 * maps) * heights * (2 if precision == "float64" else 1)
     _require_free(needed, f"{command}: {heights} heights", "", "--bbox takes a part")
 
 

@@ -65,6 +65,8 @@ def test_a_map_that_does_not_fit(refused, monkeypatch, tmp_path):
     assert refused(*words) == said
     assert "take more than 0.0027 GB" in refused(*words, "--precision", "float64")
     day = "--begin", "2026-06-21", "--end", "2026-06-22", "--latitude", "46", "--longitude", "8"
-    for command, more in (("skyview", ()), ("horizon", ("--azimuth", "90")), ("insolation", day)):
+    one, all_in_one = ("--azimuth", "90"), ("--azimuths", "10")
+    cases = ("skyview", (), 60), ("horizon", one, 55), ("horizon", all_in_one, 135), ("insolation", day, 95)
+    for command, more, size in cases:
         words = command, str(tmp_path / "in.npz"), "-o", str(tmp_path / "out.npy"), "--dx", "1", "--dy", "1", *more
-        assert refused(*words).startswith(f"{command}: 15000 heights take more than 0.00")
+        assert refused(*words).startswith(f"{command}: 15000 heights take more than {size * 15e-6:.3g} GB")

@@ -100,6 +100,7 @@ def test_what_is_no_mesh_is_refused(tmp_path):
         ("x.stl", terrain(), {"uv": True}, r"uv cannot stand in an \.stl, as x\.stl is"),
         ("x.stl", terrain(), {"colours": np.zeros((5, 6, 3), np.uint8)}, r"colours cannot stand in an \.stl"),
         ("x.stl", terrain(), {"longer_side": 0.0}, r"longer_side must be positive and finite, it is 0\.0"),
+        ("x.stl", terrain(), {"longer_side": "150"}, "longer_side must be positive and finite, it is '150'"),
         ("x.ply", terrain(), {"base": 6.0}, r"base must lie below all heights, the lowest is 5\.\d+, it is 6\.0"),
         ("x.ply", terrain(), {"colours": np.zeros((5, 6, 3))}, "colours must be uint8 of shape"),
         ("x.ply", Terrain(np.full((2, 2), np.nan)), {}, "must have a cell without a hole"),

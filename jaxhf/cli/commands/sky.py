@@ -32,7 +32,8 @@ def run(options: argparse.Namespace) -> None:
     path = require_writable_raster(options.output)
     options.azimuths = options.azimuths or (64 if make is _insolation else 32)
     stored, terrain = read_in_metres(options)
-    limits.require_memory_of_map(options.command.name, stored.heights.size, options.precision)
+    kept = options.azimuths if make is _horizon and options.azimuth is None and path.suffix.lower() == ".npy" else 0
+    limits.require_memory_of_map(options.command.name, stored.heights.size, options.precision, kept)
     limits.set_up_jax(options)
     begin = time.perf_counter()
     said, count = make(options, path, stored, terrain)

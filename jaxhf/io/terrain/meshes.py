@@ -41,8 +41,8 @@ def save_mesh(
         to be printed or cut. None: the surface alone.
       colours: of the vertices, sRGB as bytes: uint8 of shape (ny, nx, 3) or, with opacity, (ny, nx, 4), row 0 in the south.
       uv: whether each vertex has its position in the footprint, 0..1 to the east and to the north, for an image to be draped.
-      longer_side: how long the footprint's longer side is in the file, to which all is scaled; printers take an .stl's numbers
-        for millimetres. None: as long as in the terrain's unit.
+      longer_side: how long the longer side of the footprint is in the file, holes included, to which all is scaled; printers
+        take an .stl's numbers for millimetres. None: as long as in the terrain's unit.
 
     Raises:
       FileNotFoundError, PermissionError, ValueError: as `require_writable`; or no cell has four heights, or `base`, `colours`,
@@ -56,8 +56,9 @@ def save_mesh(
     if base is not None and not base < np.nanmin(heights, initial=np.inf):
         lowest = np.nanmin(heights, initial=np.inf)
         raise ArgumentError("save_mesh", "base", f"must lie below all heights, the lowest is {lowest:.6g}, it is {base}")
-    if longer_side is not None and not 0 < longer_side < np.inf:
-        raise ArgumentError("save_mesh", "longer_side", f"must be positive and finite, it is {longer_side}")
+    is_number = isinstance(longer_side, int | float | np.number) and not isinstance(longer_side, bool)
+    if longer_side is not None and not (is_number and 0 < longer_side < np.inf):
+        raise ArgumentError("save_mesh", "longer_side", f"must be positive and finite, it is {longer_side!r}")
     if path.suffix.lower() == ".stl" and (uv or colours is not None):
         raise ArgumentError("save_mesh", "uv" if uv else "colours", f"cannot stand in an .stl, as {path.name} is")
     if colours is not None:
