@@ -230,7 +230,8 @@ def test_pictures_of_windows_have_few_sizes(monkeypatch):
     assert len({tuple(rows) for rows, _ in needed}) > 1
     fits = Fits(off=0.0)
     monkeypatch.setattr(_windows, "fit", fits)
-    fit_windows(whole, [np.zeros((150, 150), np.float32)] * 3, prior=known(), noise=0.1, **OPTIONS | {"overlap": 8})
+    options: dict[str, Any] = OPTIONS | {"overlap": 8, "prior": known(), "noise": 0.1}
+    fit_windows(whole, [np.zeros((150, 150), np.float32)] * 3, **options)
     sizes = {(scene.camera.height, scene.camera.width) for given in fits.given for scene in given[0]}
     assert len(fits.given) == len(order)
     assert len(sizes) == 1
