@@ -1,7 +1,6 @@
 """Worlds whose programs serve terrains of many sizes: arrays of few lengths, with sizes that are data."""
 
 import dataclasses
-import functools
 import math
 from typing import Any, NamedTuple
 
@@ -82,24 +81,25 @@ def roomy_ceilings(surfaces: tuple[Surface, ...], ceilings: Ceilings) -> Ceiling
     return tuple(tuple(with_its_room(k, ceiling) for k, ceiling in enumerate(of_light)) for of_light in ceilings)
 
 
+_FORMS: dict[Any, Any] = {}
+"""For the structure of a world, that of `of_any_terrain` of it, which is asked for each picture."""
+
+
 def of_any_terrain(world: World) -> World:
     """A world with room whose program need not know how large its terrains are; the same where there is none."""
     if not world.has_room:
         return world
     leaves, structure = jax.tree.flatten(world)
-    return jax.tree.unflatten(_of_any_terrain(structure), leaves)
+    if structure not in _FORMS:
+        shapes = {grid.known_shape for _, grid, _ in _roomy(world.surfaces)}
+        surfaces = (_opened(surface, shapes) for surface in world.surfaces)
+        _FORMS[structure] = jax.tree.structure(dataclasses.replace(world, surfaces=tuple(surfaces)))
+    return jax.tree.unflatten(_FORMS[structure], leaves)
 
 
-@functools.cache  # which is asked for each picture
-def _of_any_terrain(structure: Any) -> Any:
-    world = jax.tree.unflatten(structure, [0] * structure.num_leaves)
-    shapes = {grid.known_shape for _, grid, _ in _roomy(world.surfaces)}
-
-    def opened(surface: Surface) -> Surface:
-        sized = isinstance(surface, Grid | Walls) and surface.known_shape in shapes
-        return dataclasses.replace(surface, known_shape=None) if sized else surface
-
-    return jax.tree.structure(dataclasses.replace(world, surfaces=tuple(map(opened, world.surfaces))))
+def _opened(surface: Surface, shapes: set[tuple[int, int] | None]) -> Surface:
+    sized = isinstance(surface, Grid | Walls) and surface.known_shape in shapes
+    return dataclasses.replace(surface, known_shape=None) if sized else surface
 
 
 def _roomy(surfaces: tuple[Surface, ...]) -> list[tuple[int, Grid, _Room]]:

@@ -94,7 +94,7 @@ def test_colours_and_texture_coordinates(tmp_path):
     assert not any("material" in line for line in lines)
 
 
-def test_what_is_no_mesh_is_refused(tmp_path):
+def test_what_is_no_mesh_is_refused(tmp_path, as_users_call_it):
     cases: list[tuple[str, Terrain, dict[str, Any], str]] = [
         ("x.off", terrain(), {}, r"cannot write a mesh with the ending '\.off'"),
         ("x.stl", terrain(), {"uv": True}, r"uv cannot stand in an \.stl, as x\.stl is"),
