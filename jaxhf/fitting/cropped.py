@@ -99,8 +99,10 @@ _Sides = tuple[list[int], list[int]]
 def sides_in_sight(
     scenes: Sequence[Scene], terrain: Float[np.ndarray, "my mx"], off: float, windows: Sequence[Window]
 ) -> _Sides:
-    """So many as the parts of pictures need that show each of these windows, by few sizes: what needs more than a size over
-    `_COARSENING` has that one. The arguments are those of `cropped`."""
+    """For the parts of pictures that show each of these windows; the arguments are those of `cropped`.
+
+    They are few: a part has the least of them that is enough, at most `_COARSENING` times what it needs.
+    """
     found: list[tuple[int, int]] = []
     for scene in scenes:
         sight = _Sight.of(scene)
