@@ -74,7 +74,12 @@ def _meet_hfield(
 def one_axis(hfield: HField) -> HField:
     """A batch, or a single one, as a batch with one axis, its numbers in the precision of the heights."""
     axes, count = len(hfield.batch), math.prod(hfield.batch)
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf, hfield.data.dtype).reshape(count, *leaf.shape[axes:]), hfield)
+
+    def in_a_row(leaf: jax.Array) -> jax.Array:
+        whole = jnp.issubdtype(leaf.dtype, jnp.integer)  # as sizes of a grid at hand are
+        return jnp.asarray(leaf, None if whole else hfield.data.dtype).reshape(count, *leaf.shape[axes:])
+
+    return jax.tree.map(in_a_row, hfield)
 
 
 def _searchable(hfield: HField) -> Ground:

@@ -31,11 +31,11 @@ def test_a_second_run_does_not_trace(tmp_path):
         pictures.append(np.load(tmp_path / name))
         paths = list((tmp_path / "kept").glob("jaxhf-*/*"))
         kept = {path.name.split("-")[0] for path in paths}
-        assert {"jaxhf.rendering.picture.trace_picture", "jaxhf.preparation.world.make_world"} <= kept
+        assert {"jaxhf.rendering.picture.trace_picture", "jaxhf.rendering.render._made_world"} <= kept
         for path in paths:
             if path.name.startswith("jit_"):
                 path.unlink()
-    assert not {"jit_trace_picture", "jit_make_world"} & kept
+    assert not {"jit_trace_picture", "jit__made_world"} & kept
     np.testing.assert_array_equal(*pictures)
 
 
