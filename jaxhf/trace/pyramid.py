@@ -28,7 +28,7 @@ class Pyramid(eqx.Module):
     Attributes:
       bounds: level after level, each row padded to the finest's width; first for rays above, then for rays below.
       width, height: of the finest level, cells, rounded up to powers of two.
-      log_width: the power of two.
+      log_width: the base-2 logarithm of `width`.
       largest: cells along a side of the coarsest level's blocks.
       below: where the bounds for rays below begin.
       has_levels: whether there may be any above the finest.
