@@ -134,3 +134,18 @@ def compilations() -> Iterator[list[str]]:
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield events
     jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.fixture
+def traced(monkeypatch) -> list[tuple[str, ...]]:
+    """What was traced for tiles."""
+    from jaxhf.rendering import tiles  # not before annotations are checked
+
+    found, trace_tile = [], tiles._trace_tile
+
+    def noted(aovs, *args):
+        found.append(aovs)
+        return trace_tile(aovs, *args)
+
+    monkeypatch.setattr(tiles, "_trace_tile", noted)
+    return found

@@ -110,9 +110,8 @@ def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Se
     normals = None
     if settings.shading == "smooth":
         normals = _at_seam(field, vertex_normals(heights, field.dx, field.dy, settings.normals or "six")).reshape(-1, 3)
-    has_levels = settings.traversal != "dda"
-    levels = levels_of((ny, nx)) if has_levels else 0
-    pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels, has_levels)
+    levels = 0 if settings.traversal == "dda" else levels_of((ny, nx))
+    pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels)
     most = enough_steps(nx - 1, ny - 1, levels)
     most = most if settings.max_steps is None else min(settings.max_steps, most)
     cells, extent = ((jnp.asarray(nx - 1, kind), jnp.asarray(ny - 1, kind)) for kind in (jnp.int32, dtype))

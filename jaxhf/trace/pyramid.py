@@ -31,7 +31,7 @@ class Pyramid(eqx.Module):
       log_width: the base-2 logarithm of `width`.
       largest: cells along a side of the coarsest level's blocks.
       below: where the bounds for rays below begin.
-      has_levels: whether there may be any above the finest.
+      has_levels: whether there are any above the finest.
       first: where the first bound stands; None: at 0, else `bounds` holds those of several grids, one after the other.
     """
 
@@ -61,14 +61,13 @@ def levels_of(shape: tuple[int, ...]) -> int:
     return next_power_of_two(min(shape) - 1).bit_length() - 1
 
 
-def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int, has_levels: bool = True) -> Pyramid:
+def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int) -> Pyramid:
     """Builds the bounds by dense reductions: no loop on the host, and none over the cells.
 
     Args:
       z: heights, 0 to `z_top`; nan in holes.
       z_top: the largest.
       levels: how many above the finest.
-      has_levels: see `Pyramid`.
     """
     ny, nx = z.shape
     width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)
@@ -101,7 +100,7 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int, has_l
         log_width=jnp.int32(width.bit_length() - 1),
         largest=jnp.int32(2**levels),
         below=jnp.int32(above.size),
-        has_levels=has_levels,
+        has_levels=levels > 0,
     )
 
 

@@ -11,7 +11,7 @@ import jaxhf
 from jaxhf.preparation import any_size
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import World, resolve_settings
-from jaxhf.rendering import render, tiles
+from jaxhf.rendering import render
 from jaxhf.scene.procedural import fractal
 
 SETTINGS = jaxhf.Settings(chunk=64)
@@ -51,19 +51,6 @@ def holed(shape: tuple[int, int]) -> jaxhf.Scene:
     heights = np.array(scene(shape).heights)
     heights[5:15, 10:20], heights[:, -1] = np.nan, np.nan
     return scene(shape).with_heights(heights)
-
-
-@pytest.fixture
-def traced(monkeypatch) -> list[tuple[str, ...]]:
-    """What was traced for tiles."""
-    found, trace_tile = [], tiles._trace_tile
-
-    def noted(aovs, *args):
-        found.append(aovs)
-        return trace_tile(aovs, *args)
-
-    monkeypatch.setattr(tiles, "_trace_tile", noted)
-    return found
 
 
 @pytest.mark.parametrize("make", [scene, pytest.param(solid, marks=pytest.mark.deep)])

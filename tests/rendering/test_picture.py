@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.rendering import picture, tiles
+from jaxhf.rendering import picture
 from jaxhf.scene.camera import of_any_size
 from jaxhf.scene.procedural import fractal
 
@@ -24,19 +24,6 @@ def scene(cells: int = 12, kind: type = jaxhf.Perspective) -> jaxhf.Scene:
 
 def seen(scene: jaxhf.Scene, width: int, height: int) -> jaxhf.Scene:
     return scene.with_camera(dataclasses.replace(scene.camera, width=width, height=height))
-
-
-@pytest.fixture
-def traced(monkeypatch) -> list[tuple[str, ...]]:
-    """What was traced for tiles."""
-    found, trace_tile = [], tiles._trace_tile
-
-    def noted(aovs, *args):
-        found.append(aovs)
-        return trace_tile(aovs, *args)
-
-    monkeypatch.setattr(tiles, "_trace_tile", noted)
-    return found
 
 
 def test_another_size_needs_no_other_program(traced):
