@@ -43,29 +43,32 @@ def test_a_whole_step_solves_the_linear_problem():
     assert step.length == pytest.approx(rms(basis.crop(expected[:count].reshape(basis.base.shape))), rel=5e-3)
     assert step.predicted == pytest.approx(-gradient @ expected / 2, rel=5e-3)
     assert step.loss == pytest.approx(sum(np.sum(np.square(part)) for part in (*images, *priors)) / 2, rel=1e-5)
-    half = relaxed(here.unknowns, step)
-    np.testing.assert_allclose(half.coefficients, step.change.coefficients / 2, atol=1e-6)
+    there = relaxed(here.unknowns, step)
+    np.testing.assert_allclose(there.coefficients, 0.75 * step.change.coefficients, atol=1e-6)
 
 
-@pytest.mark.parametrize(("lengths", "accepted"), [((1.0, 0.5, 0.46), [True, False]), ((1.0, 2.0), [False])])
-def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, monkeypatch):
-    """Whatever becomes of the loss: else all stays as it was."""
+@pytest.mark.parametrize(
+    ("lengths", "accepted", "goes_on"),
+    [((1.0, 0.5, 0.46), [True, False], [True, True]), ((1.0, 2.0), [False], [True]), ((1.0, 0.7), [True], [False])],
+)
+def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, goes_on, monkeypatch):
+    """Whatever becomes of the loss: else all stays as it was. Where the next is hardly shorter, nothing is left to be gained."""
     here = expanded(scenes(), pictures(), settings=SETTINGS, noise=0.01)
     ones = jax.tree.map(jnp.ones_like, here.unknowns)
     steps = [WholeStep(ones, length, 10 * length, 7.0 + number) for number, length in enumerate(lengths)]
     state = dataclasses.replace(first_state(here.problem, here.unknowns), stage=4)
     place: Any = _run._Place(here, None, steps[0])
     monkeypatch.setattr(_run, "expand", lambda unknowns, problem: dataclasses.replace(here, unknowns=unknowns))
-    for number, taken in enumerate(accepted, 1):
+    for number, (taken, more) in enumerate(zip(accepted, goes_on, strict=True), 1):
         monkeypatch.setattr(_run, "whole_step", lambda _, number=number: steps[number])
         before, there = state.unknowns, place.expansion
         state, place = _run._stepped(state, place, Stage(0, 1.0, by_factors=True), 0.0)
         kept = steps[number if taken else number - 1]
         assert (state.history[-1].accepted, state.history[-1].step) == (taken, number)
-        assert (state.loss, state.predicted, place.whole_step) == (kept.loss, kept.predicted, kept)
-        assert state.history[-1].change == (0.5 * lengths[number - 1] if taken else 0)
+        assert (state.loss, state.predicted, place.whole_step) == (kept.loss, kept.predicted if more else 0, kept)
+        assert state.history[-1].change == (0.75 * lengths[number - 1] if taken else 0)
         assert (place.expansion is there) != taken
-        np.testing.assert_allclose(state.unknowns.coefficients, before.coefficients + (0.5 if taken else 0))
+        np.testing.assert_allclose(state.unknowns.coefficients, before.coefficients + (0.75 if taken else 0))
 
 
 def test_fits_of_few_heights_with_points_on_edges_end_so(monkeypatch):

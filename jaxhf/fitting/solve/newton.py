@@ -2,7 +2,8 @@
 
 Pictures of few samples a pixel change by jumps, and the loss with them. A trust region, which accepts by the loss, stops where
 the jumps are lucky, short of the end along all that pictures tell little of. So these steps are judged by the next one, which
-must be shorter (Deuflhard's natural monotonicity test, Newton Methods for Nonlinear Problems, 2004, chapters 3 and 4).
+must be shorter (Deuflhard's natural monotonicity test, Newton Methods for Nonlinear Problems, 2004, chapters 3 and 4). A
+quarter of a step is left where pictures are linear; where more than 0.6 is, it mostly follows jumps, and the fit ends.
 """
 
 from typing import NamedTuple
@@ -17,8 +18,9 @@ from ..model.normal_matrix import in_row
 from ..model.robust import soften
 from ..model.surface import Unknowns
 
-RELAXED = 0.5  # of a whole step: the jumps of the loss make the half of it
-SHORTER = 0.9  # of the step before: as long a one follows jumps alone; half of it would be left of a linear problem's
+RELAXED = 0.75  # of a whole step, part of which is made by jumps of the loss
+SHORTER = 0.9  # of the step before: a longer one follows jumps alone, and the one before is not accepted
+LAST = 0.6  # of the step before: a longer one is mostly made by jumps, and is not taken
 _TOLERANCE = 1e-3  # of the linear problem
 
 

@@ -16,7 +16,7 @@ from ..model.problem import LOSS_SCALE, Problem
 from ..model.rows import has_rows
 from ..model.surface import Unknowns, make_basis
 from ..model.units import balanced
-from .newton import RELAXED, SHORTER, WholeStep, relaxed, whole_step
+from .newton import LAST, RELAXED, SHORTER, WholeStep, relaxed, whole_step
 from .noise import Estimate, Restricted, explains_noise, rms, spreads, widened
 from .stages import Stage, on_finer, stages, varies_all, why_ended
 from .state import State
@@ -95,15 +95,15 @@ def _step(state: State, place: _Place) -> tuple[Unknowns, _Place, Outcome]:
 
 
 def _step_by_factors(state: State, place: _Place) -> tuple[Unknowns, _Place, Outcome]:
-    here, unknowns = place.whole_step, state.unknowns
+    here = place.whole_step
     assert here is not None
-    expansion = expand(relaxed(unknowns, here), place.expansion.problem)
-    there, change = whole_step(expansion), 0.0
-    accepted = there.length <= SHORTER * here.length
-    if accepted:
-        unknowns, place, change = expansion.unknowns, _Place(expansion, None, there), RELAXED * here.length
-    kept = there if accepted else here
-    return unknowns, place, Outcome(kept.loss, accepted, kept.predicted, state.step_size, change)
+    expansion = expand(relaxed(state.unknowns, here), place.expansion.problem)
+    there = whole_step(expansion)
+    if there.length > SHORTER * here.length:
+        return state.unknowns, place, Outcome(here.loss, False, here.predicted, state.step_size, 0.0)
+    predicted = there.predicted if there.length <= LAST * here.length else 0.0
+    outcome = Outcome(there.loss, True, predicted, state.step_size, RELAXED * here.length)
+    return expansion.unknowns, _Place(expansion, None, there), outcome
 
 
 def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None, given: Given) -> tuple[State, _Place] | None:

@@ -23,9 +23,9 @@ _FIELD_GAIN = 1e-4  # the same beside an `AlbedoField`, which leaves pictures li
 _LEFT_GAIN = 2e-4  # the same at the end, where steps are whole ones: by 0.02 of it
 _COARSE_GAIN = 0.02  # of the loss, where another stage follows
 _COARSE_STEPS = 8  # at most, where another stage follows: what is left there is mostly for shorter modes to explain
-_USUAL_STEPS, _USUAL_COARSE_STEPS = 5, 4  # of a stage, for what progress says is to come
+_USUAL_STEPS, _USUAL_COARSE_STEPS, _USUAL_BY_FACTORS = 5, 4, 2  # of a stage, for what progress says is to come
 _LAST_STAGES = 3  # at most, over which the scale of the robust loss comes down to its own, and the noise is estimated
-_MOST_BY_FACTORS = 10  # steps; four to six are usual
+_MOST_BY_FACTORS = 10  # steps; one to four are usual
 _COARSEST = 8  # modes a side
 
 
@@ -59,7 +59,10 @@ def varies_all(state: State, problems: Sequence[Problem]) -> bool:
 def steps_to_come(state: State, problems: Sequence[Problem], given: Given) -> int:
     """About how many: as many as stages take as a rule."""
     most, done = given.max_steps - len(state.history), len(state.steps)
-    usual, *later = [_USUAL_STEPS if stage.share == 1 else _USUAL_COARSE_STEPS for stage in stages(problems)[state.stage :]]
+    usual, *later = [
+        _USUAL_BY_FACTORS if stage.by_factors else _USUAL_STEPS if stage.share == 1 else _USUAL_COARSE_STEPS
+        for stage in stages(problems)[state.stage :]
+    ]
     return min(most, max(usual - done, 1 + done // 3) + sum(later))
 
 

@@ -36,7 +36,7 @@ class State:
       stage_start: steps taken before it.
       edge_samples: points on edges.
       loss: at `unknowns`.
-      predicted: by how much the next step is to lower it.
+      predicted: by how much the next step is to lower it, see `Outcome`.
       seconds: since the fit began, a resumed one goes on counting.
       history: a `Step` for each step.
     """

@@ -102,8 +102,8 @@ def _silent(**_: Any) -> None:
 
 
 class Outcome(NamedTuple):
-    """What one step did: the loss after it, whether it was accepted, by how much the next one is to lower the loss, 1 / λ of
-    that one, and the change of the heights, root mean square."""
+    """What one step did: the loss after it, whether it was accepted, by how much the next one is to lower the loss (0: it would
+    follow jumps of the loss), 1 / λ of that one, and the change of the heights, root mean square."""
 
     loss: Scalar | float
     accepted: Flag | bool
