@@ -142,7 +142,7 @@ def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 def reading(options: argparse.Namespace) -> dict[str, Any]:
     """Those of a command's options that say how its terrain is read."""
-    return {name: getattr(options, name) for name in ("z_scale", "nodata", "band", "bbox") if name in options}
+    return {name: getattr(options, name) for name in ("z_scale", "nodata", "band", "bbox", "window") if name in options}
 
 
 def refuse(options: argparse.Namespace, *names: str, because: str) -> None:

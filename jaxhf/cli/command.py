@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from .arguments import Option, choice, number, option, real_number, whole
+from .arguments import Option, choice, number, option, real_number, whole, whole_number
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,11 @@ IN = option("terrain", metavar="IN", help=f"heights: {TERRAIN}")
 SCENE = option("scene", metavar="SCENE", help="a .toml or .pbrt scene")
 NODATA = number("--nodata", "V", "a stored value that means no height [as the file says]")
 _BBOX = "only heights within, in the file's coordinates [all]"
+_WINDOW = "in its place the first column and row, and how many, as GDAL's -srcwin"
 PART = (
     whole("--band", "N", "of a raster, the band of heights, from 1 [its only one]", least=1),
     option("--bbox", nargs=4, type=real_number, metavar=("WEST", "SOUTH", "EAST", "NORTH"), help=_BBOX),
+    option("--window", nargs=4, type=whole_number, metavar=("XOFF", "YOFF", "XSIZE", "YSIZE"), help=_WINDOW),
 )
 RASTER = {
     "heights as they are stored": (

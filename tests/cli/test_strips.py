@@ -18,7 +18,7 @@ COMMANDS = [
     "hillshade", "hillshade --compute-edges --variant igor", "hillshade --shadows", "hillshade --scale 1e5", "slope --percent",
     "slope --compute-edges", "aspect --zero-for-flat", "curvature --kind plan --compute-edges", "ruggedness",
     "ruggedness --measure tpi --compute-edges", "relief",
-    "relief --ramp viridis --alpha", "relief --no-shading", "slope --bbox 7.01 45.9 7.05 45.97",
+    "relief --ramp viridis --alpha", "relief --no-shading", "slope --bbox 7.01 45.9 7.05 45.97", "slope --window 3 5 200 290",
 ]  # fmt: skip
 
 

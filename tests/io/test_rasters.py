@@ -136,6 +136,23 @@ def test_a_part_of_a_band(tmp_path, dx, dy):
     assert (ny, nx) == (9, 7)
 
 
+@pytest.mark.parametrize("dx", [30, -30])
+@pytest.mark.parametrize("dy", [20, -20])
+def test_a_window_counts_from_the_first_pixel(tmp_path, dx, dy):
+    """As rasterio's own; of files that are no rasters from the north-west."""
+    path = write(tmp_path / "x.tif", np.random.default_rng(0).uniform(size=(9, 7)).astype(np.float32), (dx, 0, 5e5, 0, dy, 4e6))
+    part = load_heights(path, window=(1, 1, 3, 5))
+    with rasterio.open(path) as dataset:
+        pixels = dataset.read(1, window=((1, 6), (1, 4)))
+        x, y = dataset.xy(5 if dy < 0 else 1, 3 if dx < 0 else 1)
+    np.testing.assert_array_equal(part.heights, pixels[:: -1 if dy < 0 else 1, :: -1 if dx < 0 else 1])
+    assert (part.x0, part.y0) == (x, y)
+    save_heights(tmp_path / "x.npz", load_heights(path))
+    other = load_heights(tmp_path / "x.npz", window=(1 if dx > 0 else 3, 1 if dy < 0 else 3, 3, 5))
+    np.testing.assert_array_equal(other.heights, part.heights)
+    assert other.in_file == part.in_file
+
+
 def test_a_part_of_a_raster_without_a_place(tmp_path):
     """Whose file begins in the north, though its geotransform is none."""
     with warnings.catch_warnings():
@@ -167,6 +184,15 @@ def test_a_part_of_a_terrain_in_degrees(tmp_path):
             {"bbox": (5e5, 4e6 - 60, 5e5 + 30, 4e6)},
             "must be heights, 2 x 2 at least; they stand at x from 500015 to 500105",
         ),
+        (
+            {"window": (0, 0, 5, 3)},
+            r"window must lie within the file's 4 columns and 3 rows, and be 2 x 2 or larger; it is \(0, 0, 5, 3\)",
+        ),
+        ({"window": (-1, 0, 2, 2)}, "window must lie within the file's 4 columns"),
+        ({"window": (0, 2, 2, 2)}, "window must lie within the file's 4 columns"),
+        ({"window": (0, 2, 2, 1)}, "window must lie within the file's 4 columns"),
+        ({"window": (0, 0.5, 2, 2)}, "window must be a column, a row, and how many columns and rows, whole numbers"),
+        ({"window": (0, 0, 2, 2), "bbox": (0, 0, 1, 1)}, "bbox or window must say which heights are taken, not both"),
     ],
 )
 @pytest.mark.usefixtures("as_users_call_it")

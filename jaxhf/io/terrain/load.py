@@ -25,7 +25,7 @@ from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, 
 from .grids import read_asc, read_hgt, read_mujoco
 from .rasters import Rows, raster_rows, read_raster
 from .sidecars import by_world_file
-from .terrain import Box, Nodata, Terrain, heights_of
+from .terrain import Box, Nodata, Terrain, Window, heights_of
 
 
 def load_heights(
@@ -39,6 +39,7 @@ def load_heights(
     nodata: float | None = None,
     band: int | None = None,
     bbox: Box | None = None,
+    window: Window | None = None,
 ) -> Terrain:
     """Reads heights from a file.
 
@@ -64,13 +65,15 @@ def load_heights(
       band: of a raster, which one, from 1; None: it has but one.
       bbox: west, south, east and north in the coordinates of the file, which may be degrees: only the heights that stand within
         are taken, of a raster only these are read. None: all.
+      window: in its place the first column and row, from 0, and how many columns and rows are taken, as GDAL's -srcwin: of a
+        raster in its own order, of other files from the north-west.
 
     Raises:
       FileNotFoundError: no file is there.
       ValueError: the ending is not known, the file is not a whole grid of heights, or its degrees are on a globe of unknown
         size and dx or dy is not given.
     """
-    terrain = read_terrain(path, z_scale, nodata, band=band, bbox=bbox)
+    terrain = read_terrain(path, z_scale, nodata, band=band, bbox=bbox, window=window)
     given = {"dx": dx, "dy": dy, "x0": x0, "y0": y0}
     with reading(Path(path)):
         return terrain.in_metres(**{name: value for name, value in given.items() if value is not None})
@@ -83,6 +86,7 @@ def read_terrain(
     nodata_overrules: bool = True,
     band: int | None = None,
     bbox: Box | None = None,
+    window: Window | None = None,
 ) -> Terrain:
     """As `load_heights`, but in the file's own coordinates, which may be degrees.
 
@@ -100,11 +104,11 @@ def read_terrain(
         if band is not None:
             require("load_heights", "band", band, Whole(1))
         if reader is read_raster:
-            terrain = read_raster(path, chosen, band, bbox)
+            terrain = read_raster(path, chosen, band, bbox, window)
         elif band is not None:
             raise FileError(f"it has no bands, band must be left out; it is {band}")
         else:
-            terrain = reader(path, chosen).within(bbox)
+            terrain = reader(path, chosen).within(bbox, window)
         stored = terrain
         if z_scale != 1:
             with np.errstate(over="ignore", invalid="ignore"):
@@ -128,7 +132,11 @@ _SAMPLE = 2**22  # about how many of these are looked at for values that may mea
 
 @contextlib.contextmanager
 def terrain_rows(
-    path: PathLike, nodata: float | None = None, band: int | None = None, bbox: Box | None = None
+    path: PathLike,
+    nodata: float | None = None,
+    band: int | None = None,
+    bbox: Box | None = None,
+    window: Window | None = None,
 ) -> Iterator[Rows]:
     """As `read_terrain`, for what needs a few rows at once: of a raster of more than `STRIP` heights only these are read."""
     path = require_file(path)
@@ -138,7 +146,8 @@ def terrain_rows(
                 if band is not None:
                     require("load_heights", "band", band, Whole(1))
                 stack.enter_context(import_extra("rasterio", f"reading {path.suffix} needs", "geo").Env(GDAL_CACHEMAX=_CACHE))
-                rows = stack.enter_context(raster_rows(path, lambda named: named if nodata is None else nodata, band, bbox))
+                used = (lambda named: named) if nodata is None else lambda _: nodata
+                rows = stack.enter_context(raster_rows(path, used, band, bbox, window))
             (ny, nx), stored = rows.place.heights.shape, rows.read
 
             def read(part: slice, step: int) -> Terrain:
@@ -150,7 +159,7 @@ def terrain_rows(
                 _warn_of(path, read(slice(0, ny), step))
                 yield Rows(rows.place, read)
                 return
-        yield rows_of(read_terrain(path, nodata=nodata, band=band, bbox=bbox))
+        yield rows_of(read_terrain(path, nodata=nodata, band=band, bbox=bbox, window=window))
 
 
 _CACHE = 2**27  # bytes of GDAL's for blocks of a file, of which it else takes a share of the memory

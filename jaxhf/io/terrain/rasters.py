@@ -22,7 +22,7 @@ from ..gdal import opened
 from ..pictures.codecs import write_png
 from .georeference import Georeference, coordinate_system
 from .sidecars import beside
-from .terrain import Box, Nodata, Terrain, heights_of, places_within
+from .terrain import Box, Nodata, Terrain, Window, heights_of
 
 
 class Rows(NamedTuple):
@@ -38,14 +38,18 @@ class Rows(NamedTuple):
         return self.read(slice(0, ny), 1)
 
 
-def read_raster(path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None) -> Terrain:
+def read_raster(
+    path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None, window: Window | None = None
+) -> Terrain:
     """The heights in a raster, in its own coordinates; of a band, from 1, and of a part, see `load_heights`."""
-    with raster_rows(path, nodata, band, box) as rows:
+    with raster_rows(path, nodata, band, box, window) as rows:
         return rows.whole()
 
 
 @contextlib.contextmanager
-def raster_rows(path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None) -> Iterator[Rows]:
+def raster_rows(
+    path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None, window: Window | None = None
+) -> Iterator[Rows]:
     """As `read_raster`, while the file is open."""
     with opened(path) as dataset:
         if band is None and dataset.count != 1:
@@ -58,19 +62,19 @@ def raster_rows(path: Path, nodata: Nodata, band: int | None = None, box: Box | 
             raise FileError(f"its scale and offset must be finite, the scale not zero; they are {scale} and {offset}")
         used = nodata(dataset.nodatavals[number - 1])
         whole, north_first, east_first = _place(dataset, used, dataset.units[number - 1] or "")
-        rows, columns = places_within(box, whole.heights.shape, (whole.x0, whole.y0), (whole.dx, whole.dy))
-        place = whole.within(box)
+        rows, columns = whole.places(box, window, north_first, east_first)
+        place = whole.cut(rows, columns)
         left = dataset.width - columns.stop if east_first else columns.start
         masked = any(flag.name == "per_dataset" for flag in dataset.mask_flag_enums[number - 1])
 
         def read(part: slice, step: int) -> Terrain:
             first, last = rows.start + part.start, rows.start + part.stop
             top = dataset.height - last if north_first else first
-            window = (top, top + last - first), (left, left + columns.stop - columns.start)
-            shape = tuple(-(-(end - start) // step) for start, end in window)
-            heights = heights_of(dataset.read(number, window=window, out_shape=shape), used, scale, offset)
+            pixels = (top, top + last - first), (left, left + columns.stop - columns.start)
+            shape = tuple(-(-(end - start) // step) for start, end in pixels)
+            heights = heights_of(dataset.read(number, window=pixels, out_shape=shape), used, scale, offset)
             if masked:
-                heights[dataset.dataset_mask(window=window, out_shape=shape) == 0] = np.nan
+                heights[dataset.dataset_mask(window=pixels, out_shape=shape) == 0] = np.nan
             heights = heights[:: -1 if north_first else 1, :: -1 if east_first else 1]
             return dataclasses.replace(place, heights=heights, y0=place.y0 + part.start * place.dy)
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ...scene.heightfield import Heightfield
 
 Box = Sequence[float]  # west, south, east, north
+Window = Sequence[int]  # the first column and row, and how many of each, as GDAL's -srcwin
 Nodata = Callable[[float | None], float | None]  # what means no height, where a file names this value, or none, for it
 
 
@@ -183,12 +184,25 @@ class Terrain:
         heights = self.heights if dtype is None else fitted(self.heights, dtype)
         return Heightfield(heights, self.dx, self.dy, self.x0, self.y0)
 
-    def within(self, box: Box | None) -> "Terrain":
-        """The heights that stand within west, south, east and north, in the coordinates of its file."""
-        dx, dy, x0, y0 = self.in_file
-        rows, columns = places_within(box, self.heights.shape, (x0, y0), (dx, dy))
+    def within(self, box: Box | None, window: Window | None = None) -> "Terrain":
+        """The heights that stand within west, south, east and north, in the coordinates of its file, or in a window of it."""
+        return self.cut(*self.places(box, window))
+
+    def cut(self, rows: slice, columns: slice) -> "Terrain":
+        """Its heights in these rows and columns, counted from vertex (0, 0), where they stand."""
         corner = self.x0 + columns.start * self.dx, self.y0 + rows.start * self.dy
         return dataclasses.replace(self, heights=self.heights[rows, columns], x0=corner[0], y0=corner[1])
+
+    def places(
+        self, box: Box | None, window: Window | None, north_first: bool = True, east_first: bool = False
+    ) -> tuple[slice, slice]:
+        """The rows and columns that `within` takes; a window counts from where the file begins, which these say."""
+        dx, dy, x0, y0 = self.in_file
+        if window is None:
+            return places_within(box, self.heights.shape, (x0, y0), (dx, dy))
+        if box is not None:
+            raise FileError(f"bbox or window must say which heights are taken, not both: {tuple(box)} and {tuple(window)}")
+        return _places_in_window(window, self.heights.shape, north_first, east_first)
 
     def in_metres(self, **given: float) -> "Terrain":
         """The terrain with degrees turned into metres from vertex (0, 0), and then with `given` for its dx, dy, x0 and y0."""
@@ -288,3 +302,16 @@ def places_within(
         span = " and ".join(f"{name} from {low:.10g} to {high:.10g}" for name, (low, high) in zip("xy", ends, strict=True))
         raise FileError(f"within bbox, {tuple(box)}, there must be heights, 2 x 2 at least; they stand at {span}")
     return found[0], found[1]
+
+
+def _places_in_window(window: Window, shape: tuple[int, ...], north_first: bool, east_first: bool) -> tuple[slice, slice]:
+    if np.shape(window) != (4,) or any(value % 1 != 0 for value in window):
+        raise FileError(f"window must be a column, a row, and how many columns and rows, whole numbers; it is {window}")
+    left, top, width, height = map(int, window)
+    (ny, nx), right, bottom = shape, left + width, top + height
+    if min(left, top) < 0 or min(width, height) < 2 or right > nx or bottom > ny:
+        raise FileError(
+            f"window must lie within the file's {nx} columns and {ny} rows, and be 2 x 2 or larger; it is {tuple(window)}"
+        )
+    rows, columns = slice(top, bottom), slice(left, right)
+    return slice(ny - bottom, ny - top) if north_first else rows, slice(nx - right, nx - left) if east_first else columns
