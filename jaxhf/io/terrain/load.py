@@ -23,9 +23,10 @@ from ..gdal import DRIVERS
 from ..pictures.codecs import read_grey
 from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
 from .grids import read_asc, read_hgt, read_mujoco
+from .parts import Box, Window
 from .rasters import Rows, raster_rows, read_raster
 from .sidecars import by_world_file
-from .terrain import Box, Nodata, Terrain, Window, heights_of
+from .terrain import Nodata, Terrain, heights_of
 
 
 def load_heights(

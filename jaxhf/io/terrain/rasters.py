@@ -21,8 +21,9 @@ from ..files import PathLike, reading, replacing, require_pixels, require_writab
 from ..gdal import opened
 from ..pictures.codecs import write_png
 from .georeference import Georeference, coordinate_system
+from .parts import Box, Window
 from .sidecars import beside
-from .terrain import Box, Nodata, Terrain, Window, heights_of
+from .terrain import Nodata, Terrain, heights_of
 
 
 class Rows(NamedTuple):
