@@ -12,7 +12,7 @@ from ..core.errors import ArgumentError
 from ..core.rules import OneOf, require
 from .choices import ALGORITHMS, VARIANTS
 from .shadows import lit
-from .surface import Heights, require_positive, surface
+from .surface import Heights, require_positive, rotation_of, surface
 from .windows import Window, differences, over_windows, spans
 
 _SHADOW = 1  # the darkest byte that is not nodata
@@ -61,9 +61,11 @@ def hillshade(
     require(owner, "variant", variant, OneOf(VARIANTS))
     require_light(owner, azimuth, altitude)
     require_positive(owner, "z_factor", z_factor)
+    rotation = rotation_of(heights)
+    azimuth = azimuth - rotation  # from the y axis
     ground = surface(owner, heights, dx, dy, scale)
     z_scaled, formula = z_factor / (spans(algorithm) * ground.scale), _FORMULAE[variant]
-    light = _Light(ground.dx, ground.dy, z_scaled, math.radians(azimuth), math.radians(altitude), algorithm)
+    light = _Light(ground.dx, ground.dy, z_scaled, math.radians(azimuth), math.radians(altitude), algorithm, rotation)
 
     def shade(window: Window) -> UInt8[np.ndarray, "k m"]:
         values = formula(light, window).astype(np.float32) + np.float32(0.5)
@@ -99,6 +101,7 @@ class _Light(NamedTuple):
     azimuth: float
     altitude: float
     algorithm: str
+    rotation: float  # see `Terrain.rotation`
 
     def slopes(self, window: Window) -> tuple[_Values, _Values]:
         """The rise from east to west and, rows being counted to the south, from south to north; over `spans` cells."""
@@ -136,6 +139,9 @@ def _multidirectional(light: _Light, window: Window) -> _Values:
     overhead, level = 127 * math.sin(light.altitude), 127 * math.cos(light.altitude) * light.z_scaled
     diagonal = level * math.cos(math.radians(225))
     x, y = light.slopes(window)
+    if light.rotation:  # the azimuths are those of the map
+        cos, sin = math.cos(math.radians(light.rotation)), math.sin(math.radians(light.rotation))
+        x, y = x * cos - y * sin, x * sin + y * cos
     xx, yy = x * x, y * y
     both = xx + yy
     southwest = 0.5 * both - x * y
@@ -152,8 +158,8 @@ def _multidirectional(light: _Light, window: Window) -> _Values:
 
 def _igor(light: _Light, window: Window) -> _Values:
     turn, towards = 2 * math.pi, (1.5 * math.pi - light.azimuth) % (2 * math.pi)
-    west, south = differences(window, light.algorithm)
     x, y = light.slopes(window)
+    west, south = (x, -y) if light.rotation else differences(window, light.algorithm)  # in which GDAL's cells are square
     slope = np.degrees(np.arctan(np.sqrt(x * x + y * y) * light.z_scaled)) / 90
     apart = np.abs(np.arctan2(south, west, dtype=np.float64) % turn - towards)
     apart = np.where(apart > math.pi, turn - apart, apart)

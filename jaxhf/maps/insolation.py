@@ -58,7 +58,7 @@ def insolation(
       wanted: "energy", or its parts "direct" (from the sun) and "diffuse" (from the sky); "hours": for how long the sun
         shines there, hours.
       turbidity: how much haze and vapour the air holds, after Linke: 1 (clean and dry) to 10; mountains 2, lowlands 3 to 5.
-      azimuths: how many directions, from north on at even steps.
+      azimuths: how many directions, from the y axis on at even steps.
       dx, dy, progress, mesh: see `horizon`.
 
     Returns:

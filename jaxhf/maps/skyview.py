@@ -15,6 +15,7 @@ from ..preparation.crossings import even_azimuths
 from ..xla.devices import takes_numbers
 from .choices import WEIGHTINGS
 from .horizons import field_of, map_over_horizons, unit_normals
+from .surface import rotation_of
 
 
 @takes_numbers
@@ -58,6 +59,7 @@ def horizon(
         raise ArgumentError("horizon", "azimuths", f"must be a whole number or a list of finite numbers, they are {azimuths}")
     if not -90 <= lowest < 90:
         raise ArgumentError("horizon", "lowest", f"must be from -90 to below 90 degrees, it is {lowest}")
+    azimuths = azimuths - rotation_of(terrain)
     return map_over_horizons(
         "horizon", "degrees", field, azimuths, -np.inf if lowest == -90 else np.tan(np.deg2rad(lowest)), progress, mesh
     )
@@ -86,7 +88,7 @@ def sky_view(
       normal is that of `vertex_normals`. A plane of slope S without other terrain has (1 + cos S) / 2.
 
     Args:
-      azimuths: how many directions, from north on at even steps.
+      azimuths: how many directions, from the y axis on at even steps.
       terrain, dx, dy, progress, mesh: as for `horizon`, whose errors it has, too.
 
     Returns:

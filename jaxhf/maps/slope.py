@@ -5,7 +5,7 @@ from jaxtyping import Float32
 
 from ..core.rules import OneOf, require
 from .choices import ALGORITHMS
-from .surface import Heights, surface
+from .surface import Heights, rotation_of, surface
 from .windows import Window, differences, over_windows, spans
 
 NODATA = -9999.0
@@ -50,7 +50,8 @@ def aspect(
 ) -> Float32[np.ndarray, "ny nx"]:
     """Where each slope faces, in degrees clockwise from north: shape (ny, nx), float32, -9999 where flat or without a value.
 
-    As in GDAL cells count as square: where they are not, a diagonal slope's aspect is that of the grid, not of the ground.
+    As in GDAL cells count as square: where they are not, a diagonal slope's aspect is that of the grid, not of the ground. A
+    rotated `Terrain` has the aspects of the ground, from the north of its map.
 
     Args:
       heights, algorithm, compute_edges: see `hillshade`, whose errors it has, too.
@@ -58,17 +59,21 @@ def aspect(
       zero_for_flat: 0 in place of -9999.
     """
     require("aspect", "algorithm", algorithm, OneOf(ALGORITHMS))
-    ground = surface("aspect", heights, 1.0, scale=1.0)
+    rotation = rotation_of(heights)
+    square = None if rotation else 1.0
+    ground = surface("aspect", heights, square, square, scale=1.0)
     nothing = np.float32(0.0 if zero_for_flat else NODATA)
 
     def formula(window: Window) -> Float32[np.ndarray, "k m"]:
         west, south = (values.astype(np.float64) for values in differences(window, algorithm))
-        angle = (np.arctan2(south, west) / (np.pi / 180)).astype(np.float32)
+        angle = (np.arctan2(south / ground.dy, west / ground.dx) / (np.pi / 180)).astype(np.float32)
         turn, quarter = np.float32(360), np.float32(90)
         if trigonometric:
             angle = np.where(angle < 0, angle + turn, angle)
         else:
             angle = np.where(angle > quarter, turn + quarter - angle, quarter - angle)
+        if rotation:
+            angle = np.mod(angle + np.float32(-rotation if trigonometric else rotation), turn)
         angle = np.where(angle == turn, np.float32(0), angle)
         return np.where((west == 0) & (south == 0), nothing, angle)
 

@@ -52,6 +52,11 @@ def with_spacing(
     return heights, given.get("dx", square), given.get("dy", square)
 
 
+def rotation_of(terrain: Any) -> float:
+    """What azimuths from the north of a map are turned by to count from the y axis, see `Terrain.rotation`; 0 of an array."""
+    return terrain.rotation if isinstance(terrain, Terrain) else 0.0
+
+
 def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:
     values = numbers(heights)
     if values.dtype.kind not in "fiu":

@@ -257,23 +257,34 @@ def _placed(
 
 
 def cells_of(
-    owner: str, name: str, points: Any, shape: tuple[int, ...], begin: tuple[float, float], step: tuple[float, float]
+    owner: str,
+    name: str,
+    points: Any,
+    shape: tuple[int, ...],
+    begin: tuple[float, float],
+    step: tuple[float, float],
+    rotation: float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
-    """Where points stand in columns and rows of a terrain of this shape, whose vertex (0, 0) stands at `begin`."""
+    """Where points stand in columns and rows of a terrain of this shape, whose vertex (0, 0) stands at `begin`.
+
+    `rotation` is how many degrees its columns point clockwise of y.
+    """
     try:
         given = np.asarray(points, np.float64)
     except (TypeError, ValueError):
         given = np.empty(0)
     if given.ndim not in (1, 2) or given.shape[-1:] != (2,) or not given.size or not np.isfinite(given).all():
         raise ArgumentError(owner, name, f"must be x and y, finite, of shape (2,) or (n, 2): {points!r}")
-    ny, nx = shape
-    cells, last = ((given - begin) / step).reshape(-1, 2), np.array([nx - 1, ny - 1])
+    (ny, nx), turn = shape, math.radians(rotation)
+    axes = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+    cells, last = ((given - begin) @ axes / step).reshape(-1, 2), np.array([nx - 1, ny - 1])
     rounding = _ROUNDING + 8 * np.finfo(float).eps * np.abs(np.array(begin) / step)  # of coordinates
     for k, cell in enumerate(cells):
         if not ((cell >= -rounding) & (cell <= last + rounding)).all():
             spans = [f"{a:.10g} to {a + (n - 1) * d:.10g}" for a, d, n in zip(begin, step, (nx, ny), strict=True)]
             x, y = given.reshape(-1, 2)[k]
-            rule = f"must be on the terrain, x from {spans[0]} and y from {spans[1]}; one is {x:.10g} {y:.10g}"
+            turned = f", rotated by {rotation:.6g} degrees clockwise about the first of both" if rotation else ""
+            rule = f"must be on the terrain, x from {spans[0]} and y from {spans[1]}{turned}; one is {x:.10g} {y:.10g}"
             raise ArgumentError(owner, name, rule)
     return np.clip(cells, 0, last)
 

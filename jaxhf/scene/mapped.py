@@ -71,11 +71,9 @@ def geotransformed(transform: Any, terrain: Any, width: int, height: int) -> tup
     if not (np.isfinite(to_file).all() and np.linalg.det(to_file[:, :2])):
         raise ArgumentError(owner, "transform", f"must be finite and invertible, it is {to_file.tolist()}")
     low, high = _levels(owner, terrain)
-    # What the terrain's own x and y are in its file: offset + scale * x
-    grid = np.array(terrain.in_file)
-    scale = grid[:2] / [terrain.dx, terrain.dy]
-    to_file[:, 2] -= grid[2:] - scale * [terrain.x0, terrain.y0]
-    right, down, corner = (to_file / scale[:, None]).T  # of a pixel, in world units
+    axes, offset = np.split(terrain.file_from_terrain, [2], axis=1)
+    to_file[:, 2:] -= offset
+    right, down, corner = np.linalg.solve(axes, to_file).T  # of a pixel, in world units
     pixel = float(np.linalg.norm(right if width <= height else down))
     extent = min(width, height) * pixel
     matrix = np.diag([1.0, 1.0, -1.0, 1.0])

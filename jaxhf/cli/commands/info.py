@@ -63,7 +63,8 @@ def _terrain_lines(path: str, terrain: Terrain) -> Iterator[str]:
             metres = f", in the middle {local.dx:.6g} x {local.dy:.6g} metres"
         yield f"cells: {dx:.9g} x {dy:.9g}{place.unit and ' '}{place.unit}{metres}"
         x, y = ("longitude", "latitude") if crs is not None and crs.degrees else ("x", "y")
-        yield f"place: {x} {x0:.10g} to {x0 + (nx - 1) * dx:.10g}, {y} {y0:.10g} to {y0 + (ny - 1) * dy:.10g}"
+        turned = f", rotated by {terrain.rotation:.9g} degrees clockwise about the first of both" if terrain.rotation else ""
+        yield f"place: {x} {x0:.10g} to {x0 + (nx - 1) * dx:.10g}, {y} {y0:.10g} to {y0 + (ny - 1) * dy:.10g}{turned}"
     code = f" (EPSG:{crs.code})" if crs is not None and crs.code else ""
     yield f"system: {place.name or 'not known'}{code}"
     holes = int(np.count_nonzero(np.isnan(terrain.heights)))

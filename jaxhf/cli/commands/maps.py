@@ -67,6 +67,7 @@ def _sheet(options: argparse.Namespace, function: Callable[..., Any]) -> None:
     path = require_writable("relief", "a sheet", SHEETS, options.output)
     begin = time.perf_counter()
     terrain = _read(options)
+    terrain.require_unrotated(f"{options.terrain}: the terrain on a sheet")
     takes = inspect.signature(function).parameters
     given = arguments.given(options, *(takes.keys() & vars(options).keys()))
     ramp = as_ramp(options.ramp, float(np.nanmin(terrain.heights)), float(np.nanmax(terrain.heights)))

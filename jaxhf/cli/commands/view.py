@@ -42,7 +42,7 @@ def _sun_path(options: argparse.Namespace, terrain: Terrain) -> np.ndarray | Non
     if not times:
         if place != (None, None):
             raise UserError("view: --latitude and --longitude stand with times, as in --sun-from 2026-06-21T06:00:00Z")
-        return None if first is None else np.linspace(first, last, options.frames)
+        return None if first is None else np.linspace(first, last, options.frames) - (terrain.rotation, 0)
     place = place_of("view", options, terrain)
     start, end = (utc("view", "time", time) for time in (first, last))
     instants = start + (end - start) * np.arange(options.frames) // (options.frames - 1)
@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> None:
     z, colours, base = _solid(options, terrain, factor)
     limits.set_up_jax(options)
     field = Heightfield(z, terrain.dx, terrain.dy)
-    frames = _frames(options, field, base, path, film)
+    frames = _frames(options, field, base, path, film, terrain.rotation)
     camera, look = frames[0]
     scene = block(field, colours, camera, look, base, SCATTERING[options.material])
     limits.require_memory(scene, local_mesh().size)
@@ -127,11 +127,12 @@ def _solid(options: argparse.Namespace, terrain: Terrain, factor: float) -> tupl
 
 
 def _frames(
-    options: argparse.Namespace, field: Heightfield, base: float | None, path: np.ndarray | None, film: bool
+    options: argparse.Namespace, field: Heightfield, base: float | None, path: np.ndarray | None, film: bool, rotation: float
 ) -> list[tuple[Perspective, Look]]:
     """A camera and a look for each frame: round the terrain, or in a moving sun, whose `path` it is; for a picture one."""
     look = Look(**arguments.given(options, "azimuth", "altitude", "haze"), samples=PRESETS[options.preset])
-    azimuth = look.azimuth - 110 if options.camera_azimuth is None else options.camera_azimuth
+    look = dataclasses.replace(look, azimuth=look.azimuth - rotation)  # from the y axis
+    azimuth = look.azimuth - 110 if options.camera_azimuth is None else options.camera_azimuth - rotation
     around, (width, height) = film and path is None, options.size
     looks = [look] if path is None else [dataclasses.replace(look, azimuth=float(az), altitude=float(alt)) for az, alt in path]
     cameras = [

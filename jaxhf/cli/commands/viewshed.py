@@ -25,7 +25,8 @@ def run(options: argparse.Namespace) -> None:
     path = require_writable_raster(options.output)
     stored, terrain = read_in_metres(options)
     dx, dy, x0, y0 = stored.in_file
-    cells = cells_of("viewshed", "--observer", options.observers, stored.heights.shape, (x0, y0), (dx, dy))
+    shape = stored.heights.shape
+    cells = cells_of("viewshed", "--observer", options.observers, shape, (x0, y0), (dx, dy), stored.rotation)
     if options.line:
         cells = _along(cells, stored.heights)
     limits.require_memory_of_map("viewshed", stored.heights.size, options.precision)

@@ -35,6 +35,9 @@ def load_drape(path: PathLike, terrain: Terrain) -> Float[np.ndarray, "h w 3"]:
         if crs is not None and place.wkt and rasterio.crs.CRS.from_wkt(place.wkt) != crs:
             rule = f"it must be in the terrain's reference system, {place.name}; it is in {crs.to_string()}"
             raise FileError(f"{rule} (gdalwarp changes it)")
+        terrain.require_unrotated("a terrain below a GeoTIFF")
+        if dataset.transform.b or dataset.transform.d:
+            raise FileError("its pixels must lie along x and y (gdalwarp makes it so), they are rotated or sheared")
         dx, dy, x0, y0 = terrain.in_file
         ny, nx = terrain.heights.shape
         west, south, east, north = x0, y0, x0 + (nx - 1) * dx, y0 + (ny - 1) * dy

@@ -35,7 +35,7 @@ class CoordinateSystem(NamedTuple):
 
 
 class Georeference(NamedTuple):
-    """Where a terrain lies in the coordinates of its file: file = offset + scale * terrain, for x and for y."""
+    """Where a terrain lies in the coordinates of its file: scale * terrain, for x and for y, then rotated, and plus offset."""
 
     wkt: str = ""  # the file's reference system as well-known text (ISO 19162, or GDAL's older form); "": not known
     scale: tuple[float, float] = (1.0, 1.0)
@@ -43,6 +43,7 @@ class Georeference(NamedTuple):
     nodata: float | None = None  # the stored value that means no height there
     point: bool = False  # whether a pixel is said to be one, PixelIsPoint in GeoTIFF; a height stands at its centre either way
     z_unit: str = ""  # of the heights, where the file names it apart from its reference system
+    rotation: float = 0.0  # degrees by which the terrain's y axis points clockwise of the file's
 
     @property
     def name(self) -> str:

@@ -51,6 +51,7 @@ def read_asc(path: Path, nodata: Nodata) -> Terrain:
 
 def write_asc(path: Path, terrain: Terrain) -> None:
     """Writes an ESRI ASCII grid in the coordinates of the terrain's file; cells not square have dx and dy, as GDAL's."""
+    terrain.require_unrotated("the terrain in an .asc")
     dx, dy, x0, y0 = terrain.in_file
     ny, nx = terrain.heights.shape
     cell = f"cellsize {dx!r}" if dx == dy else f"dx {dx!r}\ndy {dy!r}"

@@ -56,7 +56,8 @@ def load_heights(
       height stands at its pixel's centre: half a pixel inside the raster's corner. The file's scale and offset are applied.
 
     Degrees become metres at the mean latitude, with vertex (0, 0) at the origin: on the ellipsoid that the file's
-    reference system names. nan and inf are holes, as is what the file says means no data.
+    reference system names. x and y of a rotated raster lie along its rows and columns, with vertex (0, 0) at the origin; see
+    `Terrain.rotation`. nan and inf are holes, as is what the file says means no data.
 
     Args:
       path: the file.
@@ -72,7 +73,7 @@ def load_heights(
     Raises:
       FileNotFoundError: no file is there.
       ValueError: the ending is not known, the file is not a whole grid of heights, or its degrees are on a globe of unknown
-        size and dx or dy is not given.
+        size and dx or dy is not given; or a raster is sheared, or rotated in degrees.
     """
     terrain = read_terrain(path, z_scale, nodata, band=band, bbox=bbox, window=window)
     given = {"dx": dx, "dy": dy, "x0": x0, "y0": y0}
@@ -240,7 +241,8 @@ def _read_npz(path: Path, nodata: Nodata) -> Terrain:
                 scale, offset = ((float(x), float(y)) for x, y in (array("crs_scale"), array("crs_offset")))
                 nodata_there = number("nodata") if "nodata" in members else None
                 unit = str(array("z_unit", "U")) if "z_unit" in members else ""
-                place = Georeference(str(array("crs", "U")), scale, offset, nodata_there, bool(number("point")), unit)
+                turn = number("crs_rotation") if "crs_rotation" in members else 0.0
+                place = Georeference(str(array("crs", "U")), scale, offset, nodata_there, bool(number("point")), unit, turn)
                 plain = place[1:3] == Georeference()[1:3]
                 grid |= {"georeference": place, "crs": coordinate_system(place.wkt) if plain else CoordinateSystem()}
             return Terrain(heights_of(array(name), nodata(None)), **grid)

@@ -20,7 +20,7 @@ from ..errors import FileError
 from ..files import PathLike, reading, replacing, require_pixels, require_writable, utf8_name, write_npy
 from ..gdal import opened
 from ..pictures.codecs import write_png
-from .georeference import Georeference, coordinate_system
+from .georeference import CoordinateSystem, Georeference, coordinate_system
 from .parts import Box, Window
 from .sidecars import beside
 from .terrain import Nodata, Terrain, heights_of
@@ -96,18 +96,27 @@ def _place(dataset: Any, nodata: float | None, z_unit: str = "") -> tuple[Terrai
     """A terrain of no heights where GDAL's geotransform puts the pixels' centres, and whether the file's rows begin in the
     north and its columns in the east."""
     a, b, c, d, e, f = dataset.transform[:6]
-    if b or d or not (a and e):
-        raise FileError(f"its pixels must lie along x and y (gdalwarp makes it so), its geotransform is rotated: {b}, {d}")
     if dataset.gcps[0]:
         raise FileError("it must be placed by a geotransform, it has ground control points (gdalwarp makes it so)")
     ny, nx = dataset.height, dataset.width
     nothing, wkt = np.broadcast_to(np.float32(0), (ny, nx)), "" if dataset.crs is None else dataset.crs.to_wkt()
     if dataset.transform.is_identity:  # of a file without a place
         return Terrain(nothing), True, False
-    x0, y0 = c + (0.5 if a > 0 else nx - 0.5) * a, f + (0.5 if e > 0 else ny - 0.5) * e
     point = dataset.tags().get("AREA_OR_POINT") == "Point"
-    place = Georeference(wkt, nodata=nodata, point=point, z_unit=z_unit)
-    return Terrain(nothing, abs(a), abs(e), x0, y0, coordinate_system(wkt), place), e < 0, a < 0
+    place, crs = Georeference(wkt, nodata=nodata, point=point, z_unit=z_unit), coordinate_system(wkt)
+    if not b and not d and a and e:
+        x0, y0 = c + (0.5 if a > 0 else nx - 0.5) * a, f + (0.5 if e > 0 else ny - 0.5) * e
+        return Terrain(nothing, abs(a), abs(e), x0, y0, crs, place), e < 0, a < 0
+    dx, dy, area = math.hypot(a, d), math.hypot(b, e), a * e - b * d
+    if crs.degrees or abs(a * b + d * e) > _SHEAR * dx * dy or not area:
+        rule = "its pixels must lie along x and y, or be rotated without shear, and in lengths (gdalwarp makes them so)"
+        raise FileError(f"{rule}; its geotransform has {a}, {b}, {d}, {e}")
+    row = ny - 0.5 if area < 0 else 0.5
+    place = place._replace(offset=(c + 0.5 * a + row * b, f + 0.5 * d + row * e), rotation=math.degrees(math.atan2(-d, a)))
+    return Terrain(nothing, dx, dy, crs=CoordinateSystem(), georeference=place), area < 0, False
+
+
+_SHEAR = 1e-6  # cosine of the angle between rows and columns, of which transforms in text have some
 
 
 require_writable_raster = partial(require_writable, "save_raster", "a map", (".npy", ".png", ".tif", ".tiff"))
@@ -197,11 +206,11 @@ def _disk_full(rasterio: Any) -> Iterator[None]:
 def _profile(like: Terrain, dtype: Any, count: int, nodata: float | None) -> dict[str, Any]:
     """How rasterio creates a GeoTIFF where a terrain lies."""
     rasterio = import_extra("rasterio", "writing .tif needs", "geo")
-    (ny, nx), (dx, dy, x0, y0), place = like.heights.shape, like.in_file, like.georeference
+    (ny, nx), place = like.heights.shape, like.georeference
     return {
         "driver": "GTiff", "width": nx, "height": ny, "count": count, "dtype": dtype, "nodata": nodata,
         "crs": rasterio.crs.CRS.from_wkt(place.wkt) if place and place.wkt else None,
-        "transform": rasterio.Affine(dx, 0, x0 - dx / 2, 0, -dy, y0 + (ny - 0.5) * dy),
+        "transform": rasterio.Affine(*like.geotransform()),
         "photometric": "rgb" if count > 1 else "minisblack", "interleave": "pixel", "bigtiff": "if_safer",
     }  # fmt: skip
 

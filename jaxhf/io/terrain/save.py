@@ -66,6 +66,7 @@ def _write_npz(path: Path, terrain: Terrain) -> None:
     if (known := terrain.georeference) is not None:
         place |= {"crs": known.wkt, "crs_scale": known.scale, "crs_offset": known.offset, "point": known.point}
         place |= {"z_unit": known.z_unit} if known.z_unit else {}
+        place |= {"crs_rotation": known.rotation} if known.rotation else {}
         place |= {} if known.nodata is None else {"nodata": known.nodata}
     with path.open("wb") as file:
         np.savez(file, heights=terrain.heights, **place)

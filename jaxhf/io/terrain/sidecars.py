@@ -15,8 +15,8 @@ def beside(path: Path, terrain: Terrain) -> dict[Path, str]:
     """The texts that go with a .png or an .asc: the world file of the first, the reference system where it is known."""
     ending, texts = path.suffix.lower(), {}
     if ending == ".png":
-        dx, dy, x0, y0 = terrain.in_file
-        numbers = dx, 0.0, 0.0, -dy, x0, y0 + (len(terrain.heights) - 1) * dy  # the centre of the north-western pixel
+        a, b, x, d, e, y = terrain.geotransform(pixel=0.0)
+        numbers = a, d, b, e, x, y  # the last two of the north-western pixel's centre
         texts[path.with_suffix(WORLD_FILE)] = "".join(f"{number!r}\n" for number in numbers)
     if ending in (".png", ".asc") and terrain.georeference is not None and terrain.georeference.wkt:
         texts[path.with_suffix(".prj")] = terrain.georeference.wkt

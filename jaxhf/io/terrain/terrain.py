@@ -112,13 +112,42 @@ class Terrain:
         return np.isnan(self.heights)
 
     @property
+    def rotation(self) -> float:
+        """By how much its y axis points clockwise of its file's, degrees: 0 but for rotated rasters.
+
+        An azimuth from the north of a map minus this counts from the y axis.
+        """
+        return self.georeference.rotation if self.georeference else 0.0
+
+    @property
+    def file_from_terrain(self) -> Float[np.ndarray, "2 3"]:
+        """The affine map of x, y and 1 to the coordinates of its file, which may be degrees."""
+        place = self.georeference or Georeference()
+        turn = math.radians(place.rotation)
+        rotated = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
+        return np.column_stack([rotated * place.scale, place.offset])
+
+    @property
     def in_file(self) -> tuple[float, float, float, float]:
         """Its dx, dy, x0 and y0 in the coordinates of its file, which may be degrees."""
-        place = self.georeference or Georeference()
-        (scale_x, scale_y), (offset_x, offset_y) = place.scale, place.offset
-        found = scale_x * self.dx, scale_y * self.dy, offset_x + scale_x * self.x0, offset_y + scale_y * self.y0
-        dx, dy, x0, y0 = map(float, found)
-        return dx, dy, x0, y0
+        scale_x, scale_y = self.georeference.scale if self.georeference else (1.0, 1.0)
+        x0, y0 = self.file_from_terrain @ (self.x0, self.y0, 1)
+        return float(scale_x * self.dx), float(scale_y * self.dy), float(x0), float(y0)
+
+    def geotransform(self, pixel: float = 0.5) -> tuple[float, ...]:
+        """The six numbers of its Affine in rasterio: of columns and rows, the northern one first, to its file's coordinates.
+
+        Column 0 and row 0 stand for the corner of the first pixel, or with 0 for `pixel` for its centre.
+        """
+        (right, up), ny = (self.file_from_terrain[:, :2] * (self.dx, self.dy)).T, len(self.heights)
+        corner = self.in_file[2:] - pixel * right + (ny - 1 + pixel) * up
+        return tuple((np.column_stack([right, -up, corner]) + 0.0).ravel().tolist())  # + 0.0: none is -0.0
+
+    def require_unrotated(self, name: str = "it") -> None:
+        """FileError where its rows and columns do not lie along its file's x and y."""
+        if self.rotation:
+            rule = f"{name} must lie along x and y (gdalwarp makes it so)"
+            raise FileError(f"{rule}; the raster is rotated by {self.rotation:.6g} degrees")
 
     @property
     def place(self) -> tuple[float, float]:
@@ -126,9 +155,10 @@ class Terrain:
 
         ValueError where its georeference does not say; where x and y are lengths on a map, that needs rasterio.
         """
-        dx, dy, x0, y0 = self.in_file
         (ny, nx), wkt = self.heights.shape, self.georeference.wkt if self.georeference else ""
-        latitude, longitude = geographic(wkt, x0 + (nx - 1) / 2 * dx, y0 + (ny - 1) / 2 * dy) if wkt else (math.nan, math.nan)
+        middle = self.x0 + (nx - 1) / 2 * self.dx, self.y0 + (ny - 1) / 2 * self.dy
+        x, y = (self.file_from_terrain @ (*middle, 1)).tolist()
+        latitude, longitude = geographic(wkt, x, y) if wkt else (math.nan, math.nan)
         if not (-90 <= latitude <= 90 and -360 <= longitude <= 360):
             found = f"it is in {self.georeference.name}" if self.georeference and wkt else "it has no georeference"
             raise ArgumentError("Terrain", "place", f"must be given as latitude and longitude, {found}")
@@ -150,11 +180,11 @@ class Terrain:
 
     @property
     def turned_from_north(self) -> float:
-        """`convergence`, and 0 where that is not known or y counts in degrees, to the north."""
+        """`convergence`, and `rotation` where that is not known or y counts in degrees, to the north."""
         wkt = self.georeference.wkt if self.georeference else ""
         if not wkt or coordinate_system(wkt).degrees:
-            return 0.0
-        return float(np.nan_to_num(self.convergence))
+            return self.rotation
+        return float(np.nan_to_num(self.convergence, nan=self.rotation))
 
     def geodetic(self, x: Any, y: Any, z: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Latitudes and longitudes of points in its x and y, degrees, and z in metres; needs rasterio.
@@ -164,7 +194,7 @@ class Terrain:
         """
         place = self.georeference or Georeference()
         x, y, z = np.broadcast_arrays(*(np.asarray(values, np.float64) for values in (x, y, z)))
-        x, y = (offset + scale * v for offset, scale, v in zip(place.offset, place.scale, (x, y), strict=True))
+        x, y = (a * x + b * y + c for a, b, c in self.file_from_terrain)
         latitude, longitude = on_globe(place.wkt, x, y) if place.wkt else (x + np.nan, y + np.nan)
         feet = re.search(r"foot|feet|\bft", (place.height_unit or place.unit).lower())
         return latitude, longitude, z * (0.3048 if feet else 1)
@@ -198,6 +228,8 @@ class Terrain:
         """The rows and columns that `within` takes; a window counts from where the file begins, which these say."""
         dx, dy, x0, y0 = self.in_file
         if window is None:
+            if box is not None:
+                self.require_unrotated("a terrain of which bbox takes a part, where window would,")
             return places_within(box, self.heights.shape, (x0, y0), (dx, dy))
         if box is not None:
             raise FileError(f"bbox or window must say which heights are taken, not both: {tuple(box)} and {tuple(window)}")
@@ -222,8 +254,9 @@ class Terrain:
         grid, place = {name: float(value) for name, value in {**grid, **given}.items()}, self.georeference
         if place is not None and min(grid["dx"], grid["dy"]) > 0:
             dx, dy, x0, y0 = self.in_file
-            scale = dx / grid["dx"], dy / grid["dy"]
-            place = place._replace(scale=scale, offset=(x0 - scale[0] * grid["x0"], y0 - scale[1] * grid["y0"]))
+            place = place._replace(scale=(dx / grid["dx"], dy / grid["dy"]), offset=(0.0, 0.0))
+            corner = dataclasses.replace(self, **grid, georeference=place).in_file[2:]
+            place = place._replace(offset=(x0 - corner[0], y0 - corner[1]))
         return dataclasses.replace(self, **grid, crs=crs, georeference=place)
 
 

@@ -74,6 +74,7 @@ def known_heights(field: Provenance, deviations: bool, path: Path) -> Float[np.n
     """
     z_scale = abs(field.z_scale) if deviations else field.z_scale
     terrain = read_terrain(path, z_scale, field.nodata, nodata_overrules=False)
+    terrain.require_unrotated()
     heights, grid = terrain.heights, field.grid(path, terrain)
     if terrain.crs is not None and grid is not None and grid.crs is not None:
         if terrain.crs.degrees and not grid.crs.degrees:

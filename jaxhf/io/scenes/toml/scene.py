@@ -191,6 +191,7 @@ def _heightfield(part: Part, values: dict[str, Any], dtype: np.dtype) -> tuple[H
 
         def load(path: Path | None = None) -> Provenance:
             stored = read_terrain(path or jacksboro_file(), z_scale, values.get("nodata"))
+            stored.require_unrotated("a scene's terrain")
             like = path if path and not grid and path.suffix.lower() in (".tif", ".tiff") else None
             return Provenance(stored.in_metres(**grid), stored, path, like, z_scale, values.get("nodata"))
 
