@@ -60,13 +60,14 @@ def aspect(
     """
     require("aspect", "algorithm", algorithm, OneOf(ALGORITHMS))
     rotation = rotation_of(heights)
-    square = None if rotation else 1.0
-    ground = surface("aspect", heights, square, square, scale=1.0)
+    ground = surface("aspect", heights, None if rotation else 1.0, scale=1.0)
     nothing = np.float32(0.0 if zero_for_flat else NODATA)
 
     def formula(window: Window) -> Float32[np.ndarray, "k m"]:
         west, south = (values.astype(np.float64) for values in differences(window, algorithm))
-        angle = (np.arctan2(south / ground.dy, west / ground.dx) / (np.pi / 180)).astype(np.float32)
+        if rotation:
+            west, south = west / ground.dx, south / ground.dy
+        angle = (np.arctan2(south, west) / (np.pi / 180)).astype(np.float32)
         turn, quarter = np.float32(360), np.float32(90)
         if trigonometric:
             angle = np.where(angle < 0, angle + turn, angle)
