@@ -263,6 +263,7 @@ def cells_of(
     shape: tuple[int, ...],
     begin: tuple[float, float],
     step: tuple[float, float],
+    *,
     rotation: float = 0.0,
 ) -> Float[np.ndarray, "n 2"]:
     """Where points stand in columns and rows of a terrain of this shape, whose vertex (0, 0) stands at `begin`.

@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> None:
     stored, terrain = read_in_metres(options)
     dx, dy, x0, y0 = stored.in_file
     shape = stored.heights.shape
-    cells = cells_of("viewshed", "--observer", options.observers, shape, (x0, y0), (dx, dy), stored.rotation)
+    cells = cells_of("viewshed", "--observer", options.observers, shape, (x0, y0), (dx, dy), rotation=stored.rotation)
     if options.line:
         cells = _along(cells, stored.heights)
     limits.require_memory_of_map("viewshed", stored.heights.size, options.precision)
