@@ -78,6 +78,9 @@ def first_met(
     `of_field` is what these rays meet of one height field, where that can be told without a search of each.
     """
     of_field = of_field or (lambda field: meet_hfield(field, o, d))
+    if o.size == 0:  # as of a batch of none
+        whole = jnp.zeros(o.shape[:-1], jnp.int32)
+        return Scan(o, o, o[..., 0], whole > 0, None if isinstance(geoms, HField) else whole)
     if isinstance(geoms, HField):
         scan = of_field(geoms)
     else:

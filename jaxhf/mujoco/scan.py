@@ -90,7 +90,7 @@ def height_scan(
     require(owner, "align", align, OneOf(Align))
     offset = known_numbers(owner, "offset", offset, FINITE)
     starts = _starts(pos, quat, jnp.asarray(offset, pos.dtype), align=align)
-    if align != "base" and isinstance(geoms, HField) and geoms.upright and max_range is None:
+    if align != "base" and isinstance(geoms, HField) and geoms.upright and max_range is None and pos.size:
         return _look_up(geoms, starts, places)
     o, d = _rays(starts, places)
 

@@ -10,7 +10,7 @@ from hfields import SIZE, Reference, heights, matrix
 
 import jaxhf
 from jaxhf.core.errors import ArgumentError
-from jaxhf.mujoco import HField, grid_pattern, height_scan, ray
+from jaxhf.mujoco import Geoms, HField, grid_pattern, height_scan, ray
 
 GROUNDS = np.stack([heights(9, 6, seed) for seed in (1, 2)]).astype(np.float64)
 TURN, PLACE = (0.8, 0, 0, -0.6), np.array([[0.0, 0, 0], [7, -3, 0.4]])
@@ -110,6 +110,16 @@ def test_gradient_matches_central_differences(dtype, rtol):
         )
         (ahead, _), (behind, _) = map(jax.jit(weighted), moved)
     np.testing.assert_allclose(sum(along), (float(ahead) - float(behind)) / (2 * eps), rtol=rtol)
+
+
+def test_a_batch_of_none_meets_nothing():
+    field = HField(GROUNDS[:0].astype(np.float32), SIZE)
+    pos, quat = np.zeros((0, 3)), np.zeros((0, 4))
+    for geoms in (field, field.prepared(), Geoms([field], ["sphere"], [(1, 1, 1)], np.zeros((0, 1, 3)))):
+        for scan in (ray(geoms, pos, pos), *(height_scan(geoms, pos, quat, PLACES[:5], align=way) for way in ("yaw", "base"))):
+            assert scan.p.shape == scan.n.shape == (*scan.dist.shape, 3)
+            assert scan.mask.shape == scan.dist.shape in ((0,), (0, 5))
+            assert (scan.geom is not None) == isinstance(geoms, Geoms)
 
 
 def test_rays_from_within_the_base_meet_its_bottom():
