@@ -102,7 +102,8 @@ plt.show()
 # things come from the scan: a leg is as much shorter as its foot stands higher, and a swinging foot is lifted over the
 # highest of the places round it.
 #
-# All of it is a program for one robot on one terrain. `jax.vmap` makes it one for 128, on terrains of their own.
+# All of it is a program for one robot on one terrain. `jax.vmap` makes it one for 128 walks: blind or not, four clearances,
+# 16 terrains.
 
 # %%
 PERIOD, STRIDE, CARRIES = 1.0, 0.24, 0.55  # seconds, metres, and the share of a period for which a foot carries
