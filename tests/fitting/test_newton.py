@@ -52,7 +52,7 @@ def test_a_whole_step_solves_the_linear_problem():
     [((1.0, 0.5, 0.46), [True, False], [True, True]), ((1.0, 2.0), [False], [True]), ((1.0, 0.7), [True], [False])],
 )
 def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, goes_on, monkeypatch):
-    """Whatever becomes of the loss: else all stays as it was. Where the next is hardly shorter, nothing is left to be gained."""
+    """Whatever becomes of the loss: else all stays as it was. Where it is hardly shorter, nothing is left to be gained."""
     here = expanded(scenes(), pictures(), settings=SETTINGS, noise=0.01)
     ones = jax.tree.map(jnp.ones_like, here.unknowns)
     steps = [WholeStep(ones, length, 10 * length, 7.0 + number) for number, length in enumerate(lengths)]
