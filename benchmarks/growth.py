@@ -30,7 +30,7 @@ UNITS = {
     "fits": "heights of a fit",
 }  # fmt: skip
 SQUARE = ("heights", "pixels", "fits")
-# At the peak, for each device, which has the scene to itself: 54 to 63 measured with one, 107 with two.
+# At the peak, for each device, which has the scene to itself: 54 to 65 measured with one, 107 with two.
 BYTES_A_HEIGHT = 66
 
 
