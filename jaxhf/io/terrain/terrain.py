@@ -229,7 +229,7 @@ class Terrain:
         dx, dy, x0, y0 = self.in_file
         if window is None:
             if box is not None:
-                self.require_unrotated("a terrain of which bbox takes a part, where window would,")
+                self.require_unrotated("a terrain that bbox cuts (window cuts any)")
             return places_within(box, self.heights.shape, (x0, y0), (dx, dy))
         if box is not None:
             raise FileError(f"bbox or window must say which heights are taken, not both: {tuple(box)} and {tuple(window)}")
