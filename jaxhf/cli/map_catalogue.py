@@ -76,6 +76,7 @@ _VIEWSHED = Command(
                 help=_OBSERVER,
             ),
             flag("--line", "observers all along the line through these points, at most a cell apart"),
+            flag("--area", "observers at every height within the polygon of these points"),
             number("--height", "H", "of the eyes above the ground [1.8]"),
             number("--target-height", "H", "of what is to be seen, above the ground [0]"),
             flag("--above-ground", "the least height above the ground that is seen, in 32-bit floats; .tif or .npy"),

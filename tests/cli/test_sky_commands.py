@@ -166,11 +166,28 @@ def test_viewshed(run, tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "above.npy"), expected)
 
 
+def test_viewshed_of_an_area(run, tmp_path):
+    """From all heights within a polygon with a notch, but the one in the hole."""
+    corners = np.array([(0.5, 0.5), (5.5, 0.5), (5.5, 3.5), (3.2, 2.2), (0.5, 3.5)]) * (2, 3)
+    shown = [word for x, y in corners for word in ("--observer", str(100 + x), str(50 + y))]
+    code, said = run("viewshed", "seen.npy", *shown, "--area", "--height", "0.1")
+    assert (code, "from 11 points" in said) == (0, True), said
+    within = [(1, 1), (2, 1), (3, 1), (4, 1), (5, 1), (1, 2), (2, 2), (4, 2), (5, 2), (1, 3), (5, 3)]
+    expected = jaxhf.viewshed(jaxhf.Terrain(Z, 2.0, 3.0), np.array(within) * (2, 3), 0.1)
+    np.testing.assert_array_equal(np.load(tmp_path / "seen.npy"), 255 * expected)
+
+
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
         (("--observer", "90", "52"), "--observer must be on the terrain, x from 100 to 112 and y from 50 to 62; one is 90 52"),
-        (("--observer", "103", "52", "--line"), "--line needs two --observer at least, there is one"),
+        (("--observer", "103", "52", "--line"), "--line needs 2 --observer at least, it has 1"),
+        (("--observer", "103", "52", "--observer", "105", "52", "--area"), "--area needs 3 --observer at least, it has 2"),
+        (("--observer", "103", "52", "--area", "--line"), "--line would change nothing: --area takes all of what"),
+        (
+            ("--observer", "103", "52", "--observer", "105", "52", "--observer", "103.1", "52.1", "--area"),
+            "--area must hold heights, none stands within",
+        ),
         (
             ("--observer", "103", "52", "--above-ground", "--target-height", "2"),
             "--target-height would change nothing: --above-ground",

@@ -20,15 +20,18 @@ def run(options: argparse.Namespace) -> None:
     if options.above_ground:
         require_numbers(options.output, "heights")
         arguments.refuse(options, "target_height", because="--above-ground says how high it must be")
-    if options.line and len(options.observers) < 2:
-        raise UserError("viewshed: --line needs two --observer at least, there is one")
+    if options.area:
+        arguments.refuse(options, "line", because="--area takes all of what the line surrounds")
+    for name, least in (("line", 2), ("area", 3)):
+        if getattr(options, name) and len(options.observers) < least:
+            raise UserError(f"viewshed: --{name} needs {least} --observer at least, it has {len(options.observers)}")
     path = require_writable_raster(options.output)
     stored, terrain = read_in_metres(options)
     dx, dy, x0, y0 = stored.in_file
     shape = stored.heights.shape
     cells = cells_of("viewshed", "--observer", options.observers, shape, (x0, y0), (dx, dy), rotation=stored.rotation)
-    if options.line:
-        cells = _along(cells, stored.heights)
+    if options.line or options.area:
+        cells = (_along if options.line else _within)(cells, stored.heights)
     limits.require_memory_of_map("viewshed", stored.heights.size, options.precision)
     limits.set_up_jax(options)
     begin = time.perf_counter()
@@ -53,3 +56,15 @@ def _along(cells: np.ndarray, heights: np.ndarray) -> np.ndarray:
         between = np.linspace(first, second, math.ceil(np.abs(second - first).max()), endpoint=False)[1:]
         found += [np.array([at for at in between if math.isfinite(height_at(heights, *at))]).reshape(-1, 2), second[None]]
     return np.concatenate(found)
+
+
+def _within(cells: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """The vertices within the polygon of these points, without those in holes: rays along x cross it an odd number of times."""
+    iy, ix = np.nonzero(np.isfinite(heights))
+    inside = np.zeros(ix.shape, bool)
+    for (x0, y0), (x1, y1) in zip(cells, np.roll(cells, -1, axis=0), strict=True):
+        if y0 != y1:
+            inside ^= ((y0 > iy) != (y1 > iy)) & (ix < x0 + (iy - y0) * ((x1 - x0) / (y1 - y0)))
+    if not inside.any():
+        raise UserError("viewshed: --area must hold heights, none stands within")
+    return np.column_stack([ix, iy])[inside].astype(float)
