@@ -22,7 +22,7 @@ _VIEW = Command(
         "": (
             option("terrain", metavar="IN", nargs="?", help=f"heights: {TERRAIN}"),
             flag("--demo", "in place of IN the Jacksboro fault, which matplotlib ships"),
-            option("-o", "--output", metavar="OUT", help=".png, .jpg, .exr, .npy; a film: .gif, .mp4 [IN's name, .png]"),
+            option("-o", "--output", metavar="OUT", help=".png, .jpg, .webp, .exr, .npy; a film: .gif, .mp4 [IN's name, .png]"),
         ),
         "picture": (
             option("--size", type=size, default=(1280, 800), metavar="WxH", help="pixels [1280x800]"),
@@ -67,7 +67,7 @@ _RENDER = Command(
     options={
         "": (
             SCENE,
-            output("the picture: .png, .jpg (sRGB), .exr, .npy or .pfm (linear)"),
+            output("the picture: .png, .jpg, .webp (sRGB), .exr, .npy or .pfm (linear)"),
             option("--aovs", type=names, default=(), metavar="NAMES", help=_AOVS),
         ),
         "size": (

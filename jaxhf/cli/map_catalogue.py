@@ -35,7 +35,7 @@ _LIGHT = {
 }
 _SHEET = {
     "sheet": (
-        flag("--annotate", "with coordinates, a scale bar, north, and what the colours mean, as .png, .pdf or .svg"),
+        flag("--annotate", "with coordinates, a scale bar, north, and what the colours mean, as .png, .webp, .pdf or .svg"),
         number("--contours", "STEP", "contour lines so far apart, in the unit of the heights [none]", rule=positive),
         option("--title", metavar="TEXT", help="above the map [none]"),
     )

@@ -13,7 +13,7 @@ from ..io.terrain.georeference import Georeference, coordinate_system
 from ..io.terrain.terrain import Terrain
 from ..maps.ramp import Ramp, coloured
 
-SHEETS = (".png", ".pdf", ".svg")
+SHEETS = (".png", ".webp", ".pdf", ".svg")
 _LINES = 500  # contour lines at most
 _DRAWN = 2000  # of the heights along a side, in contour lines: more than are told apart on a page
 _INDEX = 5  # each so many of which one is thick and has its height
@@ -72,7 +72,7 @@ def sheet(
 
 
 def save_sheet(path: Path, figure: Any) -> None:
-    """Writes it as .png, .pdf or .svg, in which text stays text."""
+    """Writes it as .png, .webp, .pdf or .svg, in which text stays text."""
     import matplotlib
 
     with replacing(path) as temporary, matplotlib.rc_context({"svg.fonttype": "none", "pdf.fonttype": 42}):

@@ -25,7 +25,7 @@ Codec = TypeVar("Codec")
 _KINDS = {
     **dict.fromkeys((".toml", ".pbrt"), "a scene, for jaxhf render"),
     **dict.fromkeys((".tif", ".tiff", ".npz", ".asc", ".hgt"), "a terrain, for jaxhf view, hillshade, relief or convert"),
-    **dict.fromkeys((".png", ".jpg", ".jpeg", ".exr", ".npy", ".pfm"), "a picture"),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".webp", ".exr", ".npy", ".pfm"), "a picture"),
     **dict.fromkeys((".glb", ".obj", ".ply", ".stl"), "a mesh"),
 }
 
@@ -161,7 +161,7 @@ _NEEDS = {  # the package that writes a format, and the extra that installs it
 def require_writable(owner: str, what: str, endings: Iterable[str], path: PathLike) -> Path:
     """Checks that `owner` can write a file of one of these endings, so that nobody renders or fits for an hour first.
 
-    FileError where the ending is another, or a package for it is missing; else as `require_folder`.
+    FileError where the ending is another, or a package for it, or its part of Pillow, is missing; else as `require_folder`.
     """
     path = file_path(owner, path)
     by_ending(dict.fromkeys(endings), path, f"write {what} with")
@@ -171,6 +171,11 @@ def require_writable(owner: str, what: str, endings: Iterable[str], path: PathLi
         with reading(path):
             package, extra = _NEEDS[ending]
             import_extra(package, f"writing {ending} needs", extra)
+    if ending == ".webp":
+        from PIL import features  # which most files do without
+
+        if not features.check("webp"):
+            raise FileError(f"{path}: the Pillow that is installed was built without WebP; write .png or .jpg")
     return path
 
 

@@ -70,7 +70,7 @@ REFUSED = [
     ("render a.toml -o b.png --samples 1.5", "--samples must be a whole number, it is '1.5'"),
     ("render hills.npz -o a.png", "known: .pbrt, .toml; this is a terrain, for jaxhf view, hillshade, relief or convert\n"),
     ("hillshade scene.toml -o a.png", ".xyz; this is a scene, for jaxhf render\n"),
-    ("render scene.toml -o a.tif", "known: .exr, .jpeg, .jpg, .npy, .pfm, .png\n"),  # and not the .pfm that is spelt alike
+    ("render scene.toml -o a.tif", "known: .exr, .jpeg, .jpg, .npy, .pfm, .png, .webp\n"),  # not the .pfm that is spelt alike
     ("render scene.toml -o a.pgn", "did you mean '.png'?\n"),
     ("convert hills.npz a.gbl", "cannot write heights with the ending '.gbl'; did you mean '.glb'?"),
     ("convert none.tif a.jpg", "cannot write heights with the ending '.jpg'"),  # before it reads

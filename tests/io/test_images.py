@@ -233,6 +233,8 @@ BAD_FILES = [
     ("rgb16.png", png((1, 1, 16, 2, 0, 0, 0), bytes(7)), "16 bits must be grey, it has 3 channels"),
     ("bit.png", flipped_bit, "the checksum of its part 'IDAT' is wrong"),
     ("cut.jpg", cut, "truncated"),
+    ("text.webp", raw(b"not a picture"), "it is not a WebP"),
+    ("cut.webp", cut, "cut.webp: "),
     ("depth.exr", depth_exr, "its channels must be R, G, B or Y, they are Z"),
     ("cut.pfm", cut, "40 x 40 pixels take 19200 bytes"),
     ("bomb.pfm", raw(b"Pf\n99999999 99999999\n-1\n"), "99999999 x 99999999"),
@@ -300,16 +302,24 @@ def test_a_link_stays_a_link_and_the_mode_is_the_usual_one(tmp_path, image):
 
 @pytest.mark.parametrize("shape", [(16, 24, 3), (16, 24)])
 @pytest.mark.parametrize("transfer", ["srgb", "linear"])
-def test_a_jpeg_holds_what_a_png_holds(tmp_path, shape, transfer):
+def test_a_jpeg_and_a_webp_hold_what_a_png_holds(tmp_path, shape, transfer):
     """To the error of its compression, of a smooth picture."""
     y, x = np.meshgrid(np.linspace(0, 1, 16), np.linspace(-0.2, 1.2, 24), indexing="ij")
     image = (np.stack([x, y, 1 - x], axis=-1) if len(shape) == 3 else x * y).astype(np.float32)
-    for ending in ("png", "jpg", "JPEG"):
+    for ending in ("png", "jpg", "JPEG", "webp"):
         save_image(tmp_path / f"a.{ending}", image, transfer=transfer)
-    png, *jpegs = (load_image(tmp_path / f"a.{ending}", transfer="linear") for ending in ("png", "jpg", "JPEG"))
-    np.testing.assert_allclose(jpegs, [png, png], atol=0.03)
-    with Image.open(tmp_path / "a.jpg") as stored:
-        assert (stored.format, stored.size, stored.mode) == ("JPEG", (24, 16), "RGB" if len(shape) == 3 else "L")
-    with pytest.raises(ValueError, match="a JPEG has at most 65500 pixels a side, this has 65501 x 1"):
-        save_image(tmp_path / "b.jpg", np.zeros((1, 65501)))
-    assert not (tmp_path / "b.jpg").exists()
+    png, *others = (load_image(tmp_path / f"a.{ending}", transfer="linear") for ending in ("png", "jpg", "JPEG", "webp"))
+    np.testing.assert_allclose(others[:2], [png, png], atol=0.03)
+    assert np.abs(others[2] - png).mean() < 0.02  # which has the hue of every second pixel
+    for ending, kind, grey, most in (("jpg", "JPEG", "L", 65500), ("webp", "WebP", "RGB", 16383)):
+        with Image.open(tmp_path / f"a.{ending}") as stored:
+            assert (stored.format, stored.size, stored.mode) == (kind.upper(), (24, 16), "RGB" if len(shape) == 3 else grey)
+        with pytest.raises(ValueError, match=f"a {kind} has at most {most} pixels a side, this has {most + 1} x 1"):
+            save_image(tmp_path / f"b.{ending}", np.zeros((1, most + 1)))
+        assert not (tmp_path / f"b.{ending}").exists()
+
+
+def test_a_pillow_without_webp_is_told_first(tmp_path, monkeypatch):
+    monkeypatch.setattr("PIL.features.check", lambda feature: feature != "webp")
+    with pytest.raises(ValueError, match=r"a\.webp: the Pillow that is installed was built without WebP; write \.png or \.jpg"):
+        require_writable(tmp_path / "a.webp")

@@ -7,7 +7,9 @@ import contextlib
 import re
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as imageio
 import numpy as np
@@ -58,6 +60,13 @@ def _read_jpeg(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     data = path.read_bytes()
     if not data.startswith(b"\xff\xd8\xff"):
         raise FileError("it is not a JPEG")
+    return _decoded(data, "RGB")
+
+
+def _read_webp(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+    data = path.read_bytes()
+    if data[:4] + data[8:12] != b"RIFFWEBP":
+        raise FileError("it is not a WebP")
     return _decoded(data, "RGB")
 
 
@@ -127,14 +136,12 @@ def _read_tiff(path: Path) -> np.ma.MaskedArray:
     return np.ma.array(image, mask=np.broadcast_to(~there if image.ndim == 2 else ~there[..., None], image.shape))
 
 
-_MOST_OF_JPEG = 65500  # of libjpeg
-
-
-def _write_jpeg(path: Path, pixels: np.ndarray) -> None:
-    if max(pixels.shape[:2]) > _MOST_OF_JPEG:
-        raise FileError(f"a JPEG has at most {_MOST_OF_JPEG} pixels a side, this has {pixels.shape[1]} x {pixels.shape[0]}")
+def _write_lossy(path: Path, pixels: np.ndarray, kind: str, most: int, **how: Any) -> None:
+    """As a "JPEG" or "WebP", whose library takes `most` pixels a side; FileError where there are more."""
+    if max(pixels.shape[:2]) > most:
+        raise FileError(f"a {kind} has at most {most} pixels a side, this has {pixels.shape[1]} x {pixels.shape[0]}")
     with path.open("wb") as file:
-        imageio.imwrite(file, pixels, plugin="pillow", extension=".jpg", quality=95, subsampling=0)
+        imageio.imwrite(file, pixels, plugin="pillow", extension=f".{kind.lower()}", quality=95, **how)
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
@@ -153,6 +160,7 @@ def _write_pfm(path: Path, pixels: np.ndarray) -> None:
 READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".png": read_png,
     **dict.fromkeys((".jpg", ".jpeg"), _read_jpeg),
+    ".webp": _read_webp,
     ".exr": read_exr,
     ".pfm": _read_pfm,
     ".npy": _read_npy,
@@ -161,9 +169,10 @@ READERS: dict[str, Callable[[Path], np.ndarray]] = {
 # One writer a format: a path, and pixels as the file holds them, bytes or floats of shape (h, w, 3) or (h, w).
 WRITERS: dict[str, Callable[[Path, np.ndarray], None]] = {
     ".png": write_png,
-    **dict.fromkeys((".jpg", ".jpeg"), _write_jpeg),
+    **dict.fromkeys((".jpg", ".jpeg"), partial(_write_lossy, kind="JPEG", most=65500, subsampling=0)),
+    ".webp": partial(_write_lossy, kind="WebP", most=16383),
     ".exr": lambda path, pixels: write_channels(path, channels_of(pixels)),
     ".pfm": _write_pfm,
     ".npy": write_npy,
 }
-OF_BYTES = (".png", ".jpg", ".jpeg")
+OF_BYTES = (".png", ".jpg", ".jpeg", ".webp")

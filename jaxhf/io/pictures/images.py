@@ -23,10 +23,10 @@ from .exr import channels_of, write_channels
 def load_image(path: PathLike, *, transfer: str | None = None) -> Float32[np.ndarray, "h w 3"]:
     """Reads an image as linear radiance: float32, shape (h, w, 3), top row first.
 
-    .png, .jpg and .tif (a GeoTIFF such as an orthophoto; needs rasterio) hold whole numbers of 8 or, if grey or .tif, 16 bits,
-    which `transfer` explains. Floats are linear radiance as they are: in a .tif too, in .exr (needs OpenEXR), .pfm and .npy
-    (shape (h, w, 3) or (h, w)). Grey becomes three equal channels, alpha is dropped, colour profiles and EXIF rotations are
-    not looked at. Pixels of a .tif that its nodata value, mask or alpha leaves out are nan.
+    .png, .jpg, .webp and .tif (a GeoTIFF such as an orthophoto; needs rasterio) hold whole numbers of 8 or, if grey or .tif,
+    16 bits, which `transfer` explains. Floats are linear radiance as they are: in a .tif too, in .exr (needs OpenEXR), .pfm
+    and .npy (shape (h, w, 3) or (h, w)). Grey becomes three equal channels, alpha is dropped, colour profiles and EXIF
+    rotations are not looked at. Pixels of a .tif that its nodata value, mask or alpha leaves out are nan.
 
     Args:
       path: the file.
@@ -69,16 +69,16 @@ def _load(path: PathLike, transfer: str | None, left_out: float) -> np.ndarray:
 def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapping[str, Any] | None = None) -> None:
     """Writes a linear image of shape (h, w, 3) or (h, w), top row first, NumPy or JAX.
 
-    Values are radiance in floats, 1 being white; bytes of 0..255 are not. What is masked is nan. .png, .jpg: 8 bits of the
-    values clipped to 0..1, nan becomes 0; a .jpg has Pillow's quality 95. .exr and .pfm: float32. .npy: in the precision of
-    `image`. The last three keep nan and inf. The file appears whole or not at all: what was there before stays until its
-    successor is complete.
+    Values are radiance in floats, 1 being white; bytes of 0..255 are not. What is masked is nan. .png, .jpg, .webp: 8 bits
+    of the values clipped to 0..1, nan becomes 0; the last two have Pillow's quality 95. .exr and .pfm: float32. .npy: in the
+    precision of `image`. The last three keep nan and inf. The file appears whole or not at all: what was there before stays
+    until its successor is complete.
 
     Args:
       path: the file.
       image: the radiance.
-      transfer: the bytes of a .png or .jpg: "srgb", which viewers and `load_image` expect; "linear", 255 times the value, as in
-        GDAL's shaded maps. The other formats always hold the values as they are.
+      transfer: the bytes of a .png, .jpg or .webp: "srgb", which viewers and `load_image` expect; "linear", 255 times the
+        value, as in GDAL's shaded maps. The other formats always hold the values as they are.
       aovs: what `render` gives beside the image, by name, each (h, w) or (h, w, c): layers of an .exr, in float32. Their
         channels are those of compositing programs: depth.Z, normal.X, normal.Y, normal.Z, uv.U, uv.V, else name.V, or
         name.0, name.1 and so on.
