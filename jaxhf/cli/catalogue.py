@@ -14,6 +14,7 @@ _FROM = "where the camera stands, clockwise from north [110 left of the sun]"
 _SUN_FROM = "a film of a moving sun: where it begins, or when, as in 2026-06-21T07:00-05:00"
 _HEIGHT_COLOURS = "colours by height: a gdaldem colour file, or a matplotlib colour map"
 _DRAPE = "a picture laid over it: a GeoTIFF where it lies, others from corner to corner"
+_CAPTION = "with a caption of the sun and the exaggeration, a scale bar and north, as .png, .webp, .pdf or .svg"
 _VIEW = Command(
     "view",
     "show a terrain as a solid block, or fly round it",
@@ -28,6 +29,8 @@ _VIEW = Command(
             option("--size", type=size, default=(1280, 800), metavar="WxH", help="pixels [1280x800]"),
             choice("--preset", tuple(PRESETS), _PRESET, default="balanced"),
             whole("--frames", "N", "of a film, 24 a second [72]", least=2),
+            flag("--annotate", _CAPTION),
+            option("--title", metavar="TEXT", help="above the caption [none]"),
         ),
         "camera": (
             number("--from", DEGREES, _FROM, dest="camera_azimuth"),

@@ -17,6 +17,7 @@ SHEETS = (".png", ".webp", ".pdf", ".svg")
 _LINES = 500  # contour lines at most
 _DRAWN = 2000  # of the heights along a side, in contour lines: more than are told apart on a page
 _INDEX = 5  # each so many of which one is thick and has its height
+DPI = 150
 
 
 def sheet(
@@ -52,14 +53,13 @@ def sheet(
         every = slice(None, None, math.ceil(max(ny, nx) / _DRAWN))
         _draw_contours(axis, x[every], y[every], terrain.heights[every, every], contours, (low, high))
     degrees = coordinate_system(place.wkt).degrees  # in the file: here lengths are metres all the same
-    in_metres = degrees or place.unit.lower() in ("metre", "meter", "m")
     shown = ListedColormap(coloured(ramp, np.linspace(low, high, 256)[None], entries)[0] / 255)
     unit = place.height_unit or ("m" if degrees else "")
     norm = Normalize(low, max(high, float(np.nextafter(np.float32(low), np.float32(np.inf)))))
     legend = figure.colorbar(ScalarMappable(norm, shown), ax=axis, shrink=0.6)
     legend.set_label(f"height{unit and f', {unit}'}", parse_math=False)
-    _draw_scale_bar(axis, nx * metres.dx / 5, dx / metres.dx, in_metres, place.unit)
-    _draw_north(axis, terrain.turned_from_north)
+    _draw_scale_bar(axis, *scale_of(nx * metres.dx / 5, place), dx / metres.dx)
+    draw_north(axis, terrain.turned_from_north, (0.96, 0.97), 32.0)
     axis.ticklabel_format(useOffset=False, style="plain")
     axis.tick_params(labelsize=7)
     for along, inches in ((axis.xaxis, width), (axis.yaxis, width * tall)):
@@ -76,7 +76,7 @@ def save_sheet(path: Path, figure: Any) -> None:
     import matplotlib
 
     with replacing(path) as temporary, matplotlib.rc_context({"svg.fonttype": "none", "pdf.fonttype": 42}):
-        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=150)
+        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=DPI)
 
 
 def _draw_contours(axis: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, step: float, span: tuple[float, float]) -> None:
@@ -92,23 +92,30 @@ def _draw_contours(axis: Any, x: np.ndarray, y: np.ndarray, z: np.ndarray, step:
                 axis.clabel(lines, fontsize=6, fmt="%g")
 
 
-def _draw_scale_bar(axis: Any, most: float, drawn: float, in_metres: bool, unit: str) -> None:
-    """As long as may be, with 1, 2 or 5 for the first digit; `drawn` is a unit of length in coordinates."""
-    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
-
+def scale_of(most: float, place: Georeference) -> tuple[float, str]:
+    """The longest length up to `most` with 1, 2 or 5 for its first digit, and its name."""
     power = 10.0 ** math.floor(math.log10(most))
     length = max([power / 2, *(power * digit for digit in (1, 2, 5) if power * digit <= most)])
-    said = f"{length / 1000:g} km" if in_metres and length >= 1000 else f"{length:g} {'m' if in_metres else unit}".rstrip()
+    in_metres = coordinate_system(place.wkt).degrees or place.unit.lower() in ("metre", "meter", "m")
+    if in_metres and length >= 1000:
+        return length, f"{length / 1000:g} km"
+    return length, f"{length:g} {'m' if in_metres else place.unit}".rstrip()
+
+
+def _draw_scale_bar(axis: Any, length: float, said: str, drawn: float) -> None:
+    """`drawn` is a unit of length in coordinates."""
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+
     bar = AnchoredSizeBar(axis.transData, length * drawn, said, "lower left", pad=0.4, borderpad=0.6, sep=3, frameon=True)
     bar.patch.set(alpha=0.7, linewidth=0)
     axis.add_artist(bar)
 
 
-def _draw_north(axis: Any, turned: float) -> None:
-    """An arrow to true north, which stands counterclockwise of y where y is turned clockwise of it, degrees."""
+def draw_north(axis: Any, turned: float, tip: Any, length: float) -> None:
+    """An arrow to true north, `turned` degrees counterclockwise of up; its tip as shares of the axes, its length in points."""
     east, north = -math.sin(math.radians(turned)), math.cos(math.radians(turned))
     axis.annotate(
-        "N", xy=(0.96, 0.97), xycoords="axes fraction", xytext=(-32 * east, -32 * north), textcoords="offset points",
-        ha="center", va="center", weight="bold", arrowprops={"arrowstyle": "-|>", "facecolor": "k"},
+        "N", xy=tip, xycoords="axes fraction", xytext=(-length * east, -length * north), textcoords="offset points",
+        ha="center", va="center", weight="bold", size=0.3125 * length, arrowprops={"arrowstyle": "-|>", "facecolor": "k"},
         bbox={"boxstyle": "circle,pad=0.15", "facecolor": "w", "alpha": 0.7, "linewidth": 0},
     )  # fmt: skip

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ...core.errors import UserError
+from ...core.extras import import_extra
+from ...io.files import require_writable as require_writable_file
 from ...io.pictures.films import FILMS, require_writable_film, writing_film
 from ...io.pictures.images import PICTURES, linear_from_srgb, require_writable, save_image, srgb_from_linear
 from ...io.terrain.drape import load_drape
@@ -25,9 +27,11 @@ from ...scene.sun import sun, utc
 from ...xla.devices import local_mesh
 from .. import arguments, limits
 from ..block import Look, block, exaggeration, lights, photograph, with_water
+from ..caption import annotated
 from ..catalogue import PRESETS
 from ..overwriting import require_no_input
 from ..progress import bar
+from ..sheet import SHEETS, save_sheet
 from .maps import place_of
 
 _TALLEST = 100  # times its length: beyond, a terrain is a needle that no pixel shows
@@ -73,8 +77,16 @@ def _output(options: argparse.Namespace) -> tuple[Path, bool]:
         arguments.refuse(options, "azimuth", "altitude", because="the sun moves from --sun-from to --sun-to")
     if options.drape is not None:
         arguments.refuse(options, "ramp", because="--drape gives the terrain its colours")
+    if film:
+        arguments.refuse(options, "annotate", because=f"{output} is a film, and pictures have captions")
+    if not options.annotate:
+        arguments.refuse(options, "title", because="without --annotate there is no caption")
     require_no_input(options, output)
-    (require_writable_film if film else require_writable)(output)
+    if options.annotate:
+        import_extra("matplotlib", "--annotate draws with", "plot")
+        require_writable_file("view", "a picture with a caption", SHEETS, output)
+    else:
+        (require_writable_film if film else require_writable)(output)
     return output, film
 
 
@@ -100,7 +112,12 @@ def run(options: argparse.Namespace) -> None:
         said = f"{len(frames)} frames of {said}"
     else:
         with bar(total=look.samples, unit=" samples", delay=0.5) as shown:
-            save_image(output, photograph(ready, camera, look, shown.update))
+            image = photograph(ready, camera, look, shown.update)
+        if options.annotate:
+            level = float(np.nanmin(z)) if base is None else base
+            save_sheet(output, annotated(_bytes(image), terrain, camera, level, options.title, _caption(terrain, look, factor)))
+        else:
+            save_image(output, image)
     print(f"{output}: {said}, heights x {factor:g}, {time.perf_counter() - begin:.1f} s")
 
 
@@ -144,11 +161,22 @@ def _frames(
     return [(camera, look) for camera in cameras for look in looks]  # of which one is alone
 
 
+def _caption(terrain: Terrain, look: Look, factor: float) -> str:
+    """What a picture does not show by itself."""
+    said = [f"sun from {(look.azimuth + terrain.rotation) % 360:g}°, {look.altitude:g}° high"]
+    said += [f"vertical exaggeration {factor:g}"] if factor != 1 else []
+    return "; ".join([*said, "scale along the edge beside it"])
+
+
+def _bytes(image: np.ndarray) -> np.ndarray:
+    """Linear radiance (h, w, 3) as the bytes of sRGB."""
+    return (srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8)
+
+
 def _film(output: Path, ready: Prepared, frames: Sequence[tuple[Perspective, Look]]) -> None:
     """Writes frames of a block that was prepared in the light of the first one."""
     with writing_film(output) as add, bar(total=len(frames), unit=" frames") as shown:
         for camera, look in frames:
             lit = ready if look is frames[0][1] else ready.with_lights(lights(ready.scene.heightfields[0], look))
-            image = photograph(lit, camera, look)
-            add((srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8))
+            add(_bytes(photograph(lit, camera, look)))
             shown.update()
