@@ -50,7 +50,7 @@ _VIEW = Command(
             option("--ramp", metavar="FILE|NAME", help=_HEIGHT_COLOURS),
             option("--drape", metavar="IMAGE", help=_DRAPE),
             choice("--material", MATERIALS, "the law by which it reflects [matte]", default="matte"),
-            number("--water", "LEVEL", "below it is water", rule=finite),
+            number("--water", "LEVEL", "up to it is water [0 where wide areas lie at 0]", rule=finite),
             option("--no-skirt", dest="skirt", action="store_false", help="no walls: a sheet"),
         ),
         **RASTER,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.cli.block import Look, _in_haze as in_haze, block, exaggeration, with_water
+from jaxhf.cli.block import Look, _in_haze as in_haze, block, exaggeration, sea_level, with_water
 from jaxhf.scene.camera import cropped
 
 RAMP = np.linspace(0, 1, 101)[:, None] * np.ones(101)
@@ -26,9 +26,19 @@ def test_water_is_level_and_darkens_with_depth():
     colours = np.full((2, 3, 3), 0.5)
     level, tinted = with_water(heights, colours, 3.0)
     np.testing.assert_array_equal(level, np.array([[5, 3, 3], [np.nan, 3, 9]], np.float32))
-    np.testing.assert_array_equal(tinted[[0, 0, 1], [0, 1, 2]], 0.5)
-    assert (tinted[0, 2] < tinted[1, 1]).all()
-    assert (tinted[1, 1] < 0.5).all()
+    np.testing.assert_array_equal(tinted[[0, 1, 1], [0, 0, 2]], 0.5)
+    shades = tinted[[0, 1, 0], [2, 1, 1]]  # of depths 2, 1 and 0
+    assert (np.diff(shades, axis=0) > 0).all()
+    assert (shades < 0.5).all()
+
+
+def test_a_sea_is_wide_and_level_at_0_beside_land():
+    heights = np.maximum(np.arange(-10.0, 190.0), 0)[:, None] * np.ones(30)
+    assert sea_level(heights)
+    assert sea_level(np.where(heights > 100, np.nan, heights))
+    assert not sea_level(heights[10:])  # a shore
+    assert not sea_level(heights + 1)
+    assert not sea_level(0 * heights)
 
 
 def test_haze_grows_with_distance_before_a_background():

@@ -157,6 +157,18 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
             load_drape(path, terrain)
 
 
+def test_a_sea_is_blue_without_being_asked_for(tmp_path, command):
+    heights = np.maximum(np.arange(-8, 9), 0)[:, None] * np.ones(17, np.float32)
+    jaxhf.save_heights(tmp_path / "in.npz", Terrain(heights, 10.0, 10.0))
+    words = ["view", tmp_path / "in.npz", *SMALL, "--from", 180, "--above", 90, "-o"]
+    for out, more, blue in (("a.npy", [], True), ("b.npy", ["--water", 0], True), ("c.npy", ["--ramp", "Reds"], False)):
+        code, _, err = command(*words, tmp_path / out, *more)
+        assert (code, "in.npz holds wide areas at 0, which are drawn as a sea" in err) == (0, not more)
+        red, _, high = np.load(tmp_path / out)[24, 24]  # in the south
+        assert (high > 1.5 * red) == blue
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npy"), np.load(tmp_path / "b.npy"))
+
+
 @pytest.mark.filterwarnings("always:view. the heights go from")
 def test_there_is_a_terrain_to_try(terrain, tmp_path, monkeypatch, command):
     """Here another, as that of matplotlib takes seconds; docs/index.md shows it."""

@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import datetime
+import sys
 import time
 import warnings
 from collections.abc import Sequence
@@ -26,7 +27,7 @@ from ...scene.material import SCATTERING
 from ...scene.sun import sun, utc
 from ...xla.devices import local_mesh
 from .. import arguments, limits
-from ..block import Look, block, exaggeration, lights, photograph, with_water
+from ..block import Look, block, exaggeration, lights, photograph, sea_level, with_water
 from ..caption import annotated
 from ..catalogue import PRESETS
 from ..overwriting import require_no_input
@@ -128,9 +129,12 @@ def _solid(options: argparse.Namespace, terrain: Terrain, factor: float) -> tupl
         colours = load_drape(options.drape, terrain)
     else:
         colours = linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(terrain, options.ramp)]
+    sea = options.water is options.drape is options.ramp is None and sea_level(z)
+    if sea:
+        options.water = 0.0
     if options.water is not None:
         low, high = np.nanmin(z), np.nanmax(z)
-        if not low < options.water < high:
+        if not low <= options.water < high:
             warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {options.water:g}", stacklevel=2)
         z, colours = with_water(z, colours, options.water)
     reach = max((n - 1) * d for n, d in zip(z.shape, (terrain.dy, terrain.dx), strict=True))
@@ -138,6 +142,9 @@ def _solid(options: argparse.Namespace, terrain: Terrain, factor: float) -> tupl
     if times > _TALLEST:
         found = f"times {factor:g} it is {times:.3g} times its length high"
         raise UserError(f"view: --exaggeration must leave a terrain at most {_TALLEST} times its length high; {found}")
+    if sea and not options.quiet:
+        said = "holds wide areas at 0, which are drawn as a sea, as --water 0 does (--ramp overrules)"
+        print(f"jaxhf: {options.terrain} {said}", file=sys.stderr)
     z = z * z.dtype.type(factor)
     low, high = np.nanmin(z), np.nanmax(z)
     return z, colours, float(low - max(0.25 * (high - low), 0.02 * reach)) if options.skirt else None
