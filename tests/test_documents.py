@@ -36,6 +36,7 @@ DEEP = {  # over four seconds of a processor
     "docs/coming-from/asp.md",
     "docs/coming-from/gdal.md",
     "docs/coming-from/mitsuba.md",
+    "docs/coming-from/rayshader.md",
     "docs/index.md",
     *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/maps", "guides/sun-and-sky", "guides/view")),
     *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "picture", "robots")),
