@@ -255,7 +255,7 @@ def test_ranges_of_directions_of_any_length():
 
 
 def test_bounds_at_hand_move_with_a_height_field():
-    geoms = Geoms.from_model(MODEL)
+    geoms = Geoms.from_model(MODEL, np.flatnonzero(MODEL.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)[:2].tolist())
     moved, prepared = geoms.at(DATA), geoms.prepared().at(DATA)
     assert prepared.hfields[1]._grid is not None
     o, d = any_rays(500, 4)
