@@ -75,19 +75,24 @@ def resumed(path: Path, whole: jaxhf.Fit, **options) -> list[jaxhf.Step]:
     return again
 
 
-@pytest.mark.parametrize("last", [2, "level", *(pytest.param(step, marks=pytest.mark.deep) for step in (1, 3, 5, "end"))])
-def test_after_ctrl_c_it_goes_on_to_the_same_bits(tmp_path, whole, last):
-    """In a stage, and after the last step of one."""
-    first_of_all = next(step.step for step in whole.history if step.level == 17)
-    last = {"level": first_of_all - 1, "end": len(whole.history) - 1}.get(last, last)
+def interrupted(path: Path, last: int, fit: Callable[..., jaxhf.Fit] = begun) -> None:
+    """Ctrl-C after the step of this number."""
 
     def interrupt(step: Any) -> None:
         if step.step == last:
             raise KeyboardInterrupt
 
-    path = tmp_path / "fit.checkpoint"
     with pytest.raises(KeyboardInterrupt):
-        begun(path, progress=interrupt)
+        fit(path, progress=interrupt)
+
+
+@pytest.mark.parametrize("last", [2, "level", *(pytest.param(step, marks=pytest.mark.deep) for step in (1, 3, 5, "end"))])
+def test_after_ctrl_c_it_goes_on_to_the_same_bits(tmp_path, whole, last):
+    """In a stage, and after the last step of one."""
+    first_of_all = next(step.step for step in whole.history if step.level == 17)
+    last = {"level": first_of_all - 1, "end": len(whole.history) - 1}.get(last, last)
+    path = tmp_path / "fit.checkpoint"
+    interrupted(path, last)
     assert resumed(path, whole)[0].step == last + 1
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
@@ -102,14 +107,8 @@ def test_it_goes_on_among_rejected_steps(tmp_path, monkeypatch):
     once, twice = accepted.index(False) + 1, accepted.index(False) + 2
     assert not accepted[twice - 1]
     for last in (once, twice):
-
-        def interrupt(step: Any, last: int = last) -> None:
-            if step.step == last:
-                raise KeyboardInterrupt
-
         path = tmp_path / f"{last}.checkpoint"
-        with pytest.raises(KeyboardInterrupt):
-            begun(path, progress=interrupt)
+        interrupted(path, last)
         assert resumed(path, whole)[0].step == last + 1
 
 
@@ -125,7 +124,7 @@ def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
     """Ctrl-C as `_run` has called the function of this name for so many times: in it, or where its loss is waited for."""
     original, calls = getattr(_run, name), []
 
-    def interrupted(*arguments):
+    def stopping(*arguments):
         calls.append(arguments)
         found = original(*arguments)
         if len(calls) != call:
@@ -136,7 +135,7 @@ def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
         return unknowns, position, outcome._replace(loss=Slow())
 
     with monkeypatch.context() as patched:
-        patched.setattr(_run, name, interrupted)
+        patched.setattr(_run, name, stopping)
         with pytest.raises(KeyboardInterrupt):
             yield
 
@@ -239,19 +238,17 @@ def test_it_goes_on_with_coarse_and_with_fine_heights(tmp_path, monkeypatch):
     scenes, targets = problem(33)
     unknown = jaxhf.Unknown(albedo="map", light_std=1.0)
     options = OPTIONS | {"noise": 1.0, "prior": jaxhf.Prior(0.1, 1.0, 0.1), "unknown": unknown}
-    whole = jaxhf.fit(scenes, targets, **options)
+
+    def fit(path: Path | None = None, resume: bool = False, **more: Any) -> jaxhf.Fit:
+        return jaxhf.fit(scenes, targets, **options, **more, checkpoint=path and jaxhf.Checkpoint(path, resume=resume))
+
+    whole = fit()
     coarse = sum(step.level < 33 for step in whole.history)  # 17 heights a side, with 2 beyond each border
     assert 2 < coarse < len(whole.history) - 2
     for last in (1, coarse - 1, coarse, coarse + 1, len(whole.history) - 1):
-
-        def interrupt(step: Any, last: int = last) -> None:
-            if step.step == last:
-                raise KeyboardInterrupt
-
         path = tmp_path / f"{last}.checkpoint"
-        with pytest.raises(KeyboardInterrupt):
-            jaxhf.fit(scenes, targets, **options, checkpoint=jaxhf.Checkpoint(path), progress=interrupt)
-        agree(jaxhf.fit(scenes, targets, **options, checkpoint=jaxhf.Checkpoint(path, resume=True)), whole)
+        interrupted(path, last, fit)
+        agree(fit(path, resume=True), whole)
 
 
 def run_python(program: str, *arguments: str) -> subprocess.Popen:
