@@ -37,6 +37,7 @@ from jaxhf.xla.machine import peak_mb
 
 FEWER = 1.5  # times less than the table's ratio is what a case may reach
 APART = (10, 6)  # percent by which the shares within one and two deviations may differ from the table's
+Bounds = tuple[float, list[int]]  # of a case of the table: its ratio, and these shares
 STEEPEST = 1.1  # power of the number of heights with which a fit's time may grow
 FROM = 256  # heights a side from which that is judged: of smaller terrains time is mostly compilation
 
@@ -305,7 +306,7 @@ def judged(run: benchmark.Run, options: argparse.Namespace) -> None:
             np.savez(options.out / f"{name}.npz", **kept, std=0 if found.std is None else found.std)
 
 
-def table() -> dict[str, tuple[float, list[int]]]:
+def table() -> dict[str, Bounds]:
     """For each case the ratio and the percents within one and two deviations, of docs/measurements/fit-cases.csv."""
     lines = (Path(__file__).parents[1] / "docs/measurements/fit-cases.csv").read_text().splitlines()
     rows = csv.DictReader(line for line in lines if not line.startswith("#"))
@@ -314,13 +315,7 @@ def table() -> dict[str, tuple[float, list[int]]]:
 
 
 def judge(
-    run: benchmark.Run,
-    name: str,
-    definition: Definition,
-    case: Case,
-    found: jaxhf.Fit,
-    seconds: float,
-    bounds: tuple[float, list[int]] | None,
+    run: benchmark.Run, name: str, definition: Definition, case: Case, found: jaxhf.Fit, seconds: float, bounds: Bounds | None
 ) -> None:
     """A case must be as near as the table says, within `FEWER` and `APART`; one that was drawn three times nearer than its map.
 
@@ -367,10 +362,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, help="of the cases that are drawn, to repeat a run [another one in each run]")
     parser.add_argument("--count", type=int, default=4, help="how many cases are drawn")
     parser.add_argument(
-        "--hfield",
-        type=Path,
-        help="assets/hfield.png in the folder mujoco_playground/_src/locomotion/go1/xmls of the wheel that "
-        "pip download --no-deps playground fetches",
+        "--hfield", type=Path, help="mujoco_playground/_src/locomotion/go1/xmls/assets/hfield.png of PyPI's wheel of playground"
     )
     parser.add_argument("--out", type=Path, help="a folder for what cases find, as .npz")
     parser.add_argument(

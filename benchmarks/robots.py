@@ -7,9 +7,9 @@ import functools
 import importlib
 import resource
 import sys
-import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -110,11 +110,8 @@ def closed_forms(run: benchmark.Run, count: int) -> None:
 
 
 def threads(work: Callable[[int], None], many: int) -> None:
-    running = [threading.Thread(target=work, args=(k,)) for k in range(many)]
-    for thread in running:
-        thread.start()
-    for thread in running:
-        thread.join()
+    with ThreadPoolExecutor(many) as pool:
+        list(pool.map(work, range(many)))
 
 
 def speed(run: benchmark.Run, robots: int, cores: int = 2) -> None:
