@@ -132,14 +132,7 @@ def _distance(present: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def cast(
-    heights: np.ndarray,
-    dx: float,
-    dy: float,
-    x0: float,
-    y0: float,
-    o: Vectors,
-    d: Vectors,
-    slack: float = 1e-12,
+    heights: np.ndarray, dx: float, dy: float, x0: float, y0: float, o: Vectors, d: Vectors, slack: float = 1e-12
 ) -> OracleHit:
     """The first hits of half-lines o + t d, t > 0, on the surface, by the sign of g at every crossing.
 

@@ -123,11 +123,8 @@ def test_sensors_meet_what_rays_meet():
 
 def test_noise_is_along_the_rays():
     ground = HField(heights(9, 6, 1), SIZE)
-    pos, quat, pattern = (
-        np.array([0.3, -0.2, 1.5]),
-        np.array([1.0, 0, 0, 0]),
-        3 * lidar_pattern(7, (-60.0, 0.0), resolution=14.4),
-    )
+    pos, quat = np.array([0.3, -0.2, 1.5]), np.array([1.0, 0, 0, 0])
+    pattern = 3 * lidar_pattern(7, (-60.0, 0.0), resolution=14.4)
     exact = jax.tree.map(np.asarray, lidar(ground, pos, quat, pattern))
     keys = jax.random.split(jax.random.key(0), 100)
     noisy = jax.vmap(lambda key: lidar(ground, pos, quat, pattern, noise=0.02, key=key))(keys)

@@ -75,11 +75,7 @@ def test_another_terrain_needs_no_other_program(make, pixels, traced):
 
 
 @pytest.mark.parametrize(
-    "make",
-    [
-        scene,
-        *(pytest.param(make, marks=pytest.mark.deep) for make in (solid, in_sun, of_two, holed)),
-    ],
+    "make", [scene, *(pytest.param(make, marks=pytest.mark.deep) for make in (solid, in_sun, of_two, holed))]
 )
 def test_pictures_are_those_of_a_program_for_their_terrain(make, monkeypatch):
     """To the bit; also of terrains without room, which are narrow or have a seam."""

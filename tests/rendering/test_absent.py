@@ -109,11 +109,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
         case(jaxhf.Object(jaxhf.Skirt.of(FIELD, -1))),
         [everywhere(skirt.make_walls), within(skirt.Walls, "hit")],
     ),
-    "second heightfield": (
-        "smooth normals",
-        case(jaxhf.Object(FIELD), shading="smooth"),
-        [],
-    ),
+    "second heightfield": ("smooth normals", case(jaxhf.Object(FIELD), shading="smooth"), []),
     "several samples": ("plain", case(samples=4), []),
     "sky": ("plain", case(lights=(SUN, SKY)), []),
     "hidden sky": (

@@ -20,10 +20,7 @@ def terrain(heights) -> jaxhf.Scene:
 
 def mirrors(heights) -> jaxhf.Scene:
     """A mirror, and a tilted sheet over it."""
-    objects = [
-        jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Mirror()),
-        jaxhf.Object(jaxhf.Heightfield(HEIGHTS), None, SHEET),
-    ]
+    objects = [jaxhf.Object(jaxhf.Heightfield(heights), jaxhf.Mirror()), jaxhf.Object(jaxhf.Heightfield(HEIGHTS), None, SHEET)]
     return jaxhf.Scene(objects, CAMERA, [jaxhf.Point((0.8, -0.3, 1.4))])
 
 

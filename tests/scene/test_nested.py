@@ -295,10 +295,7 @@ HOLED[5, 7] = np.nan
         (lambda: jaxhf.nested(field(9, 1), cast(Any, 3)), "fields must be Heightfields .*, it is an int"),
         (lambda: jaxhf.nested(field(40, 1, 40, 40), field(20, 8), blend=0), "blend must be a whole number from 1 on, it is 0"),
         (lambda: jaxhf.nested(field(40, 8), field(80, 1)), "must come from fine to coarse; along y the cells of one have 8"),
-        (
-            lambda: jaxhf.nested(field(40, 1, 0, 40), field(20, 8)),
-            "for 2 of its cells .* along x one lies from 0 to 39",
-        ),
+        (lambda: jaxhf.nested(field(40, 1, 0, 40), field(20, 8)), "for 2 of its cells .* along x one lies from 0 to 39"),
         (lambda: jaxhf.nested(field(16, 1, 40, 40), field(20, 8)), "must hold 3 cells of the next coarser one .* along y"),
         (lambda: jaxhf.nested(field(41, 1, 40, 40), field(20, 8, heights=HOLED)), "one has one at x 49, y 40"),
         (lambda: jaxhf.nested(*terrains()[2:4]), "must not be nested already"),
