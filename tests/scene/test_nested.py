@@ -214,19 +214,12 @@ def test_the_derivative_is_that_of_one_grid(points):
     for fields, dz in (((fine, around), change), ((whole,), np.pad(change, beyond))):
         seen = scene(*fields, camera=cameras()["orthographic"], lights=[light])
         keys = [jax.random.key(number) for number in range(4)] if points else [None]
-        tangents.append(
-            np.mean(
-                [
-                    jax.jvp(
-                        lambda z, seen=seen, key=key: jaxhf.render(seen.with_heights(z), settings, key=key),
-                        (seen.heights,),
-                        (jnp.asarray(dz, jnp.float32),),
-                    )[1]
-                    for key in keys
-                ],
-                axis=0,
-            )
-        )
+
+        def drawn(z, key, seen=seen):
+            return jaxhf.render(seen.with_heights(z), settings, key=key)
+
+        at, along = (seen.heights,), (jnp.asarray(dz, jnp.float32),)
+        tangents.append(np.mean([jax.jvp(functools.partial(drawn, key=key), at, along)[1] for key in keys], axis=0))
     nested, one = tangents
     size = np.sqrt(np.mean(one**2))
     assert size > 1e-3
