@@ -279,7 +279,7 @@ def cells_of(
     (ny, nx), turn = shape, math.radians(rotation)
     axes = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
     cells, last = ((given - begin) @ axes / step).reshape(-1, 2), np.array([nx - 1, ny - 1])
-    rounding = _ROUNDING + 8 * np.finfo(float).eps * np.abs(np.array(begin) / step)  # of coordinates
+    rounding = _ROUNDING + 8 * np.finfo(float).eps * np.abs(begin).max() / np.array(step)  # of coordinates
     for k, cell in enumerate(cells):
         if not ((cell >= -rounding) & (cell <= last + rounding)).all():
             spans = [f"{a:.10g} to {a + (n - 1) * d:.10g}" for a, d, n in zip(begin, step, (nx, ny), strict=True)]

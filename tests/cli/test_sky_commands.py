@@ -177,6 +177,15 @@ def test_viewshed_of_an_area(run, tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "seen.npy"), 255 * expected)
 
 
+def test_an_area_holds_what_stands_on_its_sides(run):
+    """All 34 heights in the rectangle of the corners, and a row of three on a polygon that is a line."""
+    corners = [(100, 50), (112, 50), (112, 62), (100, 62)]
+    shown = [word for x, y in corners for word in ("--observer", str(x), str(y))]
+    assert "from 34 points" in run("viewshed", "seen.npy", *shown, "--area")[1]
+    line = [word for x in (102, 106, 104) for word in ("--observer", str(x), "53")]
+    assert "from 3 points" in run("viewshed", "seen.npy", *line, "--area")[1]
+
+
 @pytest.mark.parametrize(
     ("options", "expected"),
     [

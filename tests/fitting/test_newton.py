@@ -49,7 +49,12 @@ def test_a_whole_step_solves_the_linear_problem():
 
 @pytest.mark.parametrize(
     ("lengths", "accepted", "goes_on"),
-    [((1.0, 0.5, 0.46), [True, False], [True, True]), ((1.0, 2.0), [False], [True]), ((1.0, 0.7), [True], [False])],
+    [
+        ((1.0, 0.5, 0.46), [True, False], [True, True]),
+        ((1.0, 2.0), [False], [True]),
+        ((1.0, np.nan), [False], [True]),
+        ((1.0, 0.7), [True], [False]),
+    ],
 )
 def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, goes_on, monkeypatch):
     """Whatever becomes of the loss: else all stays as it was. Where it is hardly shorter, nothing is left to be gained."""

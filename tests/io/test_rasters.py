@@ -192,6 +192,9 @@ def test_a_part_of_a_terrain_in_degrees(tmp_path):
         ({"window": (0, 2, 2, 2)}, "window must lie within the file's 4 columns"),
         ({"window": (0, 2, 2, 1)}, "window must lie within the file's 4 columns"),
         ({"window": (0, 0.5, 2, 2)}, "window must be a column, a row, and how many columns and rows, whole numbers"),
+        ({"window": ("0", "0", "2", "2")}, "whole numbers; it is"),
+        ({"window": (0, 0, 2, None)}, "whole numbers; it is"),
+        ({"window": (0, 0, 2, 2), "bbox": 5}, "not both: 5 and"),
         ({"window": (0, 0, 2, 2), "bbox": (0, 0, 1, 1)}, "bbox or window must say which heights are taken, not both"),
     ],
 )

@@ -15,6 +15,8 @@ from .. import arguments, limits
 from ..progress import compiled_bar
 from .maps import read_in_metres, require_numbers
 
+_ON_SIDE = 1e-6  # cells from it
+
 
 def run(options: argparse.Namespace) -> None:
     if options.above_ground:
@@ -30,9 +32,9 @@ def run(options: argparse.Namespace) -> None:
     dx, dy, x0, y0 = stored.in_file
     shape = stored.heights.shape
     cells = cells_of("viewshed", "--observer", options.observers, shape, (x0, y0), (dx, dy), rotation=stored.rotation)
+    limits.require_memory_of_map("viewshed", stored.heights.size, options.precision)
     if options.line or options.area:
         cells = (_along if options.line else _within)(cells, stored.heights)
-    limits.require_memory_of_map("viewshed", stored.heights.size, options.precision)
     limits.set_up_jax(options)
     begin = time.perf_counter()
     known = arguments.given(options, "height", "target_height", "radius")
@@ -59,12 +61,20 @@ def _along(cells: np.ndarray, heights: np.ndarray) -> np.ndarray:
 
 
 def _within(cells: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """The vertices within the polygon of these points, without those in holes: rays along x cross it an odd number of times."""
-    iy, ix = np.nonzero(np.isfinite(heights))
-    inside = np.zeros(ix.shape, bool)
-    for (x0, y0), (x1, y1) in zip(cells, np.roll(cells, -1, axis=0), strict=True):
-        if y0 != y1:
-            inside ^= ((y0 > iy) != (y1 > iy)) & (ix < x0 + (iy - y0) * ((x1 - x0) / (y1 - y0)))
-    if not inside.any():
+    """The vertices in and on the polygon of these points, without those in holes: rays along x cross it an odd number of
+    times. What stands on a side is within, however coordinates are rounded."""
+    left, bottom = np.ceil(cells.min(0) - _ON_SIDE).astype(int)
+    right, top = np.floor(cells.max(0) + _ON_SIDE).astype(int)
+    iy, ix = np.nonzero(np.isfinite(heights[bottom : top + 1, left : right + 1]))
+    vertices = np.column_stack([ix + left, iy + bottom]).astype(float)
+    inside, on_side = np.zeros((2, len(vertices)), bool)
+    for first, second in zip(cells, np.roll(cells, -1, axis=0), strict=True):
+        along, to = second - first, vertices - first
+        share = np.clip(to @ along / max(along @ along, np.finfo(float).tiny), 0, 1)
+        on_side |= np.abs(to - share[:, None] * along).max(1) < _ON_SIDE
+        if along[1]:
+            crosses = (vertices[:, 1] < first[1]) != (vertices[:, 1] < second[1])
+            inside ^= crosses & (to[:, 0] < to[:, 1] * (along[0] / along[1]))
+    if not (inside | on_side).any():
         raise UserError("viewshed: --area must hold heights, none stands within")
-    return np.column_stack([ix, iy])[inside].astype(float)
+    return vertices[inside | on_side]

@@ -99,7 +99,7 @@ def _step_by_factors(state: State, place: _Place) -> tuple[Unknowns, _Place, Out
     assert here is not None
     expansion = expand(relaxed(state.unknowns, here), place.expansion.problem)
     there = whole_step(expansion)
-    if there.length > SHORTER * here.length:
+    if not there.length <= SHORTER * here.length:
         return state.unknowns, place, Outcome(here.loss, False, here.predicted, state.step_size, 0.0)
     predicted = there.predicted if there.length <= LAST * here.length else 0.0
     outcome = Outcome(there.loss, True, predicted, state.step_size, RELAXED * here.length)

@@ -243,7 +243,7 @@ def _read_npz(path: Path, nodata: Nodata) -> Terrain:
                 unit = str(array("z_unit", "U")) if "z_unit" in members else ""
                 turn = number("crs_rotation") if "crs_rotation" in members else 0.0
                 place = Georeference(str(array("crs", "U")), scale, offset, nodata_there, bool(number("point")), unit, turn)
-                plain = place[1:3] == Georeference()[1:3]
+                plain = place[1:3] == Georeference()[1:3] and not turn
                 grid |= {"georeference": place, "crs": coordinate_system(place.wkt) if plain else CoordinateSystem()}
             return Terrain(heights_of(array(name), nodata(None)), **grid)
         if "elevation" not in members:

@@ -1,6 +1,7 @@
 """Which rows and columns of a grid a box or a window takes."""
 
 import math
+import numbers
 from collections.abc import Sequence
 
 import numpy as np
@@ -33,7 +34,7 @@ def places_within(
 
 def places_in_window(window: Window, shape: tuple[int, ...], north_first: bool, east_first: bool) -> tuple[slice, slice]:
     """The same of a window, which counts from where the file begins, as the last two say."""
-    if np.shape(window) != (4,) or any(value % 1 != 0 for value in window):
+    if np.shape(window) != (4,) or not all(isinstance(value, numbers.Real) and value % 1 == 0 for value in window):
         raise FileError(f"window must be a column, a row, and how many columns and rows, whole numbers; it is {window}")
     left, top, width, height = map(int, window)
     (ny, nx), right, bottom = shape, left + width, top + height

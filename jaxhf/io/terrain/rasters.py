@@ -96,6 +96,8 @@ def _place(dataset: Any, nodata: float | None, z_unit: str = "") -> tuple[Terrai
     """A terrain of no heights where GDAL's geotransform puts the pixels' centres, and whether the file's rows begin in the
     north and its columns in the east."""
     a, b, c, d, e, f = dataset.transform[:6]
+    if max(abs(b) * dataset.height, abs(d) * dataset.width) < _UNROTATED * min(abs(a), abs(e)):  # by rounding
+        b = d = 0.0
     if dataset.gcps[0]:
         raise FileError("it must be placed by a geotransform, it has ground control points (gdalwarp makes it so)")
     ny, nx = dataset.height, dataset.width
@@ -117,6 +119,7 @@ def _place(dataset: Any, nodata: float | None, z_unit: str = "") -> tuple[Terrai
 
 
 _SHEAR = 1e-6  # cosine of the angle between rows and columns, of which transforms in text have some
+_UNROTATED = 1e-6  # cells by which rows and columns leave x and y
 
 
 require_writable_raster = partial(require_writable, "save_raster", "a map", (".npy", ".png", ".tif", ".tiff"))

@@ -83,6 +83,7 @@ def _write_tiff(path: Path, terrain: Terrain) -> None:
 
 
 def _write_png(path: Path, terrain: Terrain) -> None:
+    terrain.require_unrotated("the terrain in a .png")
     low, high = (float(bound(terrain.heights)) for bound in (np.min, np.max))
     if not (low >= -0.5 and high < 65535.5):
         span = "has holes" if terrain.nodata.any() else f"goes from {low:.6g} to {high:.6g}"

@@ -232,7 +232,7 @@ class Terrain:
                 self.require_unrotated("a terrain that bbox cuts (window cuts any)")
             return places_within(box, self.heights.shape, (x0, y0), (dx, dy))
         if box is not None:
-            raise FileError(f"bbox or window must say which heights are taken, not both: {tuple(box)} and {tuple(window)}")
+            raise FileError(f"bbox or window must say which heights are taken, not both: {box} and {window}")
         return places_in_window(window, self.heights.shape, north_first, east_first)
 
     def in_metres(self, **given: float) -> "Terrain":
