@@ -15,7 +15,7 @@ from ...core.errors import UserError
 from ...core.extras import import_extra
 from ...io.files import require_writable as require_writable_file
 from ...io.pictures.films import FILMS, require_writable_film, writing_film
-from ...io.pictures.images import PICTURES, linear_from_srgb, require_writable, save_image, srgb_from_linear
+from ...io.pictures.images import PICTURES, bytes_of, linear_from_srgb, require_writable, save_image
 from ...io.terrain.drape import load_drape
 from ...io.terrain.load import jacksboro_file, load_heights
 from ...io.terrain.terrain import Terrain
@@ -116,7 +116,9 @@ def run(options: argparse.Namespace) -> None:
             image = photograph(ready, camera, look, shown.update)
         if options.annotate:
             level = float(np.nanmin(z)) if base is None else base
-            save_sheet(output, annotated(_bytes(image), terrain, camera, level, options.title, _caption(terrain, look, factor)))
+            save_sheet(
+                output, annotated(bytes_of(image), terrain, camera, level, options.title, _caption(terrain, look, factor))
+            )
         else:
             save_image(output, image)
     print(f"{output}: {said}, heights x {factor:g}, {time.perf_counter() - begin:.1f} s")
@@ -175,15 +177,10 @@ def _caption(terrain: Terrain, look: Look, factor: float) -> str:
     return "; ".join([*said, "scale along the edge beside it"])
 
 
-def _bytes(image: np.ndarray) -> np.ndarray:
-    """Linear radiance (h, w, 3) as the bytes of sRGB."""
-    return (srgb_from_linear(np.clip(image, 0, 1)) * 255 + 0.5).astype(np.uint8)
-
-
 def _film(output: Path, ready: Prepared, frames: Sequence[tuple[Perspective, Look]]) -> None:
     """Writes frames of a block that was prepared in the light of the first one."""
     with writing_film(output) as add, bar(total=len(frames), unit=" frames") as shown:
         for camera, look in frames:
             lit = ready if look is frames[0][1] else ready.with_lights(lights(ready.scene.heightfields[0], look))
-            add(_bytes(photograph(lit, camera, look)))
+            add(bytes_of(photograph(lit, camera, look)))
             shown.update()

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32, UInt8
 
 from ...core.errors import ArgumentError
 from ...core.rules import OneOf, require
@@ -101,13 +101,18 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         raise ArgumentError("save_image", "aovs", f"are layers of an .exr, {path} is none")
     ending, layers = path.suffix.lower(), _layers(aovs or {}, pixels.shape[:2])
     if ending in OF_BYTES:
-        shares = np.clip(np.nan_to_num(pixels.astype(np.float64), nan=0.0), 0, 1)
-        pixels = (TRANSFERS[transfer][0](shares) * 255 + 0.5).astype(np.uint8)
+        pixels = bytes_of(pixels, transfer)
     with replacing(path) as temporary:
         if layers:
             write_channels(temporary, channels_of(pixels) | layers)
         else:
             WRITERS[ending](temporary, pixels)
+
+
+def bytes_of(image: Float[np.ndarray, "h w *c"], transfer: str = "srgb") -> UInt8[np.ndarray, "h w *c"]:
+    """Linear radiance as the bytes that `save_image` writes."""
+    shares = np.clip(np.nan_to_num(image.astype(np.float64), nan=0.0), 0, 1)
+    return (TRANSFERS[transfer][0](shares) * 255 + 0.5).astype(np.uint8)
 
 
 def _layers(aovs: Mapping[str, Any], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
