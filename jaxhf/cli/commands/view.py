@@ -116,9 +116,8 @@ def run(options: argparse.Namespace) -> None:
             image = photograph(ready, camera, look, shown.update)
         if options.annotate:
             level = float(np.nanmin(z)) if base is None else base
-            save_sheet(
-                output, annotated(bytes_of(image), terrain, camera, level, options.title, _caption(terrain, look, factor))
-            )
+            caption = _caption(terrain, look, factor)
+            save_sheet(output, annotated(bytes_of(image), terrain, camera, level, options.title, caption))
         else:
             save_image(output, image)
     print(f"{output}: {said}, heights x {factor:g}, {time.perf_counter() - begin:.1f} s")
