@@ -60,7 +60,7 @@ def exaggeration(heights: Float[np.ndarray, "ny nx"], dx: float, dy: float) -> f
     return next(step * power for step in (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0) if step * power >= wanted * (1 - 1e-9))
 
 
-def sea_level(heights: Float[np.ndarray, "ny nx"]) -> bool:
+def has_sea(heights: Float[np.ndarray, "ny nx"]) -> bool:
     """Whether a hundredth of the cells at least is level at 0, as the sea is in most files of land; not of level terrain."""
     zero = heights == 0
     level = zero[1:, 1:] & zero[1:, :-1] & zero[:-1, 1:] & zero[:-1, :-1]
@@ -75,11 +75,10 @@ def with_water(
     deep = under / max(float(np.nanmax(under)), np.finfo(float).tiny)
     rows = np.round(np.linspace(0, len(heights) - 1, len(colours))).astype(int)
     columns = np.round(np.linspace(0, heights.shape[1] - 1, colours.shape[1])).astype(int)
-    deep, wet = np.sqrt(np.nan_to_num(deep))[np.ix_(rows, columns)][..., None], (heights <= level)[np.ix_(rows, columns)]
+    deep, wet = (part[np.ix_(rows, columns)][..., None] for part in (np.sqrt(np.nan_to_num(deep)), heights <= level))
     sea = (1 - deep) * np.array(_SHALLOW) + deep * np.array(_DEEP)
-    return np.fmax(heights, np.where(np.isnan(heights), np.nan, level)).astype(heights.dtype), np.where(
-        wet[..., None], sea, colours
-    )
+    surface = np.fmax(heights, np.where(np.isnan(heights), np.nan, level))
+    return surface.astype(heights.dtype), np.where(wet, sea, colours)
 
 
 def block(

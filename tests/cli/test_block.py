@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.cli.block import Look, _in_haze as in_haze, block, exaggeration, sea_level, with_water
+from jaxhf.cli.block import Look, _in_haze as in_haze, block, exaggeration, has_sea, with_water
 from jaxhf.scene.camera import cropped
 
 RAMP = np.linspace(0, 1, 101)[:, None] * np.ones(101)
@@ -34,11 +34,11 @@ def test_water_is_level_and_darkens_with_depth():
 
 def test_a_sea_is_wide_and_level_at_0_beside_land():
     heights = np.maximum(np.arange(-10.0, 190.0), 0)[:, None] * np.ones(30)
-    assert sea_level(heights)
-    assert sea_level(np.where(heights > 100, np.nan, heights))
-    assert not sea_level(heights[10:])  # a shore
-    assert not sea_level(heights + 1)
-    assert not sea_level(0 * heights)
+    assert has_sea(heights)
+    assert has_sea(np.where(heights > 100, np.nan, heights))
+    assert not has_sea(heights[10:])  # a shore
+    assert not has_sea(heights + 1)
+    assert not has_sea(0 * heights)
 
 
 def test_haze_grows_with_distance_before_a_background():

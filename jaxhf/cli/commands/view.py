@@ -27,7 +27,7 @@ from ...scene.material import SCATTERING
 from ...scene.sun import sun, utc
 from ...xla.devices import local_mesh
 from .. import arguments, limits
-from ..block import Look, block, exaggeration, lights, photograph, sea_level, with_water
+from ..block import Look, block, exaggeration, has_sea, lights, photograph, with_water
 from ..caption import annotated
 from ..catalogue import PRESETS
 from ..overwriting import require_no_input
@@ -130,14 +130,13 @@ def _solid(options: argparse.Namespace, terrain: Terrain, factor: float) -> tupl
         colours = load_drape(options.drape, terrain)
     else:
         colours = linear_from_srgb(np.arange(256) / 255).astype(np.float32)[color_relief(terrain, options.ramp)]
-    sea = options.water is options.drape is options.ramp is None and sea_level(z)
-    if sea:
-        options.water = 0.0
-    if options.water is not None:
+    sea = options.water is None and options.drape is None and options.ramp is None and has_sea(z)
+    water = 0.0 if sea else options.water
+    if water is not None:
         low, high = np.nanmin(z), np.nanmax(z)
-        if not low <= options.water < high:
-            warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {options.water:g}", stacklevel=2)
-        z, colours = with_water(z, colours, options.water)
+        if not low <= water < high:
+            warnings.warn(f"view: the heights go from {low:.6g} to {high:.6g}, --water is {water:g}", stacklevel=2)
+        z, colours = with_water(z, colours, water)
     reach = max((n - 1) * d for n, d in zip(z.shape, (terrain.dy, terrain.dx), strict=True))
     times = (float(np.nanmax(z)) - float(np.nanmin(z))) * factor / reach
     if times > _TALLEST:
