@@ -38,10 +38,10 @@ def picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key
         drawn = on_every_device(key, mesh) if world.settings.edge_samples else None  # else the settings draw nothing
         seen = world if is_part or has_edges(world) else of_any_terrain(world)
         return trace_picture(seen, camera, aovs, mesh, drawn)
+    if mesh.devices.size > 1:  # of whose parts XLA makes many copies, on each device
+        return everywhere(trace_in_parts(world, camera, aovs, mesh, None), mesh)
     parts = [part for _, part in _parts(world, camera, aovs, mesh, _at_once(world.settings, mesh))]
-    if mesh.devices.size > 1:  # XLA ends the process where a device waits for another one's part for 60 s
-        jax.block_until_ready(parts)
-    return _assembled(parts, camera.width, camera.height, world.settings, mesh)
+    return _assembled(parts, camera.width, camera.height, world.settings)
 
 
 def _are_few(tiling: Tiling) -> bool:
@@ -95,46 +95,47 @@ _trace_tiles = compiled(trace_tiles, static_argnames=("mesh", "aovs"))
 
 
 def trace_in_parts(
-    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, progress: Callable[[int, int], None]
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, progress: Callable[[int, int], None] | None
 ) -> dict[str, np.ndarray]:
     """As `picture`, on the host: device memory does not grow with it."""
-    tiling = Tiling(camera.width, camera.height, world.settings)
-    pixels, parts = tiling.width * tiling.height, []
+    tiling, most = Tiling(camera.width, camera.height, world.settings), _at_once(world.settings, mesh)
+    pixels, found = tiling.width * tiling.height, {}
     if _are_few(tiling):
         found = jax.device_get(trace_picture(of_any_terrain(world), camera, aovs, mesh, None))
-        progress(pixels, pixels)
+        if progress is not None:
+            progress(pixels, pixels)
         return found
-    size = min(_at_once(world.settings, mesh), math.ceil(tiling.count / 64))
-    for done, part in _parts(world, camera, aovs, mesh, size):
-        parts.append({name: in_order(mesh.devices.size, values)[:size] for name, values in on_host(part).items()})
-        progress(min(pixels, done * pixels // tiling.count), pixels)
-    return {name: tiling.assemble(np.concatenate([part[name] for part in parts])[: tiling.count]) for name in parts[0]}
+    size = most if progress is None else min(most, math.ceil(tiling.count / 64))
+    for first, part in _parts(world, camera, aovs, mesh, size):
+        done = min(first + size, tiling.count)
+        for name, values in on_host(part).items():
+            tiles = in_order(mesh.devices.size, values)[: done - first]
+            found.setdefault(name, tiling.room(tiles))
+            tiling.place(tiles, first, found[name])
+        if progress is not None:
+            progress(min(pixels, done * pixels // tiling.count), pixels)
+    return {name: values[: tiling.height, : tiling.width] for name, values in found.items()}
 
 
 def _parts(
     world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, size: int
 ) -> Iterator[tuple[int, dict[str, jax.Array]]]:
-    """So many tiles after the other, as `map_first` leaves them, and how many are then done."""
+    """So many tiles after the other, as `map_first` leaves them, with the number of the first; while one part is taken the next
+    is being traced."""
     most = _at_once(world.settings, mesh)
     corners = Tiling(camera.width, camera.height, world.settings).corners()
-    seen = of_any_terrain(world), of_any_size(camera)
+    seen, traced = (of_any_terrain(world), of_any_size(camera)), []
     for first in range(0, len(corners), size):
         some = corners[first : first + size]
         padded = np.concatenate([some, np.zeros((most - len(some), 2), np.int32)])
-        yield first + size, _trace_tiles(mesh, *seen, aovs, padded, np.int32(len(some)))
+        traced.append((first, _trace_tiles(mesh, *seen, aovs, padded, np.int32(len(some)))))
+        if len(traced) > 1:
+            yield traced.pop(0)
+    yield from traced
 
 
-@functools.partial(compiled, newer=True, static_argnames=("width", "height", "settings", "mesh"))
-def _assembled(
-    parts: list[dict[str, jax.Array]], width: int, height: int, settings: Settings, mesh: Mesh
-) -> dict[str, jax.Array]:
-    """A picture of parts as `map_first` leaves them, on each device."""
+@functools.partial(compiled, newer=True, static_argnames=("width", "height", "settings"))
+def _assembled(parts: list[dict[str, jax.Array]], width: int, height: int, settings: Settings) -> dict[str, jax.Array]:
+    """A picture of parts as one device leaves them."""
     tiling = Tiling(width, height, settings)
-
-    most = _at_once(settings, mesh)
-
-    def whole(*parts: jax.Array) -> jax.Array:
-        ordered = [in_order(mesh.devices.size, everywhere(part, mesh))[:most] for part in parts]
-        return tiling.assemble(jnp.concatenate(ordered)[: tiling.count])
-
-    return jax.tree.map(whole, *parts)
+    return jax.tree.map(lambda *parts: tiling.assemble(jnp.concatenate(parts)[: tiling.count]), *parts)

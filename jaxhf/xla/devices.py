@@ -131,11 +131,16 @@ def held_everywhere(tree: Any, mesh: Mesh) -> Any:
     Over several processes each computes it on one of its devices, and each use would copy it to the others.
     """
 
-    def held(leaf: Any) -> Any:
-        values = np.asarray(leaf)
+    return everywhere(jax.tree.map(np.asarray, tree), mesh) if mesh.is_multi_process and not is_traced() else tree
+
+
+def everywhere(tree: Any, mesh: Mesh) -> Any:
+    """NumPy's arrays, the same ones in each process, on each device of a mesh."""
+
+    def copied(values: np.ndarray) -> jax.Array:
         return jax.make_array_from_callback(values.shape, NamedSharding(mesh, P()), lambda index: values[index])
 
-    return jax.tree.map(held, tree) if mesh.is_multi_process and not is_traced() else tree
+    return jax.tree.map(copied, tree)
 
 
 def divided(tree: Any, mesh: Mesh) -> Any:
@@ -259,11 +264,6 @@ def map_first(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: An
         check_vma=False,
     )
     return over(shared, jax.tree.map(lambda leaf: leaf[turns], items), turns.astype(np.int32), count)
-
-
-def everywhere(values: Any, mesh: Mesh) -> Any:
-    """The same on each device of a mesh; for tracing."""
-    return values if mesh.devices.size == 1 else lax.with_sharding_constraint(values, NamedSharding(mesh, P()))
 
 
 def _turns(n: int, devices: int) -> np.ndarray:
