@@ -27,11 +27,11 @@ def _read(name: str) -> tuple[str, list[str], list[list[str]]]:
 
 def measured(name: str) -> str:
     """A table from measurements/, under the command that makes it."""
-    command, *parts = _read(name)
-    head, *rows = ([cell.replace("|", "\\|") for cell in row] for row in (parts[0], *parts[1]))
+    command, names, body = _read(name)
+    head, *rows = ([cell.replace("|", "\\|") for cell in row] for row in (names, *body))
     rule = ["--:" if k and rows[0][k][:1].isdigit() else "---" for k in range(len(head))]
-    body = "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
-    return f"`{command}` ([{name}.csv]({name}.csv))\n\n{body}\n"
+    lines = "\n".join("| " + " | ".join(row) + " |" for row in (head, rule, *rows))
+    return f"`{command}` ([{name}.csv]({name}.csv))\n\n{lines}\n"
 
 
 def _cells(name: str, row: Words, column: str | None = None) -> list[str]:

@@ -146,5 +146,5 @@ for name, edge_samples in {"with the boundary term": 30_000, "derivative of the 
 # mountain but the foot of its slope, and the steps run away.
 #
 # `jaxhf.fit` does the same for all heights at once, and chooses the number of points by what is in sight. The
-# page [What a derivative of a picture is](../docs/tutorials/exactness.md) computes one by hand, and
+# page [Exact derivatives](../docs/tutorials/exactness.md) computes one by hand, and
 # [The boundary term](../docs/concepts/boundary.md) says how the points are drawn.

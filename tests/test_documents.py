@@ -1,5 +1,6 @@
 """What the documents say is so: each page's blocks run, in the reader's own configuration, and the site builds strictly."""
 
+import inspect
 import re
 import shlex
 import shutil
@@ -22,6 +23,7 @@ from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 
 import jaxhf
 from jaxhf.cli.main import main
+from jaxhf.io.scenes.toml import fit
 from jaxhf.io.scenes.toml.fit import load_case
 from jaxhf.scene.procedural import fractal
 from jaxhf.xla.machine import available_bytes
@@ -173,9 +175,12 @@ def test_docstrings_leave_examples_to_the_pages():
 
 
 def test_pages_are_easy_to_read():
-    """Lines that fit, blocks in languages that are run, short tables outside of the measurements; README on two screens."""
+    """A sentence first, that says what the page is for; lines that fit, blocks in languages that are run, short tables outside
+    of the measurements; README on two screens."""
     for name in NAMES:
         text = (ROOT / name).read_text()
+        made = name.startswith(("docs/api/", "docs/notebooks/"))  # of docstrings, of notebooks
+        assert made or re.match(r"# .+\n\n(!\[.*\n\n)?(?:\w|\*\*|`)[^|]", text), f"{name}: what has a reader after this page?"
         assert not [line for line in text.splitlines() if len(line) > 120], name
         assert not re.search(r"^[^\s|#*>-](?!\. ).*\n- ", text, re.MULTILINE), f"{name}: a list needs an empty line before it"
         fences = re.findall(r"^```(.*)\n(?:.*\n)*?```$", text, re.MULTILINE)
@@ -184,6 +189,30 @@ def test_pages_are_easy_to_read():
             assert "measured(" not in text, name
             assert all(table.count("\n") <= 14 for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)), name
     assert len((ROOT / "README.md").read_text().splitlines()) <= 100
+
+
+def test_fit_files_have_their_keys_and_defaults():
+    """Those that the reader knows and no others; where one has a default in Python, the same."""
+    text = (DOCS / "guides" / "fit-files.md").read_text()
+    tables = [
+        re.findall(r"^\| `.*", part.split("\n\n")[0], re.MULTILINE) for part in text.split("| key | type | default |")[1:]
+    ]
+    tables = [{row[0].strip("` "): row[2].strip() for row in (line.split("|")[1:] for line in table)} for table in tables]
+    arguments = fit._FIT.keys() - {"prior", "unknown"}  # tables of their own
+    expected = [fit._PICTURE.keys(), arguments, fit._NOISE.keys(), fit._PRIOR.keys(), fit._UNKNOWN.keys()]
+    assert [table.keys() for table in tables] == expected
+    assert [name for name, default in tables[0].items() if not default] == ["image"]
+    for table, record in zip(tables[1:], (jaxhf.fit, jaxhf.Noise, jaxhf.Prior, jaxhf.Unknown), strict=True):
+        for name, said in table.items():
+            match inspect.signature(record).parameters[name].default:
+                case inspect.Parameter.empty:
+                    assert not said, name
+                case None:  # said in words
+                    assert said, name
+                case bool(default):
+                    assert said == str(default).lower(), name
+                case default:
+                    assert float(said) == default, name
 
 
 def test_pictures_are_small():
@@ -216,6 +245,14 @@ def test_site_builds_strictly_and_needs_no_other(tmp_path):
         text = page.read_text()
         assert not re.search(r'(?:src="|<link[^>]+href="|@import )(?:https?:)?//', text), page
         assert not re.search("&(reg|copy|trade);|[©®™]", text), f"{page}: (c), (r) and (tm) stand between backquotes"
-        assert "{{" not in re.sub(r"<(code|pre).*?</\1>", "", text, flags=re.DOTALL), page
+        prose = re.sub(r"<(code|pre).*?</\1>", "", text, flags=re.DOTALL)
+        assert "{{" not in prose, page
+        links = {link.split("#")[0] for link in re.findall(r'(?:href|src)="(?!https?:|data:|mailto:|#)([^"]+)"', prose)}
+        if page.name != "404.html":  # which a server shows in any folder; the others open from the disk
+            assert not [link for link in links if not (page.parent / link).is_file()], page
+    entry = r'<a href="[^"#]+" class="md-nav__link.*?>\s*<span class="md-ellipsis">\s*(.*?)\s*<'
+    titles = re.findall(entry, (tmp_path / "site" / "index.html").read_text())
+    assert len(titles) > 30
+    assert not [title for title in titles if titles.count(title) > 1]
     assert (tmp_path / "site" / "api" / "render.html").read_text().count('class="doc doc-heading"') >= 5
     assert "usage: jaxhf hillshade" in (tmp_path / "site" / "guides" / "commands.html").read_text()

@@ -46,7 +46,7 @@ _VIEW = Command(
             number("--haze", "SHARE", "of light lost along the terrain [0.15]"),
         ),
         "terrain": (
-            number("--exaggeration", "X", "heights are multiplied by it [1, or more on flat terrain]", rule=positive),
+            number("--exaggeration", "X", "heights are multiplied by it [1; flat or steep terrain: others]", rule=positive),
             option("--ramp", metavar="FILE|NAME", help=_HEIGHT_COLOURS),
             option("--drape", metavar="IMAGE", help=_DRAPE),
             choice("--material", MATERIALS, "the law by which it reflects [matte]", default="matte"),
