@@ -21,8 +21,7 @@ from .cropped import Seen, cropped, sides_in_sight, surroundings
 from .fit import fit
 from .given import Checkpoint, Prior
 from .history import Draws, Step
-from .model.defaults import EDGE_SAMPLES, choose_edge_samples, choose_samples
-from .model.pictures import checked_pictures
+from .model.pictures import EDGE_SAMPLES, checked_pictures, choose_edge_samples, choose_samples
 from .model.surface import Window, make_heights, with_seam
 from .solve.state import digest
 from .trust.judge import Fit

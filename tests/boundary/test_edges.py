@@ -21,7 +21,7 @@ import jaxhf
 from jaxhf.boundary.guiding import initial_weights, make_distribution
 from jaxhf.boundary.jump import boundary_segment, pass_edge, radiance_jump
 from jaxhf.boundary.sample import BoundarySample
-from jaxhf.fitting.model.defaults import choose_edge_samples
+from jaxhf.fitting.model.pictures import choose_edge_samples
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import make_world, resolve_settings
 from jaxhf.trace.edges import STEPS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.fitting.model.albedo import make_albedo_field
+from jaxhf.fitting.model.terms import make_albedo_field
 from jaxhf.scene.procedural import fractal
 
 SETTINGS = jaxhf.Settings(samples=1, shadows=False, edge_samples=0)

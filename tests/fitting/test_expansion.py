@@ -16,7 +16,7 @@ from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.model.rows import pictures_by_heights
 from jaxhf.fitting.model.surface import Unknowns
 from jaxhf.fitting.model.view import moved
-from jaxhf.fitting.trust.boundaries import _on_boundaries
+from jaxhf.fitting.trust.deviations import _on_boundaries
 
 PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])
 SUN, SKY = jaxhf.Directional((0.3, -0.4, 0.5)), jaxhf.Sky(0.1)

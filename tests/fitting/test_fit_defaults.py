@@ -10,9 +10,9 @@ from small_fits import CAMERA, SETTINGS, TRUTH, expanded, given, off_in_shape, p
 
 import jaxhf
 from jaxhf.fitting.history import Draws
-from jaxhf.fitting.model import defaults as _defaults
-from jaxhf.fitting.model.defaults import choose_edge_samples, choose_samples
+from jaxhf.fitting.model import pictures as _pictures
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
+from jaxhf.fitting.model.pictures import choose_edge_samples, choose_samples
 from jaxhf.fitting.solve.noise import spreads
 from jaxhf.fitting.trust.deviations import standard_deviations, with_unexplained
 from jaxhf.fitting.trust.facts import (
@@ -94,7 +94,7 @@ def test_edges_take_part_where_boundaries_are_in_sight():
 def test_the_length_of_boundaries_is_one_program(monkeypatch):
     """Whether edges are to be chosen for the first time, or once more beside those of the start."""
     asked = []
-    monkeypatch.setattr(_defaults, "_boundary_length", lambda _, settings: asked.append(settings) or 0.0)
+    monkeypatch.setattr(_pictures, "_boundary_length", lambda _, settings: asked.append(settings) or 0.0)
     for edge_samples in (None, 2048):
         choose_edge_samples([localise(scenes()[0])], jaxhf.Settings(samples=4, edge_samples=edge_samples))
     assert asked[0] == asked[1]

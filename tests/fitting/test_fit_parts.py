@@ -16,10 +16,9 @@ import jaxhf
 from jaxhf.core.errors import ArgumentError
 from jaxhf.fitting import fit as _fit
 from jaxhf.fitting.coarser import coarser, factors
-from jaxhf.fitting.model.expansion import prior_residuals
+from jaxhf.fitting.model.expansion import influence_function, prior_residuals, soften
 from jaxhf.fitting.model.pictures import with_albedo
 from jaxhf.fitting.model.problem import Problem
-from jaxhf.fitting.model.robust import influence_function, soften
 from jaxhf.fitting.model.surface import make_basis, resample, slope_units
 from jaxhf.fitting.model.terms import make_terms
 from jaxhf.fitting.model.units import _balanced_units

@@ -12,15 +12,13 @@ import scipy.sparse.linalg
 from small_fits import EVERYTHING, SETTINGS, SIZE, TRUTH, dense, expanded, pictures, rms, scenes
 
 import jaxhf
-from jaxhf.fitting.model import near_inverse as _near_inverse
+from jaxhf.fitting.model import normal_matrix as _normal_matrix
 from jaxhf.fitting.model.expansion import Expansion, prior_residuals
 from jaxhf.fitting.model.linearise import LinearisedEdges
-from jaxhf.fitting.model.near_inverse import near_inverse
-from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
+from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row, near_inverse
 from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
 from jaxhf.fitting.model.surface import Window
-from jaxhf.fitting.trust.boundaries import Boundaries
-from jaxhf.fitting.trust.deviations import standard_deviations
+from jaxhf.fitting.trust.deviations import Boundaries, standard_deviations
 
 sp: Any = scipy.sparse  # whose stubs miss much
 OPTIONS = {"settings": SETTINGS, "noise": 0.01}
@@ -116,12 +114,12 @@ def test_its_near_inverse_is_near(prior):
 def test_blocks_solve_with_a_matrix_over_a_grid(monkeypatch):
     """A Laplacian and little more, in which each value depends on all others."""
     for name, value in (("_FACTORED", 0), ("_BLOCK", 16), ("_BEYOND", 4)):
-        monkeypatch.setattr(_near_inverse, name, value)
+        monkeypatch.setattr(_normal_matrix, name, value)
     shape, rng = (70, 45), np.random.default_rng(0)
     along = [sp.diags_array([-np.ones(n - 1), np.r_[1, 2 * np.ones(n - 2), 1], -np.ones(n - 1)], offsets=[-1, 0, 1])
              for n in shape]  # fmt: skip
     near = sp.kronsum(along[1], along[0], format="csr") + 1e-4 * sp.eye_array(70 * 45)
-    solve = _near_inverse._inverse(near, shape)
+    solve = _normal_matrix._inverse(near, shape)
     right, other, iterations = rng.standard_normal(70 * 45), rng.standard_normal(70 * 45), []
     assert right @ solve(other) == pytest.approx(other @ solve(right), rel=1e-8)
     inverse = sp.linalg.LinearOperator(near.shape, solve, dtype=np.float64)
@@ -153,7 +151,7 @@ def test_draws_have_its_inverse_as_their_covariance(name, monkeypatch):
     covariance = np.zeros((free.size, free.size))
     covariance[np.ix_(free, free)] = np.linalg.inv((by_pictures.T @ by_pictures + by_priors.T @ by_priors)[np.ix_(free, free)])
     if name == "by modes":
-        monkeypatch.setattr(_near_inverse, "pictures_by_heights", lambda _: None)
+        monkeypatch.setattr(_normal_matrix, "pictures_by_heights", lambda _: None)
     found = standard_deviations(here, 3)
     assert (found.displacement, found.raised) == (0.0, 1.0)
     matrix = NormalMatrix(here, np.ones(VALUES))

@@ -11,7 +11,7 @@ import pytest
 import scipy.ndimage
 
 import jaxhf
-from jaxhf.fitting.model.defaults import choose_edge_samples
+from jaxhf.fitting.model.pictures import choose_edge_samples
 from jaxhf.preparation.localise import localise
 from jaxhf.scene import procedural
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ...core.types import AnyArray
 from ...rendering.render import render_each
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
@@ -23,7 +24,6 @@ from .linearise import Linearised, changing_pixels, linearise_each
 from .pictures import Group, can_be_linearised, with_albedo, with_material
 from .problem import Problem
 from .products import picture_each
-from .robust import soften
 from .surface import Basis, Unknowns
 from .view import KNOWN, View, moved_each
 
@@ -207,3 +207,26 @@ def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) 
                 scene = scene.with_lights(lights).with_camera(camera)
             found[k] = scene
     return tuple(found)
+
+
+def soften(residual: Array, scale: Float[AnyArray, ""]) -> Array:
+    """A residual whose half square is ρ of the given one: sign(r) √(2ρ(r)); k = scale, in standard deviations.
+
+    ρ is the robust loss of the pictures: Geman and McClure's (1985), ρ(r) = r²/2 / (1 + (r/k)²), which forgets what is far off.
+    """
+    return residual / jnp.sqrt(1 + (residual / scale) ** 2)
+
+
+def robust_weight(residual: AnyArray, scale: Float[AnyArray, ""]) -> Array:
+    """ρ'(r) / r: the weight that a residual has in iteratively reweighted least squares."""
+    return 1 / (1 + (residual / scale) ** 2) ** 2
+
+
+@compiled
+def influence_function(
+    residual: Float[AnyArray, " n"], scale: Float[AnyArray, ""]
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+    """ψ = ρ', its derivative, and the weight ψ / r of residuals."""
+    square = (residual / scale) ** 2
+    weight = 1 / (1 + square) ** 2
+    return weight * residual, weight * (1 - 3 * square) / (1 + square), weight

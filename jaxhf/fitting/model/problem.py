@@ -20,11 +20,9 @@ from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
 from ...xla.devices import chosen_mesh
 from ..given import NOISE_RULE, Given, Unknown
-from .albedo import AlbedoField, make_albedo_field
-from .defaults import choose_edge_samples, choose_samples
-from .pictures import Group, albedo_of, make_groups
+from .pictures import Group, albedo_of, choose_edge_samples, choose_samples, make_groups
 from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units, with_seam
-from .terms import Terms, make_terms
+from .terms import AlbedoField, Terms, by_mode, make_albedo_field, make_terms
 from .view import View, sun
 
 LOSS_SCALE = 3.0  # standard deviations from which on the robust loss makes less of a residual, in the end
@@ -112,6 +110,14 @@ class Problem(eqx.Module):
         dark = self.settings.shadows and any(_shadows_in(group) for group in self.groups)
         count = choose_edge_samples(views, self.settings, dark)
         return before if before and count < 4 * before else count
+
+    def widened(self, widths: Float[np.ndarray, " octaves"]) -> "Problem":
+        """The same problem with a prior of the heights whose modes have deviations that are so many times as large."""
+        if (widths == 1).all():
+            return self
+        spectrum = self.terms.surface.spectrum
+        wider = np.asarray(np.asarray(spectrum) / by_mode(widths, spectrum.shape), spectrum.dtype)
+        return eqx.tree_at(lambda problem: problem.terms.surface.spectrum, self, jnp.asarray(wider))
 
     def with_edge_samples(self, count: int) -> "Problem":
         return dataclasses.replace(self, settings=dataclasses.replace(self.settings, edge_samples=count))

@@ -1,20 +1,24 @@
-"""What is known of the unknowns without the pictures: Gaussian priors."""
+"""What is known of the unknowns without the pictures: Gaussian priors, also of the logarithm of an albedo."""
 
 import math
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from ...core.errors import ArgumentError
 from ...core.precision import numbers
 from ...scene.heightfield import Heightfield
 from ..given import Prior, Unknown
-from .albedo import AlbedoField
 from .surface import Basis, Unknowns, dct_matrix, laplacian, make_heights, pad, padding, slope_units
 from .view import View
+
+OCTAVES = 6
+"""Into which the modes of the heights' prior are divided, at most."""
 
 
 class Term(eqx.Module):
@@ -53,6 +57,46 @@ class Terms(eqx.Module):
     def others(self, unknowns: Unknowns) -> list[tuple[Term, Float[Array, "..."]]]:
         """Those of what is sought besides the surface, each with its numbers."""
         return list(zip(self.besides, jax.tree.leaves(unknowns.without_modes()), strict=True))
+
+
+class AlbedoField(eqx.Module):
+    """Factors of an albedo by the DCT modes of their logarithms, in units of a root mean square of 1 over the terrain.
+
+    So each changes a picture by about as much as a mode of one slope does; see `Basis`.
+
+    Attributes:
+      rows, columns: the DCT-II matrices of the two axes, their rows of root mean square 1, shapes (ty, ty) and (tx, tx).
+      weight: 1 / the standard deviation of each mode, shape (ty, tx, 1).
+    """
+
+    rows: Float[Array, "ty ty"]
+    columns: Float[Array, "tx tx"]
+    weight: Float[Array, "ty tx 1"]
+
+    def factors(self, modes: Float[Array, "ty tx c"]) -> Float[Array, "ty tx c"]:
+        """What the albedo is multiplied by."""
+        return jnp.exp(_transformed(self.rows.T, self.columns.T, modes))
+
+    def modes(self, factors: Float[Array, "ty tx c"]) -> Float[Array, "ty tx c"]:
+        """The inverse of `factors`."""
+        return _transformed(self.rows, self.columns, jnp.log(factors)) / (len(self.rows) * len(self.columns))
+
+
+def _transformed(rows: Any, columns: Any, values: Float[Array, "ty tx c"]) -> Float[Array, "ty tx c"]:
+    return jnp.einsum("ki,ijc,lj->klc", rows, values, columns, precision=lax.Precision.HIGHEST)
+
+
+def make_albedo_field(shape: tuple[int, ...], spacing: tuple[float, ...], std: float, length: float, dtype: Any) -> AlbedoField:
+    """The field of these texels or vertices, of spacing (y, x), whose logarithm has this deviation and the correlation
+    exp(-distance / length).
+
+    That is Matérn's of smoothness 1/2, as patches with sharp borders have it; heights are smoother. The amplitudes of its modes
+    go as (1 + (length · frequency)²)^(-3/4).
+    """
+    amplitude = (1 + length**2 * laplacian(shape, spacing)) ** -0.75
+    amplitude = std * amplitude / np.sqrt(np.sum(amplitude**2))  # the squares of all modes add up to the field's variance
+    rows, columns = (jnp.asarray(np.sqrt(n) * dct_matrix(n), dtype) for n in shape)
+    return AlbedoField(rows, columns, jnp.asarray(1 / amplitude[:, :, None], dtype))
 
 
 def make_terms(
@@ -136,3 +180,15 @@ def _require_plausible(field: Heightfield, length: float) -> None:
             f"must lie from one cell to the terrain's longer side, {cell:.6g} to {side:.6g}; it is {length:.6g}, or "
             f"{length / cell:.3g} cells. It is in the unit of dx and dy: {length:.6g} cells would be {length * cell:.6g}",
         )
+
+
+def by_mode(widths: Float[np.ndarray, " octaves"], shape: tuple[int, ...]) -> Float[np.ndarray, "my mx"]:
+    """The width of each mode: between octaves the logarithm goes straight over that of the frequency."""
+    return np.exp(np.tensordot(np.log(widths), octaves(shape), 1))
+
+
+def octaves(shape: tuple[int, ...]) -> Float[np.ndarray, "octaves my mx"]:
+    """How much of each mode belongs to each octave of frequencies, the first being that below the highest along an axis."""
+    y, x = (np.arange(n) / n for n in shape)
+    at = np.clip(-np.log2(np.maximum(np.hypot(y[:, None], x[None, :]), 1e-9)) - 0.5, 0, OCTAVES - 1)
+    return np.maximum(1 - np.abs(at - np.arange(OCTAVES)[:, None, None]), 0)

@@ -4,17 +4,15 @@ import itertools
 import math
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..model.expansion import Expansion
-from ..model.near_inverse import near_inverse, normal_matrix
-from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row
+from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row, near_inverse, normal_matrix
 from ..model.problem import Problem
 from ..model.rows import can_have_rows, first_vertices, part_by_heights
 from ..model.surface import Window
+from ..model.terms import OCTAVES, by_mode, octaves
 
 _FAR = 6.0  # times the median: four standard deviations of normal errors; what is farther off is not explained
 _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it
@@ -22,7 +20,6 @@ _NO_WEIGHT = 1e-3  # of a value that is far off
 _LEAST_SHARE = 0.1  # of heights in values: of fewer heights noise would be told by 5 % too small at most
 _LEAST_FREE = 0.1  # of a picture's noise: where heights explain more, what is left does not tell the noise
 _SAID = 1.0  # modes for which the prior's std counts, in an octave whose errors are larger
-OCTAVES = 6  # into which the prior's modes are divided, at most
 _ROUNDS = 8  # at most; three or four are usual
 _NOISE_CHANGE, _WIDTH_CHANGE = 1.02, 1.1  # by less in a round: it has converged
 _DRAWN_VALUES = 8192  # from which the mean square of simulated residuals is taken: right to 2 %
@@ -203,27 +200,6 @@ def _simulated(
     change = matrix.solved(matrix.gathered(noise), _TOLERANCE, begin)
     left = noise.pictures - matrix.seen(change)
     return _Simulated(noise.pictures, left, noise.modes * (noise.modes - matrix.modes_of(change)), change)
-
-
-def widened(problem: Problem, widths: Float[np.ndarray, " octaves"]) -> Problem:
-    """The problem with a prior of the heights whose modes have deviations that are so many times as large."""
-    if (widths == 1).all():
-        return problem
-    spectrum = problem.terms.surface.spectrum
-    wider = np.asarray(np.asarray(spectrum) / by_mode(widths, spectrum.shape), spectrum.dtype)
-    return eqx.tree_at(lambda problem: problem.terms.surface.spectrum, problem, jnp.asarray(wider))
-
-
-def by_mode(widths: Float[np.ndarray, " octaves"], shape: tuple[int, ...]) -> Float[np.ndarray, "my mx"]:
-    """The width of each mode: between octaves the logarithm goes straight over that of the frequency."""
-    return np.exp(np.tensordot(np.log(widths), octaves(shape), 1))
-
-
-def octaves(shape: tuple[int, ...]) -> Float[np.ndarray, "octaves my mx"]:
-    """How much of each mode belongs to each octave of frequencies, the first being that below the highest along an axis."""
-    y, x = (np.arange(n) / n for n in shape)
-    at = np.clip(-np.log2(np.maximum(np.hypot(y[:, None], x[None, :]), 1e-9)) - 0.5, 0, OCTAVES - 1)
-    return np.maximum(1 - np.abs(at - np.arange(OCTAVES)[:, None, None]), 0)
 
 
 def _values_that_tell(expansion: Expansion) -> Labels:

@@ -16,11 +16,22 @@ from ..model.problem import LOSS_SCALE, Problem
 from ..model.rows import has_rows
 from ..model.surface import Unknowns, make_basis
 from ..model.units import balanced
-from .newton import LAST, RELAXED, SHORTER, WholeStep, relaxed, whole_step
-from .noise import Estimate, Restricted, explains_noise, rms, spreads, widened
+from .noise import Estimate, Restricted, explains_noise, rms, spreads
 from .stages import Stage, on_finer, stages, varies_all, why_ended
 from .state import State
-from .steps import FIRST_DAMPING, Outcome, advance, first_position, position_at
+from .steps import (
+    FIRST_DAMPING,
+    LAST,
+    RELAXED,
+    SHORTER,
+    Outcome,
+    WholeStep,
+    advance,
+    first_position,
+    position_at,
+    relaxed,
+    whole_step,
+)  # fmt: skip
 
 _LEAST_CHANGE = 1.1  # a noise or a robust loss's scale that would change by less than this factor stays
 _MOST_WIDTH = 1e3  # times wider or narrower than they were said to be, as errors of an octave may be found
@@ -132,7 +143,7 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
         # λ goes on from where it came to, or begins anew where rejections raised it: the loss is another one
         step_size = max(float(state.step_size), 1 / state.steps[0].damping) * float(np.mean((told.noise / state.noise) ** 2))
     else:
-        units, curvature, others = balanced(here.of(widened(posed, told.widths / state.widths)).with_noise(told.noise))
+        units, curvature, others = balanced(here.of(posed.widened(told.widths / state.widths)).with_noise(told.noise))
         step_size = 1 / (FIRST_DAMPING * curvature)
         if place is not None and posed.albedo is not None:  # what that can undo curves the loss less: λ goes on
             step_size = float(state.step_size)

@@ -31,7 +31,7 @@ _COARSEST = 8  # modes a side
 
 class Stage(NamedTuple):
     """Which of the problems, from coarse to fine, and up to what share of its highest frequency modes are varied; whether its
-    steps are those of `newton`."""
+    steps are those by factors, see `steps`."""
 
     level: int
     share: float

@@ -16,7 +16,7 @@ from ..given import Given
 from ..history import Step
 from ..model.problem import Problem
 from ..model.surface import Unknowns, make_basis
-from .noise import OCTAVES, widened
+from ..model.terms import OCTAVES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +71,7 @@ class State:
     def posed(self, problem: Problem, share: float) -> Problem:
         """The problem of this stage, which varies such a share of the modes, but for the noise."""
         basis = make_basis(problem.field, np.asarray(self.base), self.units, share, problem.basis.free)
-        problem = dataclasses.replace(widened(problem, self.widths), basis=basis, loss_scale=self.loss_scale)
+        problem = dataclasses.replace(problem.widened(self.widths), basis=basis, loss_scale=self.loss_scale)
         return problem.with_edge_samples(self.edge_samples)
 
 

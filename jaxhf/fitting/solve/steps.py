@@ -1,4 +1,10 @@
-"""Steps after Levenberg (1944) and Marquardt (1963) by optimistix, whose linear problems conjugate gradients solve."""
+"""The steps of a fit: after Levenberg (1944) and Marquardt (1963), by optimistix, and in the end Gauss-Newton ones by factors.
+
+Pictures of few samples a pixel change by jumps, and the loss with them. A trust region, which accepts by the loss, stops where
+the jumps are lucky, short of the end along all that pictures tell little of. So the last steps are judged by the next one,
+which must be shorter (Deuflhard's natural monotonicity test, Newton Methods for Nonlinear Problems, 2004, chapters 3 and 4). A
+quarter of a step is left where pictures are linear; where more than 0.6 is, it mostly follows jumps, and the fit ends.
+"""
 
 import functools
 from collections.abc import Callable
@@ -14,7 +20,8 @@ from jaxtyping import Array, Float, Int
 from ...core.types import Flag, Scalar
 from ...xla.compilation import compiled
 from ...xla.devices import divided, on_every_device
-from ..model.expansion import Expansion, residuals
+from ..model.expansion import Expansion, residuals, soften
+from ..model.normal_matrix import in_row, robust_matrix
 from ..model.surface import Unknowns
 
 FIRST_DAMPING = 1e-2  # as a share of the loss's curvature along a mode
@@ -26,6 +33,10 @@ _TOLERANCE = 0.1  # of a step's linear problem: solved to 0.01 steps took twice 
 _ITERATIONS = 120  # of conjugate gradients
 # Beside an `AlbedoField`, which can undo most of what heights and lights do: solved to 0.1 a sun stayed 6 degrees off.
 _FIELD_TOLERANCE, _FIELD_ITERATIONS = 0.01, 300
+RELAXED = 0.75  # of a whole step, part of which is made by jumps of the loss
+SHORTER = 0.9  # of the step before: a longer one follows jumps alone, and the one before is not accepted
+LAST = 0.6  # of the step before: a longer one is mostly made by jumps, and is not taken
+_WHOLE_TOLERANCE = 1e-3  # of its linear problem
 
 
 class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
@@ -185,3 +196,28 @@ def _advance(
     new, rest, outcome = on_every_device((new, rest, outcome), problem.mesh)
     arrays = jax.tree.leaves(eqx.filter(eqx.combine(divided(of_j, problem.mesh), rest), eqx.is_array))
     return new, arrays, outcome
+
+
+class WholeStep(NamedTuple):
+    """The Gauss-Newton step from where an expansion is: the change of the unknowns, that of the heights, root mean square, by
+    how much it would lower the loss, were pictures linear, and the loss where it begins."""
+
+    change: Unknowns
+    length: float
+    predicted: float
+    loss: float
+
+
+def whole_step(expansion: Expansion) -> WholeStep:
+    """`expansion`: one that `has_rows`, all of whose modes are varied."""
+    left, matrix = in_row(expansion.left()), robust_matrix(expansion)
+    gradient = matrix.gradient(matrix.roots * left)
+    change = matrix.solved(-gradient, _WHOLE_TOLERANCE)
+    soft = np.asarray(soften(jnp.asarray(left), expansion.problem.loss_scale), np.float64)
+    loss = (np.sum(soft**2) + np.sum(matrix.modes_before() ** 2) + np.sum(matrix.others_off**2)) / 2
+    length = float(np.sqrt(np.mean(matrix.heights_of(change) ** 2)))
+    return WholeStep(matrix.unknowns_of(change), length, float(-(gradient @ change) / 2), float(loss))
+
+
+def relaxed(unknowns: Unknowns, step: WholeStep) -> Unknowns:
+    return jax.tree.map(lambda value, change: value + RELAXED * change, unknowns, step.change)

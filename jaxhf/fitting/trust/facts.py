@@ -14,10 +14,10 @@ from ...scene.scene import Scene
 from ...trace.normals import vertex_normals
 from ...xla.compilation import compiled
 from ..given import Given
-from ..model.expansion import Expansion
+from ..model.expansion import Expansion, influence_function
 from ..model.problem import Problem
-from ..model.robust import influence_function
-from ..solve.noise import Freedom, octaves
+from ..model.terms import octaves
+from ..solve.noise import Freedom
 from .words import Places
 
 _ALIKE = 0.3  # correlation of neighbouring residuals above which they are no noise
