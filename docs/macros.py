@@ -1,4 +1,4 @@
-"""Macros of the pages: measurements as tables and in prose, notebooks as they were run, settings and commands with their help.
+"""Macros of the pages: measurements as tables and in prose, notebooks as they were run, commands with their help.
 
 A figure in prose is that of a file of measurements/, found by words that stand in its row and by the name of its column:
 
@@ -6,7 +6,6 @@ A figure in prose is that of a file of measurements/, found by words that stand 
 """
 
 import csv
-import dataclasses
 import json
 import os
 import re
@@ -113,17 +112,6 @@ def notebook(name: str) -> str:
     return "\n\n".join(parts)
 
 
-def settings() -> str:
-    """The fields of `jaxhf.Settings`: they describe themselves where Python runs, which the API's pages do without."""
-    from jaxhf.core.settings import Settings
-
-    lines = []
-    for knob in dataclasses.fields(Settings):
-        none = f"; None: {knob.metadata['none']}" if "none" in knob.metadata else ""
-        lines.append(f"- **`{knob.name}`** (default: `{knob.default!r}`): {knob.metadata['help']}{none}.")
-    return "\n".join(lines)
-
-
 def commands() -> str:
     """What each command's --help says, which its table of options holds."""
     from jaxhf.cli.parser import COMMANDS, parser_of
@@ -139,5 +127,4 @@ def define_env(env: Any) -> None:
     env.macro(span)
     env.macro(count)
     env.macro(notebook)
-    env.macro(settings)
     env.macro(commands)

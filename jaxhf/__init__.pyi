@@ -4,8 +4,9 @@ from .core.settings import Settings as Settings
 from .core.version import __version__ as __version__
 from .fitting.fit import fit as fit
 from .fitting.given import Checkpoint as Checkpoint, Noise as Noise, Prior as Prior, Unknown as Unknown
-from .fitting.history import Step as Step, Stop as Stop
+from .fitting.history import Draws as Draws, Step as Step, Stop as Stop
 from .fitting.trust.judge import Fit as Fit
+from .fitting.trust.words import Region as Region
 from .fitting.windows import Fitted as Fitted, Mosaic as Mosaic, fit_windows as fit_windows
 from .io.errors import SceneError as SceneError
 from .io.pictures.images import load_image as load_image, save_image as save_image

@@ -1,5 +1,6 @@
 """What the documents say is so: each page's blocks run, in the reader's own configuration, and the site builds strictly."""
 
+import ast
 import inspect
 import re
 import shlex
@@ -22,6 +23,7 @@ from sybil.parsers.markdown import SkipParser
 from sybil.parsers.markdown.lexers import RawFencedCodeBlockLexer
 
 import jaxhf
+from jaxhf.cli.catalogue import COMMANDS
 from jaxhf.cli.main import main
 from jaxhf.io.scenes.toml import fit
 from jaxhf.io.scenes.toml.fit import load_case
@@ -35,6 +37,7 @@ NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 SLOW = {"docs/gallery.md", "docs/tutorials/photographs.md"}  # minutes; what the latter finds has a test of its own
 DEEP = {  # over four seconds of a processor
     "README.md",
+    *(f"docs/api/{name}.md" for name in ("fit", "maps", "mujoco", "render")),
     "docs/coming-from/asp.md",
     "docs/coming-from/gdal.md",
     "docs/coming-from/mitsuba.md",
@@ -42,6 +45,10 @@ DEEP = {  # over four seconds of a processor
     "docs/index.md",
     *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/maps", "guides/sun-and-sky", "guides/view")),
     *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "picture", "robots")),
+}
+MUJOCO = [name for name in vars(jaxhf.mujoco) if not name.startswith("_") and not inspect.ismodule(vars(jaxhf.mujoco)[name])]
+PUBLIC = {f"jaxhf.{name}": getattr(jaxhf, name) for name in dir(jaxhf) if name not in ("mujoco", "__version__")} | {
+    f"jaxhf.mujoco.{name}": getattr(jaxhf.mujoco, name) for name in MUJOCO
 }
 FOREIGN = {"gdaldem", "gdalinfo", "gdal_translate", "gdal_viewshed"}  # programs that may not be here
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
@@ -168,6 +175,39 @@ def test_the_photographs_show_what_is_found_in_them(reader):
     assert 0.55 < np.mean(np.abs(off) < jaxhf.load_heights("heights_std.npz").heights) < 0.85  # of normal ones 0.68
 
 
+def test_each_public_name_has_an_example():
+    """Below it on its page of the API, before the next name."""
+    lacking = dict(PUBLIC)
+    for path in (DOCS / "api").glob("*.md"):
+        for part in re.split("^::: ", path.read_text(), flags=re.MULTILINE)[1:]:
+            name = part.split("\n")[0]
+            examples = re.findall("^```python\n(.*?)^```$", part, re.MULTILINE | re.DOTALL)
+            assert any(re.search(rf"\b{re.escape(name)}\b", example) for example in examples), f"{path.name}: {name}"
+            del lacking[name]
+    assert not lacking
+
+
+def test_public_docstrings_name_nothing_private():
+    """In backquotes stand public names, their attributes and parameters, and others' names, but nothing else of jaxhf's."""
+    things = list(PUBLIC.values())
+    for thing in PUBLIC.values():
+        if inspect.isclass(thing):
+            members = {name: vars(thing)[name] for name in vars(thing) if not name.startswith("_")}
+            things += [getattr(member, "__func__", getattr(member, "fget", member)) for member in members.values()]
+    known = {name.split(".")[-1] for name in PUBLIC}
+    known |= {name for thing in things for name in getattr(thing, "__annotations__", ())}
+    known |= {name for thing in PUBLIC.values() for name in dir(thing) if not name.startswith("_")}
+    inside = {path.stem for path in (ROOT / "jaxhf").rglob("*.py")}
+    for path in (ROOT / "jaxhf").rglob("*.py"):
+        inside |= {node.name for node in ast.parse(path.read_text()).body if isinstance(node, ast.FunctionDef | ast.ClassDef)}
+    texts = [inspect.getdoc(thing) or "" for thing in things if not isinstance(thing, int | str | tuple)]
+    texts += [path.read_text() for path in (DOCS / "api").glob("*.md")]
+    words = {word for text in texts for word in re.findall(r"`([A-Za-z_][\w.]*)`", text)}
+    assert len(words) > 100  # or nothing was found
+    words -= {"_FillValue", "values"}  # of xarray's arrays
+    assert not {word for word in words if re.search(r"(^|\.)_(?!_)", word) or word.split(".")[0] in inside - known}
+
+
 def test_docstrings_leave_examples_to_the_pages():
     """Where they run."""
     for path in (ROOT / "jaxhf").rglob("*.py"):
@@ -254,5 +294,8 @@ def test_site_builds_strictly_and_needs_no_other(tmp_path):
     titles = re.findall(entry, (tmp_path / "site" / "index.html").read_text())
     assert len(titles) > 30
     assert not [title for title in titles if titles.count(title) > 1]
-    assert (tmp_path / "site" / "api" / "render.html").read_text().count('class="doc doc-heading"') >= 5
-    assert "usage: jaxhf hillshade" in (tmp_path / "site" / "guides" / "commands.html").read_text()
+    text = "".join(path.read_text() for path in (tmp_path / "site" / "api").glob("*.html"))
+    assert {name for name in PUBLIC if f'id="{name}"' not in text} == set()
+    assert not re.search(r"\]\[jaxhf|_setting|docs/\w+/", text), "what docs/docstrings.py leaves"
+    text = (tmp_path / "site" / "guides" / "commands.html").read_text()
+    assert {name for name in COMMANDS if f"usage: jaxhf {name}" not in text} == set()

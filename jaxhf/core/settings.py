@@ -30,10 +30,7 @@ def _setting(default: Any, rule: Rule, help: str, **more: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How a scene is rendered. Frozen and hashable, so that it can be a static argument of a compiled function.
-
-    The metadata of each field holds its help, which the end of this docstring and the command line's --help are made from.
-    """
+    """How a scene is rendered. Frozen and hashable, so that it can be a static argument of a compiled function."""
 
     traversal: Traversal = _setting(
         "pyramid",

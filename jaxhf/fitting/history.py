@@ -8,7 +8,14 @@ from typing import NamedTuple
 
 
 class Stop(enum.Enum):
-    """Why a fit stopped, in words."""
+    """Why a fit stopped; the values say it in words.
+
+    Attributes:
+      CONVERGED: what a step still changes is below the tolerance.
+      MAX_STEPS: it took as many steps as it was allowed.
+      STALLED: no step along the derivative lowers the loss any more.
+      NON_FINITE: the loss is not finite; the heights are the best before that.
+    """
 
     CONVERGED = "converged: what a step still changes is below the tolerance"
     MAX_STEPS = "stopped after max_steps"

@@ -22,8 +22,8 @@ def color_relief(
 
     Args:
       heights: shape (ny, nx), row 0 in the south, nan where there is none; or a `Terrain`.
-      ramp: a colour file as gdaldem reads it (a height, red, green and blue a line; see `load_colours`), the name of a colour
-        map of matplotlib's, or None: green lowlands to pale heights, and blue below 0.
+      ramp: a colour file as gdaldem reads it (a height, red, green and blue a line), the name of a colour map of
+        matplotlib's, or None: green lowlands to pale heights, and blue below 0.
       entries: "interpolate" between the ramp's heights, the "nearest", or the "exact" one only.
       alpha: adds opacity.
 

@@ -18,12 +18,19 @@ else:
 
 
 class Status(enum.IntEnum):
-    """How a ray ended."""
+    """How a ray ended.
+
+    Attributes:
+      MISS: 0, it met nothing.
+      HIT: 1, it met a surface.
+      EXHAUSTED: 2, its budget of steps ran out, see `Settings`.
+      INVALID: 3, its origin or direction was not finite, or its direction zero.
+    """
 
     MISS = 0
     HIT = 1
-    EXHAUSTED = 2  # its budget of steps ran out
-    INVALID = 3  # its origin or direction was not finite, or its direction zero
+    EXHAUSTED = 2
+    INVALID = 3
 
 
 class Hit(eqx.Module):

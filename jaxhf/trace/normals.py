@@ -21,14 +21,19 @@ _FANS = {
 def vertex_normals(
     heights: Float[AnyArray, "ny nx"], dx: float, dy: float, scheme: NormalScheme
 ) -> Float[jax.Array, "ny nx 3"]:
-    """Normals at the vertices, on the +z side, object frame; their lengths are the weights of the interpolation.
+    """Normals at the vertices, shape (ny, nx, 3), on the +z side; their lengths are the weights of the interpolation.
 
     "central": central differences, one-sided at the border. "four": the sum of the unit normals of the triangles
     right-up, up-left, left-down, down-right. "six": of the six triangles that touch the vertex, weighted by area, so
-    that it commutes with affine maps (the sum that the seed's pbrt shape takes). "six-equal": the six unit normals with
-    equal weights (Gouraud 1971). "six-angle": weighted by the angle at the vertex (Thürmer and Wüthrich 1998), and of
-    length 1, as Mitsuba does. What lies beyond the border or touches a hole takes no part, so that but for "six-angle" a
-    vertex there weighs less in the interpolation; one with no triangle at all gets (0, 0, 1).
+    that it commutes with affine maps. "six-equal": the six unit normals with equal weights (Gouraud 1971). "six-angle":
+    weighted by the angle at the vertex (Thürmer and Wüthrich 1998), and of length 1, as Mitsuba does. What lies beyond the
+    border or touches a hole takes no part, so that but for "six-angle" a vertex there weighs less in the interpolation; one
+    with no triangle at all gets (0, 0, 1).
+
+    Args:
+      heights: shape (ny, nx), in the unit of `dx` and `dy`; nan is a hole.
+      dx, dy: cell size.
+      scheme: one of these.
     """
     # Products of two huge heights, or of two tiny cells, are no numbers in single precision. Any unit will do, and a power of
     # two changes no bit.

@@ -63,8 +63,11 @@ def _garbage_left() -> Iterator[None]:
 def compiler_options(newer: bool = False) -> dict[str, Any] | None:
     """What `jax.jit` takes as `compiler_options`, so that a program of jaxhf's compiles and runs in less time.
 
-    `newer` is for programs without rays, see `compiled`. Options that this version of XLA does not know are left out; None
-    where no other is left, and in plain mode.
+    Args:
+      newer: for programs without rays, which run faster with XLA's newer emitters of loops.
+
+    Returns:
+      The options that this version of XLA knows; None where there are none.
     """
     if insides() is None:
         return None

@@ -84,8 +84,9 @@ def save_image(path: PathLike, image: Any, *, transfer: str = "srgb", aovs: Mapp
         name.0, name.1 and so on.
 
     Raises:
-      FileNotFoundError, ValueError: as `require_writable`; or `image` has another shape or is not of floats, or `transfer`
-        is another, or there are `aovs` of another size, or without .exr.
+      FileNotFoundError, PermissionError: the folder is not there, or nothing can be written into it.
+      ValueError: the ending is not known, or a package for it is missing; `image` has another shape or is not of floats,
+        `transfer` is another, or there are `aovs` of another size, or without .exr.
     """
     path = require_writable(path)
     require("save_image", "transfer", transfer, OneOf(TRANSFERS))

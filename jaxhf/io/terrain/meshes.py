@@ -45,7 +45,8 @@ def save_mesh(
         take an .stl's numbers for millimetres. None: as long as in the terrain's unit.
 
     Raises:
-      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or no cell has four heights, or `base`, `colours`,
+      FileNotFoundError, PermissionError: the folder is not there, or nothing can be written into it.
+      ValueError: the ending is not known, or a package for it is missing; no cell has four heights, or `base`, `colours`,
         `uv` or `longer_side` cannot be, see there; .stl holds neither colours nor `uv`.
     """
     path = require_writable_mesh(path)

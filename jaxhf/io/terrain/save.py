@@ -35,8 +35,8 @@ def save_heights(path: PathLike, terrain: Terrain | ArrayLike, like: PathLike | 
       like: a GeoTIFF of the same shape, whose place and reference system a .tif takes over.
 
     Raises:
-      FileNotFoundError, PermissionError, ValueError: as `require_writable`; or `terrain` is neither, or `like` has
-        another shape.
+      FileNotFoundError, PermissionError: the folder is not there, or nothing can be written into it.
+      ValueError: the ending is not known, or a package for it is missing; `terrain` is neither, or `like` has another shape.
     """
     path = require_writable_heights(path)
     terrain = _terrain(path, terrain)

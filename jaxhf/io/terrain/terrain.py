@@ -144,7 +144,7 @@ class Terrain:
         return tuple((np.column_stack([right, -up, corner]) + 0.0).ravel().tolist())  # + 0.0: none is -0.0
 
     def require_unrotated(self, name: str = "it") -> None:
-        """FileError where its rows and columns do not lie along its file's x and y."""
+        """ValueError where its rows and columns do not lie along its file's x and y."""
         if self.rotation:
             rule = f"{name} must lie along x and y (gdalwarp makes it so)"
             raise FileError(f"{rule}; the raster is rotated by {self.rotation:.6g} degrees")
