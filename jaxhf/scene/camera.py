@@ -49,7 +49,16 @@ class Perspective(Record):
     def look_at(
         cls, eye: Any, target: Any, up: Any = (0, 0, 1), fov: Any = 45.0, *, width: int = 512, height: int = 512
     ) -> "Perspective":
-        """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
+        """A camera at `eye` that looks at `target`, in a right-handed world.
+
+        Args:
+          eye, target: two points, world units.
+          up: a direction that is up in the picture; not that of the view, so (0, 1, 0) for one from straight above.
+          fov, width, height: as for the class.
+
+        Raises:
+          ValueError: the three leave no frame, or a number is out of range.
+        """
         return cls(look_at_pose(eye, target, up), fov, width=width, height=height)
 
     @classmethod
@@ -234,7 +243,7 @@ class Orthographic(Record):
     def look_at(
         cls, eye: Any, target: Any, up: Any = (0, 0, 1), extent: Any = 1.0, *, width: int = 512, height: int = 512
     ) -> "Orthographic":
-        """A camera at `eye` that looks at `target`, in a right-handed world; ValueError where the three leave no frame."""
+        """A camera at `eye` that looks at `target`, as `Perspective.look_at`; `extent` as for the class."""
         return cls(look_at_pose(eye, target, up), extent, width=width, height=height)
 
     @classmethod
