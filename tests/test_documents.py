@@ -39,11 +39,13 @@ DEEP = {  # over four seconds of a processor
     "README.md",
     *(f"docs/api/{name}.md" for name in ("fit", "maps", "mujoco", "render")),
     "docs/coming-from/asp.md",
+    "docs/coming-from/blender.md",
     "docs/coming-from/gdal.md",
     "docs/coming-from/mitsuba.md",
     "docs/coming-from/rayshader.md",
     "docs/index.md",
     *(f"docs/{name}.md" for name in ("concepts/shading", "guides/fitting", "guides/maps", "guides/sun-and-sky", "guides/view")),
+    *(f"docs/reference/{name}.md" for name in ("faq", "limits")),
     *(f"docs/tutorials/{name}.md" for name in ("exactness", "gradient", "picture", "robots")),
 }
 MUJOCO = [name for name in vars(jaxhf.mujoco) if not name.startswith("_") and not inspect.ismodule(vars(jaxhf.mujoco)[name])]
@@ -223,6 +225,7 @@ def test_pages_are_easy_to_read():
         assert made or re.match(r"# .+\n\n(!\[.*\n\n)?(?:\w|\*\*|`)[^|]", text), f"{name}: what has a reader after this page?"
         assert not [line for line in text.splitlines() if len(line) > 120], name
         assert not re.search(r"^[^\s|#*>-](?!\. ).*\n- ", text, re.MULTILINE), f"{name}: a list needs an empty line before it"
+        assert not re.search(r"^ *\d{4}\. ", text, re.MULTILINE), f"{name}: a year there begins a list"
         fences = re.findall(r"^```(.*)\n(?:.*\n)*?```$", text, re.MULTILINE)
         assert {fence.split(" ")[0] for fence in fences} <= {"python", "sh", "toml", "text"}, name
         if "/measurements/" not in name:
@@ -297,5 +300,6 @@ def test_site_builds_strictly_and_needs_no_other(tmp_path):
     text = "".join(path.read_text() for path in (tmp_path / "site" / "api").glob("*.html"))
     assert {name for name in PUBLIC if f'id="{name}"' not in text} == set()
     assert not re.search(r"\]\[jaxhf|_setting|docs/\w+/", text), "what docs/docstrings.py leaves"
+    assert len(re.findall(r'class="autorefs[^>]*#jaxhf\.', text)) > 200, "links of types and docstrings"
     text = (tmp_path / "site" / "guides" / "commands.html").read_text()
     assert {name for name in COMMANDS if f"usage: jaxhf {name}" not in text} == set()
