@@ -1,4 +1,4 @@
-"""Draws the pages' figures into images/: `python docs/drawings.py`."""
+"""Draws the pages' figures into images/: `python docs/drawings.py`. On dark pages they change their colours."""
 
 from pathlib import Path
 
@@ -10,9 +10,11 @@ import numpy as np
 from matplotlib.patches import Arc, FancyArrowPatch, Polygon, Rectangle
 
 IMAGES = Path(__file__).parent / "images"
-INK, GROUND, SKY, RED, BLUE, PALE = "#333333", "#c8b088", "#5b8fd0", "#c8402c", "#2c5fa8", "#e9e2d3"
+INK, GROUND, RED, BLUE, PALE, PAPER = "#333333", "#c8b088", "#c8402c", "#2c5fa8", "#e9e2d3", "#ffffff"
+DARK = {INK: "#dddddd", GROUND: "#77664a", RED: "#ff8a70", BLUE: "#8ab8ff", PALE: "#3b4252", PAPER: "#1e2129"}
 plt.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "jaxhf", "font.family": "sans-serif", "font.size": 11,
-                     "text.color": INK, "lines.solid_capstyle": "round"})  # fmt: skip
+                     "text.color": INK, "axes.edgecolor": INK, "axes.labelcolor": INK,
+                     "lines.solid_capstyle": "round"})  # fmt: skip
 
 
 def canvas(width: float, height: float, columns: int = 1):
@@ -25,9 +27,19 @@ def canvas(width: float, height: float, columns: int = 1):
 
 
 def save(figure, name: str) -> None:
-    figure.patch.set_facecolor("white")
-    figure.savefig(IMAGES / f"{name}.svg", metadata={"Date": None}, bbox_inches="tight", pad_inches=0.12)
+    """Writes a drawing on paper of its own, so that it can be read also where page and reader's system differ."""
+    path = IMAGES / f"{name}.svg"
+    figure.patch.set_facecolor(PAPER)
+    figure.savefig(path, metadata={"Date": None}, bbox_inches="tight", pad_inches=0.12)
     plt.close(figure)
+    rules = "\n".join(
+        f'  [style*="{part}: {light}"] {{ {part}: {dark} !important }}'
+        for light, dark in DARK.items()
+        for part in ("fill", "stroke")
+    )
+    text = path.read_text()
+    head = text.index("<defs>")
+    path.write_text(f"{text[:head]}<style>@media (prefers-color-scheme: dark) {{\n{rules}\n}}</style>\n {text[head:]}")
 
 
 def arrow(axis, start, end, colour=INK, **style) -> None:
@@ -59,12 +71,12 @@ def frames() -> None:
     grid.set_ylim(-0.8, 3.7)
     angles.add_patch(plt.Circle((0, 0), 1.5, fill=False, color=INK, lw=0.8))
     for name, (x, y) in {"N 0°": (0, 1), "E 90°": (1, 0), "S 180°": (0, -1), "W 270°": (-1, 0)}.items():
-        angles.text(1.8 * x + 0.12 * x, 1.75 * y, name, ha="center", va="center")
+        angles.text(2.1 * x, 1.75 * y, name, ha="center", va="center")
     sun = np.array([np.sin(np.deg2rad(315)), np.cos(np.deg2rad(315))]) * 1.5
     angles.plot(*sun, "o", color="#e0a020", ms=14)
     arrow(angles, sun * 0.93, (0, 0), "#e0a020", lw=1.6)
     angles.add_patch(Arc((0, 0), 1.5, 1.5, theta1=135, theta2=90 - 0.1 + 360, color=RED, lw=1.4))
-    angles.text(0.25, -0.95, "azimuth 315°", color=RED, ha="center")
+    angles.text(0, -1.08, "azimuth 315°", color=RED, ha="center")
     angles.plot([2.9, 5.1], [-0.6, -0.6], color=INK)
     high = np.array([2.9, -0.6]) + 1.9 * np.array([np.cos(np.deg2rad(35)), np.sin(np.deg2rad(35))])
     angles.plot(*high, "o", color="#e0a020", ms=14)
@@ -171,7 +183,7 @@ def wall() -> None:
     end = 3.1 + 1.5 / np.tan(np.deg2rad(30))
     axis.plot([0.6, end], [1.5 + 2.5 * np.tan(np.deg2rad(30)), 0], color="#e0a020", lw=1.8)
     axis.plot(0.45, 1.5 + 2.65 * np.tan(np.deg2rad(30)), "o", color="#e0a020", ms=15)
-    axis.plot([3.7, end], [0, 0], color=INK, lw=5)
+    axis.plot([3.7, end], [0, 0], color="#504a60", lw=5)
     axis.plot([end, 9], [0, 0], color="#f2d060", lw=5)
     axis.add_patch(Arc((end, 0), 2.6, 2.6, theta1=150, theta2=180, color=INK))
     axis.text(end - 1.0, 0.16, "30°")
@@ -202,7 +214,7 @@ def recovery() -> None:
     axis.plot([13.7, 13.7, 1.3], [-0.02, -0.8, -0.8], color=INK, lw=1.2)
     arrow(axis, (1.3, -0.8), (1.3, -0.02))
     axis.text(7.5, -1.15, "until a step changes less than the noise leaves open; then finer waves join", ha="center")
-    axis.text(4.4, 1.75, "the prior: a coarse map and how far it may be off", ha="left", color=BLUE)
+    axis.text(4.4, 1.9, "the prior: a coarse map and how far it may be off", ha="left", color=BLUE)
     arrow(axis, (10.6, 1.7), (10.6, 1.22), BLUE)
     axis.set_xlim(-0.2, 15.3)
     axis.set_ylim(-1.5, 2.2)
