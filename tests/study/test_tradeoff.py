@@ -13,7 +13,7 @@ from jaxhf.study.measure import DERIVATIVE_PIXELS, Picture, centre_hits
 from jaxhf.study.pareto import advice, by_task, markdown, one_at_a_time, pareto_front
 from jaxhf.study.plan import plan
 from jaxhf.study.plots import plot
-from jaxhf.study.table import changes
+from jaxhf.study.table import changes, in_words
 
 SCENES = Path(__file__).parents[2] / "scenes"
 SCENE = """samples = 1
@@ -141,10 +141,16 @@ def test_tables_and_plot_hold_every_row():
     assert "| **samples 16** | 0.01 |" in text
     assert "| samples 25 | 0.01 |" in text
     figure = plot(ROWS, "by hand")
-    titles = {axes.get_title() for axes in figure.axes} - {""}
-    assert titles == {
-        "picture", "derivative", "picture: samples", "picture: shading", "derivative: edge_samples",
-    }  # fmt: skip
+    for task, rows in zip(("picture", "derivative"), by_task(ROWS), strict=True):
+        titles = f"{task}: time, of the base", f"{task}: error"
+        time, error = (next(axes for axes in figure.axes if axes.get_title() == title) for title in titles)
+        names = [tick.get_text() for tick in time.get_yticklabels()]
+        assert sorted(names) == sorted(in_words(row, rows[0]) for row in rows)
+        for axes, column in ((time, "against_base"), (error, "error")):
+            drawn = dict(zip(names, axes.collections[-1].get_offsets()[:, 0], strict=True))
+            assert drawn == {in_words(row, rows[0]): max(row[column], 1e-9) for row in rows}
+        bold = {tick.get_text() for tick in time.get_yticklabels() if tick.get_weight() == "bold"}
+        assert bold == {in_words(row, rows[0]) for row in pareto_front(rows)}
 
 
 def knobs_of(sweep):
