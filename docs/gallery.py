@@ -3,12 +3,14 @@
 `python docs/gallery.py` for all of them; `python docs/gallery.py dawn sea` keeps only these (and runs what they need).
 """
 
+import itertools
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
 from contextlib import chdir
+from importlib.util import find_spec
 from pathlib import Path
 
 from PIL import Image, ImageSequence
@@ -17,20 +19,23 @@ from jaxhf.xla.machine import available_bytes
 
 DOCS = Path(__file__).resolve().parent
 MOST = 250_000  # bytes of one picture
+SECONDS = 6  # of a film, at least
 BLOCKS = re.compile(  # as the tests read them: a condition and a reason to leave the block out, its language, title and lines
     r'(?:<!-- skip: next if\((.*), reason="(.*)"\) -->\n\n)?^```(\w+)(?: title="([^"\n]*)")?\n((?:.*\n)*?)```', re.MULTILINE
 )
 
 
 def keep(path: Path) -> None:
-    """A film in as many colours, a picture as a JPEG as good, as make it small enough."""
+    """A film as a WebP of six seconds or more with as many frames, a picture as a JPEG, as good as makes it small enough."""
     target = DOCS / "images" / "gallery" / path.name
     if path.suffix == ".gif":
-        frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(Image.open(path))]
-        wait = Image.open(path).info["duration"]
-        for colours in (128, 64, 32, 16):
-            few = [frame.quantize(colours, dither=Image.Dither.NONE) for frame in frames]
-            few[0].save(target, save_all=True, append_images=few[1:], duration=wait, loop=0, optimize=True)
+        target, film = target.with_suffix(".webp"), Image.open(path)
+        frames, waits = zip(*((one.convert("RGB"), one.info["duration"]) for one in ImageSequence.Iterator(film)), strict=True)
+        slower = max(1, SECONDS * 1000 / sum(waits))
+        for every, quality in itertools.product((1, 2, 3, 4, 6), (85, 70, 55, 45)):
+            first, *others = frames[::every]
+            wait = [round(slower * sum(waits[k : k + every])) for k in range(0, len(waits), every)]
+            first.save(target, save_all=True, append_images=others, duration=wait, loop=0, quality=quality, method=4)
             if target.stat().st_size <= MOST:
                 break
     else:
@@ -43,7 +48,7 @@ def keep(path: Path) -> None:
 def main(wanted: list[str]) -> None:
     page = (DOCS / "gallery.md").read_text()
     shell = {"check": True, "shell": True}
-    namespace: dict[str, object] = {"available_bytes": available_bytes}
+    namespace: dict[str, object] = {"available_bytes": available_bytes, "installed": lambda name: find_spec(name) is not None}
     with tempfile.TemporaryDirectory() as folder, chdir(folder):
         shutil.copytree(DOCS.parent / "scenes", "scenes")
         for section in re.split(r"^## ", page, flags=re.MULTILINE):

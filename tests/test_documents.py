@@ -259,7 +259,7 @@ def test_fit_files_have_their_keys_and_defaults():
 
 
 def test_pictures_are_small():
-    sizes = {path: path.stat().st_size for path in DOCS.rglob("*") if path.suffix in (".png", ".jpg", ".gif", ".svg")}
+    sizes = {path: path.stat().st_size for path in DOCS.rglob("*") if path.suffix in (".png", ".jpg", ".gif", ".webp", ".svg")}
     assert not {path: size for path, size in sizes.items() if size > 250_000}
     assert sum(sizes.values()) < 3_500_000
 
