@@ -28,13 +28,17 @@ WHOLE = {unit: re.compile(rf"figures of this {unit} are by hand", re.IGNORECASE)
 
 # What looks like a figure and was chosen, or follows from a definition, and why.
 CHOSEN = {
+    "docs/coming-from/blender.md": {"f / 36 times the longer side": "what a focal length means"},
     "docs/concepts/recovery.md": {"then twice as many each time": "how stages are made"},
     "docs/concepts/shading.md": {"within a cosine of 0.01": "where a corner is rounded off"},
+    "docs/gallery.md": {"with 1 % of noise": "what was added to the pictures"},
     "docs/guides/devices.md": {"for 60 s is taken for dead": "XLA's limit", "at most 500 MB": "what the folder may hold"},
     "docs/guides/files.md": {"255 times the value": "what a byte means"},
     "docs/guides/fitting.md": {"then χ² is near 1": "what an estimate of the noise leads to by itself"},
     "docs/measurements/settings.md": {"**99.9 %**": "the name of a column"},
     "docs/tutorials/photographs.md": {"Is χ² near 1?": "a question"},
+    "docs/reference/faq.md": {"over 30 km are 1 %": "a division", "5 % wrong": "the cosine of a latitude"},
+    "docs/reference/glossary.md": {"68 %": "of the normal distribution"},
     "docs/tutorials/robots.md": {"an error of 2 cm": "the example's sensor"},
 }
 
