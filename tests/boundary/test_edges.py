@@ -45,9 +45,12 @@ def from_above(x: float) -> jaxhf.Orthographic:
     return jaxhf.Orthographic(frame, WIDE, width=SIZE, height=SIZE)
 
 
-def small_scene(heights: Any, camera: jaxhf.Orthographic, light: Any) -> jaxhf.Scene:
-    """All of one structure, so that they share their compiled programs; as traced leaves, which keep their derivatives."""
-    field = jaxhf.Object(jaxhf.Heightfield(jnp.asarray(heights)), jaxhf.Matte(0.7), np.eye(4))
+def small_scene(heights: Any, camera: jaxhf.Orthographic, light: Any, limb: float = 0.0) -> jaxhf.Scene:
+    """All of one structure, so that they share their compiled programs; as traced leaves, which keep their derivatives.
+
+    The material is Lambert's with a limb of 0, and Lommel's and Seeliger's with 1.
+    """
+    field = jaxhf.Object(jaxhf.Heightfield(jnp.asarray(heights)), jaxhf.LunarLambert(0.7, limb), np.eye(4))
     light = light if isinstance(light, jaxhf.Point) else jaxhf.Directional(light)
     return jax.tree.map(jnp.asarray, jaxhf.Scene([field], camera, [light]))
 
@@ -108,12 +111,14 @@ def shadow_scene(light: Any = (-1.0, 0.0, TAN), at: float = SHADOW) -> jaxhf.Sce
     return small_scene(HEIGHT * PLATEAU, from_above(at + 0.01), light)
 
 
-def seen_aslant(heights: Any, target: Any, towards: Any, tilt: float, light: Any = (0.0, 0.0, 1.0)) -> jaxhf.Scene:
+def seen_aslant(
+    heights: Any, target: Any, towards: Any, tilt: float, light: Any = (0.0, 0.0, 1.0), limb: float = 0.0
+) -> jaxhf.Scene:
     """Looked at along a horizontal direction and downwards by an angle."""
     x, y = towards
     eye = np.array(target) + 2 * np.array([-x * np.cos(tilt), -y * np.cos(tilt), np.sin(tilt)])
     camera = jaxhf.Orthographic.look_at(eye, target, (0, 0, 1), WIDE, width=SIZE, height=SIZE)
-    return small_scene(heights, camera, light)
+    return small_scene(heights, camera, light, limb)
 
 
 # The border of a flat sheet, x = 1, seen from above; and its far border, y = 1.
@@ -163,8 +168,7 @@ def test_a_boundary_moves_alone(name):
 
 def test_a_shadow_takes_what_the_material_sends_to_the_eye():
     """Seen aslant, across the way in which the shadow moves."""
-    scene = seen_aslant(HEIGHT * PLATEAU, (SHADOW + 0.01, 0.5, 0), (0, 1), np.arcsin(0.8), (-1.0, 0.0, TAN))
-    scene = eqx.tree_at(lambda scene: scene.objects[0].material, scene, jax.tree.map(jnp.asarray, jaxhf.LommelSeeliger(0.7)))
+    scene = seen_aslant(HEIGHT * PLATEAU, (SHADOW + 0.01, 0.5, 0), (0, 1), np.arcsin(0.8), (-1.0, 0.0, TAN), 1.0)
     interior, boundary = changes(scene, moved(heights_of, PLATEAU)(scene), KEY)
     law = 2 / (TAN / np.hypot(1, TAN) + 0.8)
     assert np.abs(interior).max() < 1e-6 * LIT / TAN / PIXEL
