@@ -56,14 +56,10 @@ def test_the_noise_of_rounded_pictures_is_their_root_mean_square():
 
 def test_normals_of_another_renderer_are_named_where_they_matter():
     """By how much they turn: hardly any on the smooth terrain, by 20 degrees on steps of a cell's width."""
-    found = [
-        _share_of_normals(expanded(scenes(heights), pictures(), settings=settings, noise=0.02))
-        for settings, heights in (
-            (SETTINGS, TRUTH), (SETTINGS, STEPS), (dataclasses.replace(SETTINGS, normals="six-angle"), STEPS)
-        )
-    ]  # fmt: skip
-    assert found[0] < 0.5 < 2 < found[1]
-    assert found[2] == 0
+    smooth, steps = (expanded(scenes(heights), pictures(), settings=SETTINGS, noise=0.02) for heights in (TRUTH, STEPS))
+    assert _share_of_normals(smooth) < 0.5 < 2 < _share_of_normals(steps)
+    other = dataclasses.replace(steps.problem, settings=dataclasses.replace(SETTINGS, normals="six-angle"))
+    assert _share_of_normals(steps.of(other)) == 0
 
 
 def test_a_grey_picture_with_three_channels_is_one_measurement():
@@ -296,9 +292,9 @@ def test_beside_a_prior_one_light_is_said_where_nothing_else_tells_slopes_and_de
     assert warnings(GOOD._replace(same_light=True, same_view=False)) == ()
 
 
-def test_a_fit_of_one_picture_beside_a_prior_says_that_it_has_one_light():
-    options = {"settings": SETTINGS, "noise": 0.01, "prior": jaxhf.Prior(0.05, 0.03), "draws": 2, "max_steps": 3}
-    found = jaxhf.fit(scenes()[:1], pictures()[:1], **options)
+def test_a_fit_of_pictures_in_one_light_beside_a_prior_says_so():
+    options = {"settings": SETTINGS, "noise": 0.01, "prior": jaxhf.Prior(0.05, 0.03, 0.2), "draws": 2, "max_steps": 3}
+    found = jaxhf.fit(3 * scenes()[:1], 3 * pictures()[:1], **options)
     assert any("all pictures have the same light: slopes" in warning for warning in found.warnings)
 
 

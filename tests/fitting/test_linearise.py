@@ -22,7 +22,7 @@ def derivatives():
     """Of a boundary point's place in the picture: in all heights by JAX, and in those of its deciding vertices."""
     settings = jaxhf.Settings(edge_samples=1)
     scene = jax.tree.map(jnp.asarray, localise(scene_of(0, True)))
-    world, camera = make_world(scene, settings), scene.camera
+    world, camera = jax.jit(lambda scene: make_world(scene, settings))(scene), scene.camera
 
     def by_rows(rows, point):
         surfaces = [
@@ -67,6 +67,9 @@ def test_what_a_mirror_or_a_sun_with_a_size_shows_has_no_such_matrix():
     assert can_be_linearised(world(jaxhf.Mirror(0.5), SUN), jaxhf.Settings(max_depth=0))
 
 
+sampling_error = jax.jit(_sampling_error, static_argnums=1)
+
+
 def samples_of(picture, side: int, pixels: int = 24) -> np.ndarray:
     """A picture's regular samples, row by row; x to the right, y down, a pixel is 1 wide."""
     y, x = (np.mgrid[0 : pixels * side, 0 : pixels * side] + 0.5) / side
@@ -84,7 +87,7 @@ def samples_of(picture, side: int, pixels: int = 24) -> np.ndarray:
 )
 def test_errors_of_few_samples_are_known(picture, least, most, side):
     """The root mean squares of errors and of what is expected of them, against 64 x 64 samples, where they are not 0."""
-    known = np.asarray(_sampling_error(jnp.asarray(samples_of(picture, side)), side))[..., 0]
+    known = np.asarray(sampling_error(jnp.asarray(samples_of(picture, side)), side))[..., 0]
     fine, few = (samples_of(picture, n).reshape(24, n, 24, n).mean((1, 3)) for n in (64, side))
     told = known > 0
     assert least < rms((few - fine)[told]) / rms(known[told]) < most
@@ -93,8 +96,8 @@ def test_errors_of_few_samples_are_known(picture, least, most, side):
 
 def test_slopes_and_boundaries_between_pixels_make_no_error():
     tilted = samples_of(lambda x, y: 3 * x - 2 * y, 4)
-    np.testing.assert_allclose(_sampling_error(jnp.asarray(tilted), 4)[1:-1, 1:-1], 0, atol=1e-5)
+    np.testing.assert_allclose(sampling_error(jnp.asarray(tilted), 4)[1:-1, 1:-1], 0, atol=1e-5)
     step = samples_of(lambda x, y: np.where(x < 11, 1.0, 0.0), 2)
-    np.testing.assert_array_equal(_sampling_error(jnp.asarray(step), 2), 0)
+    np.testing.assert_array_equal(sampling_error(jnp.asarray(step), 2), 0)
     within = samples_of(lambda x, y: np.where(x < 11.5, 1.0, 0.0), 2)
-    assert (np.asarray(_sampling_error(jnp.asarray(within), 2))[:, 11] > 0.1).all()
+    assert (np.asarray(sampling_error(jnp.asarray(within), 2))[:, 11] > 0.1).all()
