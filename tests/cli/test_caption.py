@@ -6,6 +6,7 @@ import pytest
 
 import jaxhf
 from jaxhf.cli.caption import annotated
+from jaxhf.cli.commands import view
 from jaxhf.io.terrain.georeference import WGS84_DEGREES, Georeference
 from jaxhf.io.terrain.terrain import Terrain
 
@@ -55,10 +56,12 @@ def test_a_slender_terrain_has_its_bar_along_its_length_and_degrees_are_metres()
     assert np.ptp(bar[:, 0]) > 10 * np.ptp(bar[:, 1])
 
 
-def test_the_command(tmp_path, command):
-    x, y = np.meshgrid(np.linspace(-1, 1, 17), np.linspace(-1, 1, 13))
-    z = (300 * np.exp(-4 * (x**2 + y**2))).astype(np.float32)
-    jaxhf.save_heights(tmp_path / "in.npz", Terrain(z, 100.0, 100.0))
+def test_the_command(tmp_path, monkeypatch, command):
+    """Of noise for a picture, as real ones are those of test_view_command.py."""
+    noise = np.random.default_rng(0).uniform(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
+    monkeypatch.setattr(view, "prepare", lambda scene: scene)
+    monkeypatch.setattr(view, "photograph", lambda *_: noise)
+    jaxhf.save_heights(tmp_path / "in.npz", Terrain(np.eye(13, 17, dtype=np.float32), 100.0, 100.0))
     words = ["view", tmp_path / "in.npz", "--size", "240x160", "--preset", "draft", "--devices", 1, "--exaggeration", 2]
     annotate = ["--annotate", "--title", "Hills $ dales $x_$", "--azimuth", 275, "--altitude", 30, "--from", 205]
     assert command(*words, "-o", tmp_path / "plain.png", *annotate[3:])[0] == 0

@@ -178,10 +178,10 @@ FIXED, MOVING = "--azimuth {sun}", "--sun-from {sun},40 --sun-to {sun},60 --fram
 @pytest.mark.parametrize(("ending", "light"), [(".npy", FIXED), (".gif", MOVING)])
 def test_views_are_from_where_the_map_says(tmp_path, ending, light, command):
     """In its light, too: by the pictures of the same heights along x and y, from where these are turned to."""
-    heights, pictures = np.add.outer(np.sin(np.arange(12) / 3), np.cos(np.arange(14) / 4)), []
+    heights, pictures = 50 * np.add.outer(np.sin(np.arange(13) / 3), np.cos(np.arange(17) / 4)), []
     for name, degrees, sun in (("rotated", 90, 300), ("straight", 0, 390)):
-        write(tmp_path / f"{name}.tif", heights, affine(degrees, 2, -2))
-        words = f"--size 24x16 --preset draft --from {sun - 80} {light.format(sun=sun)} --no-cache".split()
+        write(tmp_path / f"{name}.tif", heights, affine(degrees, 100, -100))
+        words = f"--size 48x32 --preset draft --from {sun - 80} {light.format(sun=sun)} --no-cache".split()
         assert command("view", tmp_path / f"{name}.tif", "-o", tmp_path / f"{name}{ending}", *words)[0] == 0
         pictures.append((tmp_path / f"{name}{ending}").read_bytes())
     assert pictures[0] == pictures[1]

@@ -158,8 +158,8 @@ def test_a_geotiff_is_draped_where_it_lies(tmp_path):
 
 
 def test_a_sea_is_blue_without_being_asked_for(tmp_path, command):
-    heights = np.maximum(np.arange(-8, 9), 0)[:, None] * np.ones(17, np.float32)
-    jaxhf.save_heights(tmp_path / "in.npz", Terrain(heights, 10.0, 10.0))
+    heights = 10 * np.maximum(np.arange(-6, 7), 0)[:, None] * np.ones(17, np.float32)
+    jaxhf.save_heights(tmp_path / "in.npz", Terrain(heights, 100.0, 100.0))
     words = ["view", tmp_path / "in.npz", *SMALL, "--from", 180, "--above", 90, "-o"]
     for out, more, blue in (("a.npy", [], True), ("b.npy", ["--water", 0], True), ("c.npy", ["--ramp", "Reds"], False)):
         code, _, err = command(*words, tmp_path / out, *more)

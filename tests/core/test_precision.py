@@ -33,7 +33,7 @@ ENTRANCES = {
     "Terrain": lambda z, _: Terrain(z).heightfield(),
     "hillshade": lambda z, _: jaxhf.hillshade(z, 1.0),
     "slope": lambda z, _: jaxhf.slope(z, 1.0),
-    "horizon": lambda z, _: jaxhf.horizon(z, 4, dx=1.0),
+    "horizon": lambda z, _: jaxhf.horizon(z, 2, dx=1.0),
     "file": by_toml,
     "prior of a fit": lambda z, _: make_heights("Prior", "heights", z, FLAT),
 }

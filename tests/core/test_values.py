@@ -85,7 +85,7 @@ OF_HEIGHTS = {
     "slope": lambda z: jaxhf.slope(z, 1.0),
     "hillshade": lambda z: jaxhf.hillshade(z, 1.0),
     "color_relief": lambda z: jaxhf.color_relief(z, "terrain"),
-    "sky_view": lambda z: jaxhf.sky_view(z, 2, dx=1.0),
+    "horizon": lambda z: jaxhf.horizon(z, 2, dx=1.0),
 }
 FILL = -9999
 WHOLE = RNG.integers(0, 9, HEIGHTS.shape)

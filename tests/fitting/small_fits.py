@@ -68,7 +68,8 @@ def dense(here: Expansion, roots: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     basis, dtype = here.problem.basis, here.unknowns.coefficients.dtype
     others = here.unknowns.without_modes()
     flat, unflat = jax.flatten_util.ravel_pytree((jnp.zeros_like(basis.base), others))
-    rows = [in_row(here.push(unflat(jnp.zeros_like(flat).at[k].set(1)))) for k in range(flat.size)]
+    alone = jax.jit(lambda k: unflat(jnp.zeros_like(flat).at[k].set(1)))
+    rows = [in_row(here.push(alone(k))) for k in range(flat.size)]
 
     def priors(x: jax.Array) -> jax.Array:
         """Of unknowns that have moved by x; the base takes what a mode would, so that held heights move, too."""

@@ -10,7 +10,7 @@ import pytest
 from small_fits import EVERYTHING, SETTINGS, TRUTH, dense, expanded, pictures, rms, scenes
 
 import jaxhf
-from jaxhf.fitting.model.expansion import residuals
+from jaxhf.fitting.model.expansion import prior_residuals
 from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.solve import run as _run
 from jaxhf.fitting.solve.stages import Stage
@@ -29,8 +29,7 @@ def test_a_whole_step_solves_the_linear_problem():
     step, left, basis = whole_step(here), in_row(here.left()), here.problem.basis
     roots = 1 / (1 + (left / 3) ** 2)
     by_pictures, by_priors, free = dense(here, roots)
-    images, priors = residuals(here.unknowns, here)[0]
-    off = np.concatenate([np.ravel(part) for part in priors])
+    off = np.concatenate([np.ravel(part) for part in prior_residuals(here.unknowns, here.problem)])
     gradient, matrix = by_pictures.T @ (roots * left) + by_priors.T @ off, by_pictures.T @ by_pictures + by_priors.T @ by_priors
     expected = np.zeros(free.size)
     expected[free] = -np.linalg.solve(matrix[np.ix_(free, free)], gradient[free])
@@ -42,7 +41,7 @@ def test_a_whole_step_solves_the_linear_problem():
     assert not moved[~free[:count]].any()
     assert step.length == pytest.approx(rms(basis.crop(expected[:count].reshape(basis.base.shape))), rel=5e-3)
     assert step.predicted == pytest.approx(-gradient @ expected / 2, rel=5e-3)
-    assert step.loss == pytest.approx(sum(np.sum(np.square(part)) for part in (*images, *priors)) / 2, rel=1e-5)
+    assert step.loss == pytest.approx((roots @ left**2 + off @ off) / 2, rel=1e-5)  # by Geman and McClure
     there = relaxed(here.unknowns, step)
     np.testing.assert_allclose(there.coefficients, 0.75 * step.change.coefficients, atol=1e-6)
 
