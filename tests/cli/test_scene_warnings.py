@@ -37,10 +37,7 @@ def scene(eye=(1.0, -4.0, 3.0), target=(1.0, 1.0, 0.0), heights=HILLS, lights=(S
         ({"eye": (1.5, 1.25, 2.26)}, None),
         ({"eye": (1.5, 1.25, 2.15)}, r"eye stands 0.1 below the surface of objects\[0\], whose height there is 2.25:"),
         ({"eye": (2.5, 1.25, -1.0)}, None),  # beside it
-        (
-            {"eye": (1.5, 1.25, 1.9), "heights": np.where(np.arange(9).reshape(3, 3) == 7, np.nan, HILLS)},
-            None,
-        ),  # in a hole's cell
+        ({"eye": (1.5, 1.25, 1.9), "heights": np.where(np.eye(9)[7].reshape(3, 3), np.nan, HILLS)}, None),  # in a hole's cell
         ({"eye": (1.5, 1.25, 1.9), "turn": np.eye(4)}, None),  # where an object is turned, below has no meaning
         ({"target": (1.0, -9.0, 3.0)}, "none of the terrain is in the picture, it spans x 0 to 2, y 0 to 2, z 0 to 3"),
         ({"target": (-9.0, -4.0, 3.0), "width": 80}, None),  # a wide picture sees it at its right end

@@ -27,15 +27,15 @@ def run(command, tmp_path):
 
 def test_skyview(run, tmp_path):
     reports = []
-    options = {"dx": 2.0, "dy": 3.0, "weighting": "slope"}
+    options = {"dx": 2.0, "dy": 3.0, "weighting": "horizontal"}
     expected = np.asarray(jaxhf.sky_view(Z, 4, **options, progress=lambda *report: reports.append(report)))
     assert reports == [(35, 35)]
     np.testing.assert_allclose(jaxhf.sky_view(Z, 4, **options), expected, rtol=1e-6)
-    code, said = run("skyview", "sky.npy", "--azimuths", "4", "--weighting", "slope")
+    code, said = run("skyview", "sky.npy", "--azimuths", "4", "--weighting", "horizontal")
     assert code == 0
     assert f": sky-view factor {np.nanmin(expected):.3f} .. {np.nanmax(expected):.3f}, 4 azimuths, " in said
     np.testing.assert_array_equal(np.load(tmp_path / "sky.npy"), expected)
-    assert run("skyview", "sky.png", "--azimuths", "4", "--weighting", "slope")[0] == 0
+    assert run("skyview", "sky.png", "--azimuths", "4", "--weighting", "horizontal")[0] == 0
     with Image.open(tmp_path / "sky.png") as picture:
         np.testing.assert_array_equal(np.asarray(picture)[::-1], np.rint(255 * np.nan_to_num(expected)))
 
@@ -125,22 +125,17 @@ def test_insolation(run, tmp_path):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (("--begin", "2026-06-21", "--end", "2026-06-22"), "insolation: times need --latitude and --longitude for "),
-        (
-            ("--begin", "2026-06-21T10:00", "--end", "2026-06-22"),
-            "--begin must be a date, as 2026-06-21, or a time with its offset",
-        ),
-        (("--begin", "2026-06-22", "--end", "2026-06-21", "--latitude", "4", "--longitude", "4"), "end must come after begin"),
-        (("--begin", "2026-06-21", "--end", "2026-06-22", "--latitude", "4"), "insolation: --latitude and --longitude belong"),
-        (
-            ("--begin", "2026-06-21", "--end", "2026-06-22", "--wanted", "hours", "--turbidity", "2"),
-            "--turbidity would change nothing: hours of sun are the same in any air",
-        ),
-        (("--begin", "2026-06-21"), "required: --end"),
+        ("--begin 2026-06-21 --end 2026-06-22", "insolation: times need --latitude and --longitude for "),
+        ("--begin 2026-06-21T10:00 --end 2026-06-22", "--begin must be a date, as 2026-06-21, or a time with its offset"),
+        ("--begin 2026-06-22 --end 2026-06-21 --latitude 4 --longitude 4", "end must come after begin"),
+        ("--begin 2026-06-21 --end 2026-06-22 --latitude 4", "insolation: --latitude and --longitude belong"),
+        ("--begin 2026-06-21 --end 2026-06-22 --wanted hours --turbidity 2",
+         "--turbidity would change nothing: hours of sun are the same in any air"),
+        ("--begin 2026-06-21", "required: --end"),
     ],
-)
+)  # fmt: skip
 def test_wrong_times_are_refused(run, options, expected):
-    code, said = run("insolation", "sun.npy", *options)
+    code, said = run("insolation", "sun.npy", *options.split())
     assert code == 2
     assert expected in " ".join(said.split())
 
@@ -189,24 +184,18 @@ def test_an_area_holds_what_stands_on_its_sides(run):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        (("--observer", "90", "52"), "--observer must be on the terrain, x from 100 to 112 and y from 50 to 62; one is 90 52"),
-        (("--observer", "103", "52", "--line"), "--line needs 2 --observer at least, it has 1"),
-        (("--observer", "103", "52", "--observer", "105", "52", "--area"), "--area needs 3 --observer at least, it has 2"),
-        (("--observer", "103", "52", "--area", "--line"), "--line would change nothing: --area takes all of what"),
-        (
-            ("--observer", "103", "52", "--observer", "105", "52", "--observer", "103.1", "52.1", "--area"),
-            "--area must hold heights, none stands within",
-        ),
-        (
-            ("--observer", "103", "52", "--above-ground", "--target-height", "2"),
-            "--target-height would change nothing: --above-ground",
-        ),
-        (("--observer", "106", "56"), "--observer[0] must be on a triangle of the terrain"),
-        (("--observer", "103"), "expected 2 arguments"),
-        ((), "required: --observer"),
+        ("--observer 90 52", "--observer must be on the terrain, x from 100 to 112 and y from 50 to 62; one is 90 52"),
+        ("--observer 103 52 --line", "--line needs 2 --observer at least, it has 1"),
+        ("--observer 103 52 --observer 105 52 --area", "--area needs 3 --observer at least, it has 2"),
+        ("--observer 103 52 --area --line", "--line would change nothing: --area takes all of what"),
+        ("--observer 103 52 --observer 105 52 --observer 103.1 52.1 --area", "--area must hold heights, none stands within"),
+        ("--observer 103 52 --above-ground --target-height 2", "--target-height would change nothing: --above-ground"),
+        ("--observer 106 56", "--observer[0] must be on a triangle of the terrain"),
+        ("--observer 103", "expected 2 arguments"),
+        ("", "required: --observer"),
     ],
 )
 def test_wrong_observers_are_refused(run, options, expected):
-    code, said = run("viewshed", "seen.npy", *options)
+    code, said = run("viewshed", "seen.npy", *options.split())
     assert code == 2
     assert expected in said

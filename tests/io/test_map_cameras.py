@@ -155,8 +155,8 @@ def test_a_picture_shows_what_the_model_sees(tmp_path):
     rpcs.samp_off -= column
     rpcs.line_off -= row
     camera = jaxhf.Perspective.from_rpc(rpcs, whole, width=160, height=120)
-    scene = jaxhf.Scene([jaxhf.Object(whole.heightfield())], camera, [jaxhf.Directional((0, 0, 1))])
-    _, aovs = jaxhf.render(scene, aovs=("status", "depth"))
+    scene = jaxhf.Scene([jaxhf.Object(whole.heightfield())], camera)
+    _, aovs = jaxhf.render(scene, jaxhf.Settings(shading="flat"), aovs=("status", "depth"))
     assert (np.asarray(aovs["status"]) == jaxhf.Status.HIT).all()
     middles = np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5), axis=-1)
     hits = (
@@ -261,8 +261,8 @@ def test_an_orthophoto_shows_what_its_geotransform_says(tmp_path, place, degrees
     terrain, transform = jaxhf.load_heights(path), rasterio.Affine(*numbers)
     for width, height in ((24, 20), (20, 24)):
         camera = jaxhf.Orthographic.from_geotransform(transform, terrain, width=width, height=height)
-        scene = jaxhf.Scene([jaxhf.Object(terrain.heightfield())], camera, [jaxhf.Directional((0, 0, 1))])
-        _, aovs = jaxhf.render(scene, aovs=("status", "uv"))
+        scene = jaxhf.Scene([jaxhf.Object(terrain.heightfield())], camera)
+        _, aovs = jaxhf.render(scene, jaxhf.Settings(shading="flat"), aovs=("status", "uv"))
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         x, y = mapped(transform, columns, rows)
         u = ((x - grid[2]) / grid[0] - 0.5) / 39
@@ -281,11 +281,7 @@ def test_what_is_no_geotransform_is_refused(tmp_path):
     terrain = jaxhf.Terrain(np.eye(3, dtype=np.float32))
     Affine = rasterio.Affine
     for transform, ground, message in (
-        (
-            (0, 1, 0, 3, 0, -1),
-            terrain,
-            "transform must be an Affine, as rasterio's dataset.transform or Affine.from_gdal",
-        ),
+        ((0, 1, 0, 3, 0, -1), terrain, "transform must be an Affine, as rasterio's dataset.transform or Affine.from_gdal"),
         (Affine(1, 1, 0, 1, 1, 0), terrain, "transform must be finite and invertible, it is [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0"),
         (Affine(1, 0, np.nan, 0, -1, 0), terrain, "transform must be finite and invertible, it is [[1.0, 0.0, nan], ["),
         (Affine(1, 0, 0, 0, -1, 2.5), terrain.heights, "terrain must be a Terrain, as load_heights gives it, it is a ndarray"),

@@ -180,14 +180,8 @@ def test_a_part_of_a_terrain_in_degrees(tmp_path):
         ({"band": 0}, "band must be a whole number from 1 on, it is 0"),
         ({"bbox": (0, 0, 1)}, "bbox must be west, south, east and north"),
         ({"bbox": (5e5, 4e6, 5e5, 5e6)}, "bbox must be west, south, east and north, finite and in this order"),
-        (
-            {"bbox": (5e5, 4e6 - 60, 5e5 + 30, 4e6)},
-            "must be heights, 2 x 2 at least; they stand at x from 500015 to 500105",
-        ),
-        (
-            {"window": (0, 0, 5, 3)},
-            r"window must lie within the file's 4 columns and 3 rows, and be 2 x 2 or larger; it is \(0, 0, 5, 3\)",
-        ),
+        ({"bbox": (5e5, 4e6 - 60, 5e5 + 30, 4e6)}, "must be heights, 2 x 2 at least; they stand at x from 500015 to 500105"),
+        ({"window": (0, 0, 5, 3)}, r"within the file's 4 columns and 3 rows, and be 2 x 2 or larger; it is \(0, 0, 5, 3\)"),
         ({"window": (-1, 0, 2, 2)}, "window must lie within the file's 4 columns"),
         ({"window": (0, 2, 2, 2)}, "window must lie within the file's 4 columns"),
         ({"window": (0, 2, 2, 1)}, "window must lie within the file's 4 columns"),

@@ -185,11 +185,7 @@ def test_derivative():
 @pytest.mark.parametrize(
     ("arguments", "options", "expected"),
     [
-        (
-            (BEGIN, BEGIN, PLACE),
-            {},
-            "insolation: end must come after begin, 2026-03-10, by ten years at most, it is 2026-03-10",
-        ),
+        ((BEGIN, BEGIN, PLACE), {}, "insolation: end must come after begin, 2026-03-10, by ten years at most, it is 2026-"),
         ((BEGIN, BEGIN + 4000 * DAY, PLACE), {}, "by ten years at most"),
         ((datetime.datetime(2026, 3, 10), BEGIN, PLACE), {}, "insolation: begin must have a time zone"),
         (("2026-03-10", BEGIN + DAY, PLACE), {}, "insolation: begin must be a datetime or datetime64, it is str"),

@@ -68,7 +68,7 @@ def test_depth_and_its_derivative_where_heights_are_traced(kind):
     @jax.jit
     def depths(z):
         def total(z):
-            depth = jaxhf.render(made.with_heights(z), aovs=("depth",))[1]["depth"]
+            depth = jaxhf.render(made.with_heights(z).with_lights(()), aovs=("depth",))[1]["depth"]
             depth = jnp.where(jnp.isfinite(depth), depth - AWAY, 0)
             return depth.sum(), depth
 
