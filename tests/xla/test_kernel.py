@@ -134,21 +134,18 @@ def test_a_derivative_may_be_that_of_another_function():
 
 
 def scenes() -> dict[str, tuple[jaxhf.Scene, jaxhf.Settings]]:
-    """One with each part of a scene that a tile may trace."""
+    """With each part of a scene that a tile may trace; one that does without a kernel takes it from all beside it."""
     field = jaxhf.Heightfield(np.random.default_rng(0).uniform(0, 0.1, (1024, 5)).astype(np.float32), 1.0)
     camera = jaxhf.Perspective.look_at((2, -500, 900), (2, 500, 0), width=40, height=40)
     terrain = jaxhf.Object(field)
     usual = [terrain], [jaxhf.Directional((1, 2, 3)), jaxhf.Sky(0.5)]
-    texture = jaxhf.ImageTexture(np.full((64, 64, 3), 0.5, np.float32))
+    texture, mirror = jaxhf.ImageTexture(np.full((64, 64, 3), 0.5, np.float32)), jaxhf.Mirror(0.5)
+    tube = jaxhf.Object(jaxhf.Cylinder(1.0), mirror)
     parts = {
         "plain": usual,
-        "skirt": ([terrain, jaxhf.Object(jaxhf.Skirt.of(field, -1.0))], usual[1]),
-        "cylinder": ([terrain, jaxhf.Object(jaxhf.Cylinder(1.0), jaxhf.Mirror(0.5))], usual[1]),
-        "texture": ([jaxhf.Object(field, jaxhf.Matte(texture))], usual[1]),
-        "two": ([terrain, jaxhf.Object(field, jaxhf.Mirror(0.5), np.diag([2.0, 2, 2, 1]))], usual[1]),
-        "point": ([terrain], [jaxhf.Point((2, 500, 9), 1e3)]),
-        "sun": ([terrain], [jaxhf.Sun((1, 2, 3))]),
-        "hidden sky": ([terrain], [jaxhf.Sky(0.5, occlusion=8)]),
+        "texture, skirt": ([jaxhf.Object(field, jaxhf.Matte(texture)), jaxhf.Object(jaxhf.Skirt.of(field, -1.0))], usual[1]),
+        "cylinder, two": ([terrain, jaxhf.Object(field, mirror, np.diag([2.0, 2, 2, 1])), tube], usual[1]),
+        "point, sun, hidden sky": ([terrain], [jaxhf.Point((2, 500, 9)), jaxhf.Sun((1, 2, 3)), jaxhf.Sky(0.5, occlusion=8)]),
     }
     knobs = {
         "samples": jaxhf.Settings(samples=4),
