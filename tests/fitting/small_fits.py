@@ -13,6 +13,7 @@ import numpy as np
 import jaxhf
 from jaxhf.fitting.given import Given
 from jaxhf.fitting.model.expansion import Expansion, expand, prior_residuals
+from jaxhf.fitting.model.linearise import LinearisedEdges
 from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.model.pictures import checked_pictures
 from jaxhf.fitting.model.problem import Problem, make_problem
@@ -84,6 +85,14 @@ def dense(here: Expansion, roots: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
         free[: basis.base.size] = np.ravel(basis.free)
     jacobian = np.asarray(jax.jit(jax.jacfwd(priors))(jnp.zeros(flat.size, dtype)), np.float64)
     return roots[:, None] * np.stack(rows, axis=1) * free, jacobian * free, free > 0
+
+
+def edges_in(pixel: Any, kind: Any, resampled: Any) -> LinearisedEdges:
+    """Points on edges of pictures in one channel, a row of each, which lie in these pixels and are moved by nothing."""
+    pixel, kind, resampled = (jnp.asarray(values, jnp.int32) for values in (pixel, kind, resampled))
+    n, count = pixel.shape
+    slopes, vertices = jnp.zeros((n, 1, 1, 5, count)), jnp.zeros((n, 1, 5, count), jnp.int32)
+    return LinearisedEdges(slopes, vertices, pixel, kind, resampled)
 
 
 def rms(values: Any) -> float:

@@ -142,8 +142,9 @@ def ctrl_c(monkeypatch, name: str, call: int, waiting: bool = False):
 
 # Which function is interrupted in which of its calls, whether its result is being waited for, and the step that comes next:
 # None is the first one of the second stage.
-CTRL_C = [("spreads", 1, False, 1), ("advance", 1, True, 1), ("advance", 3, True, 3), ("balanced", 2, False, None)]
-MORE = [("expand", 1, False, 1), ("advance", 1, False, 1), ("first_position", 1, False, 1), ("expand", 2, False, 2)]
+CTRL_C = [("spreads", 1, False, 1), ("advance", 3, True, 3), ("balanced", 2, False, None)]
+MORE = [("expand", 1, False, 1), *(("advance", 1, waiting, 1) for waiting in (False, True))]
+MORE += [("first_position", 1, False, 1), ("expand", 2, False, 2)]
 
 
 @pytest.mark.parametrize(

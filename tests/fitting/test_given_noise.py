@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 from small_fits import SETTINGS, TRUTH, pictures, scenes
+from test_windows import ABOVE, PLAIN, scenes as in_windows
 
 import jaxhf
 from jaxhf.fitting import windows as _windows
@@ -13,6 +14,7 @@ from jaxhf.fitting.model.pictures import checked_pictures
 READ, GAIN = 0.002, 0.0005
 DETECTOR = jaxhf.Noise(READ, GAIN)
 KNOWN = jaxhf.Prior(0.05, 0.03, 0.2)
+SOUGHT = jaxhf.Unknown(albedo="constant")  # in all fits, for the same programs
 
 
 def by_hand(target: np.ndarray, weight: np.ndarray | float = 1.0) -> tuple[float, np.ndarray]:
@@ -30,28 +32,27 @@ def noisy() -> list[np.ndarray]:
 
 def test_a_detectors_noise_is_that_of_weights_made_by_hand():
     targets, masks = noisy(), [None, np.tile([0.0, 1.0, 1.0], (24, 8)), None]
-    found = jaxhf.fit(scenes(), targets, noise=DETECTOR, weights=masks, prior=KNOWN, settings=SETTINGS)
+    found = jaxhf.fit(scenes(), targets, noise=DETECTOR, weights=masks, prior=KNOWN, unknown=SOUGHT, settings=SETTINGS)
     noise, weights = zip(*(by_hand(t, 1.0 if m is None else m) for t, m in zip(targets, masks, strict=True)), strict=True)
-    same = jaxhf.fit(scenes(), targets, noise=noise, weights=weights, prior=KNOWN, settings=SETTINGS)
+    same = jaxhf.fit(scenes(), targets, noise=noise, weights=weights, prior=KNOWN, unknown=SOUGHT, settings=SETTINGS)
     np.testing.assert_array_equal(found.heights, same.heights)
     np.testing.assert_array_equal(found.noise, noise)
     assert found.stats["chi2"] == same.stats["chi2"]
     assert 0.9 < found.stats["chi2"] < 1.1
     # By the recipe of weights alone, with a noise of 1: to a tenth of what a fit leaves undone.
     recipe = [weight / one for weight, one in zip(weights, noise, strict=True)]
-    other = jaxhf.fit(scenes(), targets, noise=1.0, weights=recipe, prior=KNOWN, settings=SETTINGS)
+    other = jaxhf.fit(scenes(), targets, noise=1.0, weights=recipe, prior=KNOWN, unknown=SOUGHT, settings=SETTINGS)
     np.testing.assert_allclose(found.heights, other.heights, atol=1e-3 * np.ptp(TRUTH))
 
 
 def test_dark_pixels_count_more_than_bright_ones():
     """A factor that dark and bright pixels contradict each other about is their mean by the variances of their noise."""
-    painted = jaxhf.ImageTexture(np.repeat(np.where(np.arange(12) < 6, 0.1, 0.7)[None], 12, 0), at_vertices=True)
-    exact = pictures(albedo=painted)
+    rugged = 3 * TRUTH  # of which dark pixels are a quarter as bright as bright ones
+    exact = [np.asarray(jaxhf.render(scene, SETTINGS))[..., 0] for scene in scenes(rugged)]
     dark = [image < np.median(image) for image in exact]
     targets = [np.where(where, 1.01, 0.99) * image for image, where in zip(exact, dark, strict=True)]
-    known, unknown = jaxhf.Prior(TRUTH, 1e-5), jaxhf.Unknown(albedo="constant")
-    noise = jaxhf.Noise(0.0002, 0.0001)
-    found = jaxhf.fit(scenes(TRUTH, painted), targets, prior=known, unknown=unknown, noise=noise, settings=SETTINGS)
+    known, noise = jaxhf.Prior(rugged, 1e-5, 0.2), jaxhf.Noise(0.0002, 0.0001)
+    found = jaxhf.fit(scenes(rugged), targets, prior=known, unknown=SOUGHT, noise=noise, settings=SETTINGS)
     told = [1 / (0.0002**2 + 0.0001 * target) for target in targets]
     above = sum(np.sum(w * image * target) for w, image, target in zip(told, exact, targets, strict=True))
     below = sum(np.sum(w * image**2) for w, image in zip(told, exact, strict=True))
@@ -81,12 +82,9 @@ def test_windows_take_it(monkeypatch):
     """Each picture's number is that of the whole, and so are the weights."""
     asked = []
     monkeypatch.setattr(_windows, "fit", lambda scenes, targets, **options: asked.append(options) or 1 / 0)
-    field = jaxhf.Object(jaxhf.Heightfield(np.zeros((48, 48), np.float32)), jaxhf.Matte(0.7))
-    camera = jaxhf.Orthographic.look_at((0.5, 0.5, 3), (0.5, 0.5, 0), up=(0, 1, 0), extent=0.9, width=48, height=48)
-    scene = jaxhf.Scene([field], camera, [jaxhf.Directional((0.0, 0.0, 1.0))])
-    target = np.random.default_rng(0).uniform(0, 1, (48, 48))
+    views, target = in_windows(np.zeros((48, 48), np.float32), ABOVE)[:1], np.random.default_rng(0).uniform(0, 1, (48, 48))
     with pytest.raises(ZeroDivisionError):
-        jaxhf.fit_windows([scene], [target], prior=jaxhf.Prior(0.0, 0.1), window=32, noise=DETECTOR)
+        jaxhf.fit_windows(views, [target], prior=jaxhf.Prior(0.0, 0.1), window=32, noise=DETECTOR, settings=PLAIN)
     noise, weights = by_hand(target)
     np.testing.assert_allclose(asked[0]["noise"], [noise], rtol=1e-12)
     (weight,) = asked[0]["weights"]

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_fits import EVERYTHING, SETTINGS, TRUTH, dense, expanded, pictures, rms, scenes
+from small_fits import EVERYTHING, SETTINGS, TRUTH, dense, edges_in, expanded, pictures, rms, scenes
 
 import jaxhf
 from jaxhf.fitting.model.expansion import prior_residuals
@@ -76,9 +76,11 @@ def test_a_step_counts_where_the_next_is_shorter(lengths, accepted, goes_on, mon
 
 
 def test_fits_of_few_heights_with_points_on_edges_end_so(monkeypatch):
-    here = expanded(scenes(), pictures(), settings=dataclasses.replace(SETTINGS, edge_samples=100), noise=0.01)
+    here = expanded(scenes(), pictures(), settings=SETTINGS, noise=0.01)
+    assert not _run._ends_by_factors(here)
+    (known,), one = here.linearised, np.zeros((3, 1))
+    assert known is not None
+    here = dataclasses.replace(here, linearised=(dataclasses.replace(known, edges=edges_in(one, one, one)),))
     assert _run._ends_by_factors(here)
-    without = tuple(dataclasses.replace(known, edges=None) for known in here.linearised if known is not None)
-    assert not _run._ends_by_factors(dataclasses.replace(here, linearised=without))
     monkeypatch.setattr(_run, "_FEW_HEIGHTS", here.problem.basis.base.size - 1)
     assert not _run._ends_by_factors(here)

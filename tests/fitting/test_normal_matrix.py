@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse.linalg
-from small_fits import EVERYTHING, SETTINGS, SIZE, TRUTH, dense, expanded, pictures, rms, scenes
+from small_fits import EVERYTHING, SETTINGS, SIZE, TRUTH, dense, edges_in, expanded, pictures, rms, scenes
 
 import jaxhf
 from jaxhf.fitting.model import normal_matrix as _normal_matrix
 from jaxhf.fitting.model.expansion import Expansion, prior_residuals
-from jaxhf.fitting.model.linearise import LinearisedEdges
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row, near_inverse
 from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
 from jaxhf.fitting.model.surface import Window
@@ -35,13 +34,10 @@ EACH = pytest.mark.parametrize(
     "prior", [*(pytest.param(name, marks=pytest.mark.deep) for name in PRIORS if name != BOTH), BOTH]
 )
 # What single precision leaves; double leaves no room for an error that it would hide.
-PRECISIONS = pytest.mark.parametrize(
-    "rounding", [3e-4, pytest.param(1e-9, marks=[pytest.mark.x64, pytest.mark.deep])], ids=["single", "double"]
-)
+DOUBLE = [pytest.param(name, 1e-9, marks=[pytest.mark.x64, pytest.mark.deep]) for name in PRIORS]
 
 
-@PRECISIONS
-@EACH
+@pytest.mark.parametrize(("prior", "rounding"), [(BOTH, 3e-4), *DOUBLE])
 def test_it_is_the_square_of_the_derivative(prior, rounding):
     """Of all residuals in all unknowns; so is the gradient of their squares. What holds heights gives them no row."""
     if prior == "none" and rounding < 1e-6:
@@ -132,7 +128,7 @@ FIELD = jaxhf.Unknown(albedo="map", albedo_std=0.3, albedo_length=0.2, exposures
 DRAWS = {
     "by factors": {"prior": PRIORS["correlated, some held"]},
     "by modes": {"prior": PRIORS["independent, some held"]},
-    "everything": {"prior": PRIORS["correlated"], "unknown": EVERYTHING},
+    "everything": {"prior": PRIORS["correlated, some held"], "unknown": EVERYTHING},
     "field of the albedo map": {"prior": PRIORS["correlated"], "unknown": FIELD},
     "map of the albedo": {"prior": PRIORS["correlated"], "unknown": jaxhf.Unknown(albedo="map", exposures=True)},
 }
@@ -216,8 +212,7 @@ def test_boundaries_that_stand_elsewhere_widen_deviations(displacement, by_noise
 def test_values_of_pixels_on_boundaries_are_found(monkeypatch):
     """In the order of rows: picture by picture. How far heights move them is the norm of their row of the derivative."""
     here = expanded(scenes(TRUTH), pictures(), **OPTIONS)
-    none, resampled = jnp.zeros((3, 1), np.int32), jnp.array([[5], [7], [9]])
-    edges = LinearisedEdges(jnp.zeros((3, 1, 1, 5, 1)), jnp.zeros((3, 1, 5, 1), np.int32), none, none, resampled)
+    edges = edges_in(np.zeros((3, 1)), np.zeros((3, 1)), [[5], [7], [9]])
     (known,), rows = here.linearised, pictures_by_heights(here)
     assert known is not None
     assert rows is not None
