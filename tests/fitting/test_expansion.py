@@ -116,6 +116,8 @@ def test_products_are_those_of_the_derivative_of_render(settings, channels, prec
     monkeypatch.setattr("jaxhf.fitting.model.linearise._POINTS_PER_PIXEL", 64)  # then as many are resampled as by `render`
     here, rounding = moved_expansion(settings, channels, unknown), ROUNDING[precision]
     others = here.unknowns.without_modes()
+    assert others.albedo is not None
+    assert others.albedo.shape == (*TEXELS.shape[:2], 1 if unknown.albedo_shared else max(channels))
     rng = np.random.default_rng(3)
 
     def drawn(tree: Any) -> Any:
@@ -149,9 +151,9 @@ PAINTED = TEXELS.astype(np.float32)
 ALBEDOS = {
     "one factor": (0.7, "constant", 3, True),
     "one factor of a texture": (jaxhf.ImageTexture(PAINTED), "constant", 1, False),
-    "vertices": (0.7, "map", 1, False),
+    "vertices": (0.7, "map", 3, True),
     "texels that repeat": (jaxhf.ImageTexture(PAINTED), "map", 3, False),
-    "texels that end": (jaxhf.ImageTexture(PAINTED, wrap="clamp"), "map", 3, True),
+    "texels that end": (jaxhf.ImageTexture(PAINTED, wrap="clamp"), "map", 1, False),
     "texels at vertices": (jaxhf.ImageTexture(PAINTED, at_vertices=True), "map", 3, False),
 }
 

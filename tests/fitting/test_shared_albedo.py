@@ -16,7 +16,6 @@ FACTORS = np.exp(fractal([12, 12], seed=9, exponent=2.0, range=(-0.4, 0.4)))[:, 
 ONE = np.full((1, 1, 1), 0.8, np.float32)
 KINDS: dict[str, tuple[Any, np.ndarray, dict[str, Any]]] = {  # how the albedo is known, the factors in truth, what is sought
     "a number": ((0.5, 0.7, 0.3), ONE, {"albedo": "constant"}),
-    "a number for each vertex": ((0.5, 0.7, 0.3), FACTORS, {"albedo": "map", "albedo_std": 0.3}),
     "texels": (COLOURS, FACTORS, {"albedo": "map", "albedo_std": 0.3}),
     "texels that hang together": (COLOURS, FACTORS, {"albedo": "map", "albedo_std": 0.3, "albedo_length": 0.5}),
 }
@@ -38,9 +37,8 @@ def found(kind: str, seed: int, shared: bool, **options: Any) -> jaxhf.Fit:
     return jaxhf.fit(scenes(albedo=albedo), targets, unknown=unknown, settings=SETTINGS, noise=NOISE, prior=PRIOR, **options)
 
 
-@pytest.mark.parametrize(
-    "kind", ["texels", *(pytest.param(kind, marks=pytest.mark.deep) for kind in KINDS if kind != "texels")]
-)
+@pytest.mark.deep  # test_expansion.py has their derivatives
+@pytest.mark.parametrize("kind", KINDS)
 def test_factors_that_channels_share_are_found(kind):
     """Three times as many values tell each: where it stands for itself it is √3 times nearer; the heights are no worse.
 
