@@ -49,8 +49,9 @@ def test_another_size_needs_no_other_program(traced):
     assert (traced, counts) == ([], [1600])
 
 
-@pytest.mark.parametrize("kind", [jaxhf.Perspective, jaxhf.Orthographic])
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    ("kind", "size"), list(zip((jaxhf.Perspective, jaxhf.Orthographic, jaxhf.Perspective), SIZES, strict=True))
+)
 def test_pictures_and_aovs_are_those_of_a_program_for_their_size(kind, size, monkeypatch):
     """Up to rounding: XLA may divide by a size that it knows in another way."""
     of_its_size = seen(scene(kind=kind), *size)

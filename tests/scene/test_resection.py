@@ -115,8 +115,8 @@ def test_a_picture_from_700_km_shows_points_at_their_pixels(kind):
 
     camera: Any = kind.from_points(points, pixels(points), width=64, height=48, max_error=1e-6)
     field = jaxhf.Heightfield(heights, cell, cell, *corner)
-    scene = jaxhf.Scene([jaxhf.Object(field)], camera, [jaxhf.Directional((0, 0, 1))])
-    _, aovs = jaxhf.render(scene, aovs=("status", "uv", "cell"))
+    scene = jaxhf.Scene([jaxhf.Object(field)], camera)
+    _, aovs = jaxhf.render(scene, jaxhf.Settings(shading="flat"), aovs=("status", "uv", "cell"))
     met = np.asarray(aovs["status"]) == jaxhf.Status.HIT
     u, v = np.asarray(aovs["uv"], np.float64)[met].T
     ix, iy = np.asarray(aovs["cell"])[met].T

@@ -247,8 +247,8 @@ def test_a_picture_through_intrinsics_shows_points_at_their_pixels():
     pitch = np.array([[1, 0, 0], [0, -np.sin(a), -np.cos(a)], [0, np.cos(a), -np.sin(a)]])
     rotation = pitch @ np.array([[np.cos(b), -np.sin(b), 0], [np.sin(b), np.cos(b), 0], [0, 0, 1]])
     camera = calibrated(rotation, t := np.array([0.3, -0.2, 9.0]))
-    shown = jaxhf.Scene([jaxhf.Object(heightfield(ground, np.float32))], camera, [jaxhf.Directional((0, 0, 1))])
-    _, aovs = jaxhf.render(shown, aovs=("status", "uv", "depth"))
+    shown = jaxhf.Scene([jaxhf.Object(heightfield(ground, np.float32))], camera)
+    _, aovs = jaxhf.render(shown, jaxhf.Settings(shading="flat"), aovs=("status", "uv", "depth"))
     met = np.asarray(aovs["status"]) == jaxhf.Status.HIT
     points = ground.points(*(16 * np.asarray(aovs["uv"], float)[met]).T)
     middles = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5), axis=-1)[met]
