@@ -45,9 +45,15 @@ def directions(seed: int) -> np.ndarray:
     return (d / np.linalg.norm(d, axis=1)[:, None]).astype(np.float32).astype(np.float64)
 
 
-@pytest.mark.parametrize("times", [1, pytest.param(10, marks=pytest.mark.deep)])
 @pytest.mark.parametrize("heights", [LEVEL, TILTED], ids=["level", "tilted"])
-@aimed.PRECISIONS
+@pytest.mark.parametrize(
+    ("dtype", "times"),
+    [
+        (np.float32, 1),
+        pytest.param(np.float32, 10, marks=pytest.mark.deep),
+        pytest.param(np.float64, 10, marks=[pytest.mark.deep, pytest.mark.x64]),
+    ],
+)
 def test_a_plane_is_left_for_good(heights, dtype, times):
     """1000 hits x 100 directions, or 1000, to both sides of the plane: nothing meets it again."""
     field, hit = hits_all_over(aimed.Ground(heights, dx=0.3, dy=2.0), dtype, 0.0)
