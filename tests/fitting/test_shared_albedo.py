@@ -16,6 +16,7 @@ FACTORS = np.exp(fractal([12, 12], seed=9, exponent=2.0, range=(-0.4, 0.4)))[:, 
 ONE = np.full((1, 1, 1), 0.8, np.float32)
 KINDS: dict[str, tuple[Any, np.ndarray, dict[str, Any]]] = {  # how the albedo is known, the factors in truth, what is sought
     "a number": ((0.5, 0.7, 0.3), ONE, {"albedo": "constant"}),
+    "a number for each vertex": ((0.5, 0.7, 0.3), FACTORS, {"albedo": "map", "albedo_std": 0.3}),
     "texels": (COLOURS, FACTORS, {"albedo": "map", "albedo_std": 0.3}),
     "texels that hang together": (COLOURS, FACTORS, {"albedo": "map", "albedo_std": 0.3, "albedo_length": 0.5}),
 }
