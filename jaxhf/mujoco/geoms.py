@@ -117,7 +117,7 @@ class Geoms(eqx.Module):
         """Geoms of a model, where they stand while no joint has moved; see `at` for where they are then.
 
         Args:
-          model: a `mujoco.MjModel`, or what has its arrays, as MJX's model.
+          model: as for `HField.from_model`.
           geoms: numbers, or names where the model knows names; None: all that `mj_ray` sees, so all that are not transparent
             altogether. A sensor sees the robot that it is mounted on, unless that is left out here.
 
@@ -150,10 +150,11 @@ class Geoms(eqx.Module):
         Height fields that no joint moves stay as they are. One that moves is made anew, and of a batch of data copied for each.
 
         Args:
-          data: a `mujoco.MjData`, or MJX's data, or a batch of these, after a step or `mj_forward`.
+          data: a `mujoco.MjData`, or MJX's data, or a batch of these, after a step or `mj_forward`. Where height fields are
+            a batch, each with terrain of its own, the data are one with the same axes.
 
         Raises:
-          ValueError: the data have no `geom_xpos` and `geom_xmat`, or not of so many geoms; or these geoms are a batch already.
+          ValueError: the data have no `geom_xpos` and `geom_xmat`, or not of so many geoms, or not the axes of these geoms.
         """
         xpos, xmat = (getattr(data, name, ()) for name in ("geom_xpos", "geom_xmat"))
         shape: tuple[int, ...] = np.shape(xpos)
@@ -163,17 +164,18 @@ class Geoms(eqx.Module):
         if shape[-2] <= max(self.ids):
             rule = f"must have the geoms of the model that these are from, {max(self.ids)} among them, it has {shape[-2]}"
             raise ArgumentError("Geoms.at", "data", rule)
-        if self.batch:
-            rule = f"must place geoms without a batch, as from_model returns them, theirs is {self.batch}"
-            raise ArgumentError("Geoms.at", "data", rule)
         batch, count, fields = shape[:-2], len(self.hfields), []
+        if self.batch not in ((), batch):
+            rule = f"must have the axes {self.batch} of the geoms, geom_xpos has shape {shape}"
+            raise ArgumentError("Geoms.at", "data", rule)
         pos, quat = _poses(array_leaf(xpos, self.dtype), array_leaf(xmat, self.dtype), np.array(self.ids))
         for k, (field, fixed) in enumerate(zip(self.hfields, self.fixed, strict=True)):
             if fixed:
                 fields.append(field)
                 continue
-            grid: Any = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), field._grid)
-            copies = jnp.broadcast_to(field.data, (*batch, *field.data.shape))
+            copies, grid = field.data, field._grid
+            if not field.batch:
+                copies, grid = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), (copies, grid))
             moved = HField(copies, field.size, pos[..., k, :], quat[..., k, :])
             fields.append(eqx.tree_at(lambda field: field._grid, moved, grid, is_leaf=lambda leaf: leaf is None))
         places = self.pos, self.quat

@@ -105,7 +105,7 @@ class HField(eqx.Module):
         """The height field of a geom, where it stands while no joint has moved.
 
         Args:
-          model: a `mujoco.MjModel`, or what has its arrays, as MJX's model.
+          model: a `mujoco.MjModel`, or what has its arrays, as MJX's model. Leading axes of MJX's `hfield_data` are a batch.
           geom: its number; or its name, where the model knows names.
 
         Raises:

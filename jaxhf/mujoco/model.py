@@ -67,12 +67,13 @@ def geom_pose(model: Any, number: int) -> tuple[np.ndarray, np.ndarray]:
     return pos, quat
 
 
-def hfield_numbers(model: Any, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Data (nrow, ncol) and size of a geom that is a height field."""
+def hfield_numbers(model: Any, number: int) -> tuple[Any, np.ndarray]:
+    """Data (..., nrow, ncol) and size of a geom that is a height field; MJX's models may hold a batch, and `jit` trace them."""
     asset = int(model.geom_dataid[number])
     nrow, ncol, first = (int(array[asset]) for array in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
-    data = np.array(model.hfield_data[first : first + nrow * ncol]).reshape(nrow, ncol)
-    return data, np.array(model.hfield_size[asset], np.float64)
+    data = model.hfield_data[..., first : first + nrow * ncol]
+    data = data.copy() if isinstance(data, np.ndarray) else data  # a simulation may write to its own later
+    return data.reshape(*data.shape[:-1], nrow, ncol), np.array(model.hfield_size[asset], np.float64)
 
 
 def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

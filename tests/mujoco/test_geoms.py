@@ -328,7 +328,7 @@ FIELD = HField(heights(3, 3), SIZE)
         (lambda: box(ids=5), "Geoms: ids must be several, in a list, it is an int"),
         (lambda: box(ids=("a",)), r"Geoms: ids\[0\] must be a whole number from 0 on, it is 'a'"),
         (lambda: box(size=[(1, 2), (3,)]), "Geoms: size must be numbers, it is a list"),
-        (lambda: box(pos=np.zeros((3, 1, 3))).at(DATA), "Geoms.at: data must place geoms without a batch"),
+        (lambda: box(pos=np.zeros((3, 1, 3))).at(DATA), r"Geoms.at: data must have the axes \(3,\) of the geoms"),
         (lambda: lidar(FIELD, np.zeros(3), (1.0, 0, 0, 0), noise=0.1, key=cast("jax.Array", 3)), "lidar: key must be"),
         (lambda: Geoms.from_model(MODEL, [99]), r"Geoms.from_model: geoms must be a number from 0 to \d+, it is 99"),
         (lambda: box().at(MODEL), "Geoms.at: data must be a simulation's, .*, it is a MjModel"),
