@@ -19,7 +19,7 @@ from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
 from ..core.types import Index, Scalar
-from ..trace.edges import present_edges, whole_cells
+from ..trace.edges import STEPS, present_edges, whole_cells
 from ..xla.devices import map_over
 from .crossings import TOGETHER, Crossings, crossings_of
 
@@ -127,17 +127,27 @@ def over_tiles(
     numbered: bool = False,
     besides: Besides | None = None,
 ) -> tuple[jax.Array, jax.Array | None]:
-    """As `over_horizon`, for some of the tiles, without a derivative; also in holes. Besides, the entries that were found."""
+    """As `over_horizon`, for some of the tiles, without a derivative, and with any values in holes. Besides, the entries that
+    were found."""
     columns = math.ceil((view.heights.shape[1] - 2 * _MARGIN - TILE) / TILE)
 
     def one_tile(shared: tuple["HorizonView", Scalar, Besides | None], number: Index) -> tuple[jax.Array, jax.Array | None]:
         view, lowest, besides = shared
         x, y = (number % columns) * TILE, (number // columns) * TILE
         ways = jnp.arange(view.end.shape[0], dtype=jnp.int32)
-        slopes, found = lax.map(lambda way: _from_tile(view, way, x, y, lowest, numbered), ways)
-        if besides is not None:
-            besides = besides._replace(at_vertices=jax.tree.map(lambda values: _tile_of(values, x, y), besides.at_vertices))
-        return _summarised(summary, slopes, besides), found
+
+        def searched() -> tuple[jax.Array, jax.Array | None]:
+            slopes, found = lax.map(lambda way: _from_tile(view, way, x, y, lowest, numbered), ways)
+            at_tile = besides
+            if besides is not None:
+                at_tile = besides._replace(at_vertices=jax.tree.map(lambda values: _tile_of(values, x, y), besides.at_vertices))
+            return _summarised(summary, slopes, at_tile), found
+
+        def nothing() -> tuple[jax.Array, jax.Array | None]:
+            return jax.tree.map(lambda form: jnp.full(form.shape, -1, form.dtype), jax.eval_shape(searched))
+
+        heights = lax.dynamic_slice(view.heights, (y + _MARGIN, x + _MARGIN), (TILE, TILE))
+        return lax.cond(jnp.isnan(heights).all(), nothing, searched)
 
     return map_over(mesh, one_tile, (view, lowest, besides), numbers)
 
@@ -166,7 +176,7 @@ class HorizonView(eqx.Module):
       heights: with a margin, nan beyond the grid.
       edges: for each kind, heights at the first vertices of edges, with a margin; nan where no cell of the surface has it.
       windows: the highest vertex of squares that begin at every multiple of `_GRAIN`, from `_reach()` of them before the grid.
-      holed: whether these have a hole.
+      holed: whether in one of these a vertex, or an edge from there, has heights but no cell: not along straight borders.
       crossings: of each direction.
       bounds: between stretches, the horizontal distances.
       begins: the first of the groups of crossings that are beyond each.
@@ -204,10 +214,14 @@ class HorizonView(eqx.Module):
             # One cell less: a hole beside an edge takes a cell from it.
             return crossings, bounds, begins, end, jnp.floor(jnp.minimum(ends[:-1], ends[1:])).astype(jnp.int32) - 1
 
-        hole = jnp.isnan(z)
         heights = jnp.pad(z, margin, constant_values=jnp.nan)
-        edges = jnp.pad(_edges(z), ((0, 0), *margin), constant_values=jnp.nan)
-        highest, holed = _windows(jnp.where(hole, -jnp.inf, z)), _windows(jnp.where(hole, 0, -jnp.inf).astype(dtype)) == 0
+        of_kind = _edges(z)
+        edges = jnp.pad(of_kind, ((0, 0), *margin), constant_values=jnp.nan)
+        lost = (jnp.isnan(of_kind) & ~jnp.isnan(z)[None] & ~jnp.isnan(_second_vertices(z))).any(0)
+        highest, holed = (
+            _windows(jnp.where(jnp.isnan(z), -jnp.inf, z)),
+            _windows(jnp.where(lost, 0, -jnp.inf).astype(dtype)) == 0,
+        )
         return HorizonView(heights, edges, highest, holed, *lax.map(along, directions))
 
 
@@ -281,6 +295,13 @@ def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
     whole = jnp.pad(whole_cells(z), 1)
     at_vertex = whole[1:, 1:] | whole[1:, :-1] | whole[:-1, 1:] | whole[:-1, :-1]
     return jnp.where(jnp.concatenate([present_edges(z), at_vertex[None]]), z[None], jnp.nan)
+
+
+def _second_vertices(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
+    """For each kind, heights at the second vertices of edges; nan beyond the grid."""
+    ny, nx = z.shape
+    further = jnp.pad(z, ((0, 1), (0, 1)), constant_values=jnp.nan)
+    return jnp.stack([further[y : y + ny, x : x + nx] for x, y in (*STEPS, (0, 0))])
 
 
 def _reach() -> int:
