@@ -10,6 +10,7 @@ from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import largest_component
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit
+from ..trace.pyramid import beyond
 from ..trace.triangle import value_at
 from ..trace.walk import reciprocal
 from ..trace.walk_start import place_on_grid
@@ -50,8 +51,8 @@ def make_ceiling(grid: Grid, towards: Vector) -> Ceiling:
     """
     grid, towards = lax.stop_gradient((grid, towards))
     z = grid.z
-    cells_y, cells_x = (n - 1 for n in z.shape)
-    eps, most = float(jnp.finfo(z.dtype).eps), max(cells_x, cells_y)
+    (cells_x, cells_y), longest = grid.cells, max(z.shape) - 1
+    eps, most = float(jnp.finfo(z.dtype).eps), jnp.maximum(*grid.extent)
     d = grid.grid_from_world.vector(towards)
     d = d / largest_component(d)
     columns = jnp.abs(d[0]) > jnp.abs(d[1])
@@ -66,32 +67,34 @@ def make_ceiling(grid: Grid, towards: Vector) -> Ceiling:
     z00, z10, z01, z11 = z[:-1, :-1], z[:-1, 1:], z[1:, :-1], z[1:, 1:]
     near, far = jnp.maximum(z00, jnp.where(columns, z01, z10)), jnp.maximum(z11, jnp.where(columns, z10, z01))
     needed = jnp.maximum(near, far - rise) + eps * ((64 + 4 * most) * grid.z_top + 8 * most * jnp.abs(rise))
-    needed = jnp.where(faces, -jnp.inf, jnp.where(jnp.isnan(needed), jnp.inf, needed))
+    needed = jnp.where(faces | beyond(needed.shape, grid.cells), -jnp.inf, jnp.where(jnp.isnan(needed), jnp.inf, needed))
 
     def swept(needed: jax.Array) -> tuple[jax.Array, jax.Array]:
-        heights, first = _sweep(needed, back, across, d[2], 8 * eps * most)
+        heights, first = _sweep(needed, strips, back, across, d[2], 8 * eps * most)
         return heights.reshape(-1), first
 
-    if cells_x == cells_y:
+    strips = jnp.where(columns, cells_x, cells_y)
+    if z.shape[0] == z.shape[1]:
         heights, first = swept(lax.cond(columns, jnp.transpose, lambda needed: needed, needed))
     else:
-        length = cells_x * cells_y + 3 * most
+        length = needed.size + 3 * longest
 
         def padded(needed: jax.Array) -> tuple[jax.Array, jax.Array]:
             heights, first = swept(needed)
-            return jnp.pad(heights, (0, length - heights.size)), jnp.pad(first, (0, most - first.size))
+            return jnp.pad(heights, (0, length - heights.size)), jnp.pad(first, (0, longest - first.size))
 
         heights, first = lax.cond(columns, lambda needed: padded(needed.T), padded, needed)
     return Ceiling(heights, first, columns, back, across, rise)
 
 
 def _sweep(
-    needed: Float[jax.Array, "n m"], back: Flag, across: Scalar, rise: Scalar, wide: float
+    needed: Float[jax.Array, "n m"], count: Index, back: Flag, across: Scalar, rise: Scalar, wide: Scalar
 ) -> tuple[Float[jax.Array, "n bins"], Int[jax.Array, " n"]]:
     """What a ray needs in each bin of a strip to clear what is needed there and ahead, and the column of the bin at 0.
 
     Args:
       needed: in each cell of each strip; -inf where a cell blocks no ray.
+      count: of strips; those behind hold nothing.
       back: whether the last strip comes first on the way to the light; in the result the first does.
       across: cells by which the light moves along a strip while it crosses it, -1 to 1.
       rise: of the light meanwhile.
@@ -105,7 +108,8 @@ def _sweep(
         end = begin + across
         first = jnp.floor(jnp.minimum(begin, end) - wide).astype(jnp.int32)
         more = jnp.floor(1 + jnp.maximum(begin, end) + wide).astype(jnp.int32) - first  # cells than the first, 1 to 3
-        row = lax.dynamic_index_in_dim(needed, jnp.where(back, strips - 1 - strip, strip), keepdims=False)
+        number = jnp.where(back, (count - 1 - strip) % strips, strip)  # those that hold nothing stay behind
+        row = lax.dynamic_index_in_dim(needed, number, keepdims=False)
         row = lax.pad(row, nothing, [(3, 3, 0)])
         beside = [row[k : k + cells + 3] for k in range(4)]
         bins = lax.dynamic_slice_in_dim(lax.pad(bins, nothing, [(1, 1, 0)]), 1 + before - first, cells + 3) - rise

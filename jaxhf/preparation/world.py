@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ from ..core.ray import Ray
 from ..core.settings import Settings
 from ..core.types import Flag, Index, MatrixLeaf, Scalar
 from ..core.vector import unit
-from ..scene.heightfield import Heightfield
+from ..scene.heightfield import Heightfield, Size
 from ..scene.light import Directional, Light, Sun
 from ..scene.material import Material, Mirror
 from ..scene.scene import Scene, Shape
@@ -77,10 +78,13 @@ def resolve_settings(settings: Settings, scene: Scene) -> Settings:
     return dataclasses.replace(settings, samples=side**2, edge_samples=settings.edge_samples or 0)
 
 
-def make_world(scene: Scene, settings: Settings) -> World:
-    """Prepares what does not depend on the ray; `scene` must be `localise`d."""
+def make_world(scene: Scene, settings: Settings, sizes: Sequence[Size | None] | None = None) -> World:
+    """Prepares what does not depend on the ray; `scene` must be `localise`d. `sizes`: of objects whose size is data."""
     settings = resolve_settings(settings, scene)
-    surfaces = tuple(make_surface(obj.shape, obj.world_from_object, settings) for obj in scene.objects)
+    sizes = sizes or [None] * len(scene.objects)
+    surfaces = tuple(
+        make_surface(obj.shape, obj.world_from_object, settings, size) for obj, size in zip(scene.objects, sizes, strict=True)
+    )
     azimuths = scene.sky_occlusion
     return World(
         surfaces=surfaces,
@@ -114,12 +118,12 @@ def _make_ceiling(surface: Surface, light: Light, wanted: bool) -> Ceiling | Non
     return make_ceiling(surface, unit(light.towards))
 
 
-def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: Settings) -> Surface:
+def make_surface(shape: Shape, world_from_object: MatrixLeaf | None, settings: Settings, size: Size | None = None) -> Surface:
     """A shape made ready for tracing."""
     world = None if world_from_object is None else affine(jnp.asarray(world_from_object))
     if isinstance(shape, Heightfield):
-        return make_grid(shape, world, settings)
-    return make_walls(shape, world) if isinstance(shape, Skirt) else make_tube(shape, world)
+        return make_grid(shape, world, settings, size)
+    return make_walls(shape, world, size) if isinstance(shape, Skirt) else make_tube(shape, world)
 
 
 def first_hit(

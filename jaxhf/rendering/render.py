@@ -16,15 +16,21 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
-from ..preparation.any_size import roomy_ceilings, with_room
+from ..preparation.any_size import (
+    Rooms,
+    in_room,
+    make_roomy_ceilings,
+    make_roomy_world,
+    surfaces_and_rooms,
+    with_shapes_of,
+)
 from ..preparation.localise import anchor, localise, localise_camera, localise_lights, precision
-from ..preparation.world import Ceilings, World, make_ceilings, make_world, resolve_settings
+from ..preparation.world import World, make_world, resolve_settings
 from ..scene.camera import Camera
-from ..scene.heightfield import Heightfield
+from ..scene.heightfield import Heightfield, Size
 from ..scene.light import Light
 from ..scene.scene import Scene
 from ..trace.grid import Grid, make_grid
-from ..trace.intersect import Surface
 from ..xla.compilation import compiled, is_traced
 from ..xla.devices import (
     chosen_mesh,
@@ -100,7 +106,8 @@ class Prepared(eqx.Module):
             return prepare(self.scene.with_lights(scene.lights), self.settings, mesh=self.mesh)
         local = localise_lights(scene.lights, np.array(self._origin), precision(self._form))
         local = on_every_device(local, prepared_mesh("with_lights", self.mesh, None, local))
-        ceilings = _make_ceilings(self._world.surfaces, local, self.settings, has_room=self._world.has_room)
+        surfaces, rooms = surfaces_and_rooms(self._world)
+        ceilings = _make_ceilings(surfaces, local, rooms=rooms, settings=self.settings)
         world = dataclasses.replace(self._world, lights=local, ceilings=ceilings)
         return dataclasses.replace(self, _world=world, _given=_Given(self._given.scene and scene))
 
@@ -259,23 +266,22 @@ def heightfield_grids(heights: Float[jax.Array, "m ny nx"], dx: float, dy: float
     return lax.map(lambda z: make_grid(Heightfield(z, dx, dy), None, settings), heights)
 
 
-@functools.partial(compiled, static_argnames=("settings", "has_room"))
-def _make_ceilings(surfaces: tuple[Surface, ...], lights: tuple[Light, ...], settings: Settings, has_room: bool) -> Ceilings:
-    ceilings = make_ceilings(surfaces, lights, settings)
-    return roomy_ceilings(surfaces, ceilings) if has_room else ceilings
+_make_ceilings = compiled(make_roomy_ceilings, static_argnames=("rooms", "settings"))
 
 
-def _made_world(scene: Scene, settings: Settings, has_room: bool) -> World:
-    world = make_world(scene, settings)
-    return with_room(world) if has_room else world
+def _made_world(scene: Scene, sizes: tuple[Size | None, ...], rooms: Rooms | None, settings: Settings) -> World:
+    return make_world(scene, settings) if rooms is None else make_roomy_world(scene, sizes, rooms, settings)
 
 
-_make_world = compiled(_made_world, static_argnames=("settings", "has_room"))
-_make_world_with_horizons = compiled(_made_world, newer=True, static_argnames=("settings", "has_room"))
+_make_world = compiled(_made_world, static_argnames=("rooms", "settings"))
+_make_world_with_horizons = compiled(_made_world, newer=True, static_argnames=("rooms", "settings"))
 
 
 def prepared_world(scene: Scene, settings: Settings) -> World:
     """Of a `localise`d scene, by one program for all cameras; with room, where programs of its own are to trace it."""
     make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
-    scene = unfolded(scene) if is_traced() else scene
-    return make(eqx.tree_at(lambda scene: scene.camera, scene, None), settings=settings, has_room=not is_traced())
+    if is_traced():
+        scene = eqx.tree_at(lambda scene: scene.camera, unfolded(scene), None)
+        return make(scene, (), rooms=None, settings=settings)
+    seen, sizes, rooms = in_room(scene, settings)
+    return with_shapes_of(scene, make(seen, sizes, rooms=rooms, settings=settings))

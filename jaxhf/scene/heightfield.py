@@ -6,7 +6,7 @@ from typing import Any, SupportsFloat
 import equinox as eqx
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError, require_kind
 from ..core.types import AnyArray, height_leaf
@@ -20,6 +20,29 @@ _FARTHEST = 1e18  # whose square and inverse square are numbers in single precis
 def next_power_of_two(count: int) -> int:
     """The least power of two that is at least 2 and `count`."""
     return 1 << max(1, (count - 1).bit_length())
+
+
+class Size(eqx.Module):
+    """That of a heightfield as data, for a program that serves several; its heights then have an array with holes behind them.
+
+    Attributes:
+      cells: along x and along y.
+      spacing: dx and dy.
+      lengths: of the footprint, x and y.
+    """
+
+    cells: Int[AnyArray, "2"]
+    spacing: Float[AnyArray, "2"]
+    lengths: Float[AnyArray, "2"]
+
+    @classmethod
+    def of(cls, shape: tuple[int, int], dx: float, dy: float, dtype: Any) -> "Size":
+        """Of a grid of (ny, nx) vertices."""
+        ny, nx = shape
+        cells: Any = np.array([nx - 1, ny - 1], np.int32)
+        spacing: Any = np.array([dx, dy], dtype)
+        lengths: Any = np.array([(nx - 1) * dx, (ny - 1) * dy], dtype)
+        return cls(cells, spacing, lengths)
 
 
 class Heightfield(eqx.Module):

@@ -75,18 +75,21 @@ class FlatTexture(eqx.Module):
     """
 
     texels: Float[AnyArray, "n 3"]
-    h: Index
-    w: Index
+    h: Int[AnyArray, ""]
+    w: Int[AnyArray, ""]
     at_vertices: bool = eqx.field(static=True)
     wrap: Wrap = eqx.field(static=True)
 
     @classmethod
-    def of(cls, image: ImageTexture) -> "FlatTexture":
-        h, w, _ = image.texels.shape
-        return cls(jnp.asarray(image.texels).reshape(-1, 3), jnp.int32(h), jnp.int32(w), image.at_vertices, image.wrap)
+    def of(cls, image: ImageTexture, texels: Float[AnyArray, "n 3"]) -> "FlatTexture":
+        """The image, whose texels these are."""
+        h: Any
+        w: Any
+        h, w = (np.array(n, np.int32) for n in image.texels.shape[:2])
+        return cls(texels, h, w, image.at_vertices, image.wrap)
 
     def __call__(self, uv: Point2) -> Vector:
-        between = _between(uv, self.h, self.w, self.at_vertices, self.wrap)
+        between = _between(uv, jnp.asarray(self.h), jnp.asarray(self.w), self.at_vertices, self.wrap)
         return _mixed(between, lambda row, column: self.texels[row * self.w + column])
 
 

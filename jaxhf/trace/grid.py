@@ -15,7 +15,7 @@ from ..core.errors import UserError
 from ..core.settings import Settings
 from ..core.types import MOST_PLACES, Flag, Index, Scalar
 from ..core.vector import floor_to_power_of_two
-from ..scene.heightfield import Heightfield
+from ..scene.heightfield import Heightfield, Size
 from .normals import vertex_normals
 from .pyramid import Pyramid, enough_steps, levels_of, make_pyramid
 from .triangle import Corners, plane_through, triangle_corners
@@ -81,10 +81,12 @@ class Grid(eqx.Module):
         return self.cells[0] + 1
 
 
-def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Settings) -> Grid:
+def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Settings, size: Size | None = None) -> Grid:
     """Prepares `field` for tracing: dense array arithmetic, differentiable in the heights and in the transform.
 
     Its x0 and y0 must be 0, see `localise`. The scheme of its normals and the levels of its bounds are those of the settings.
+    With a `size` that is data, beyond which its heights are holes, only the `known_shape` and the order of what is flat are
+    those of the array; each side of that must round up to the same power of two as the size's.
     """
     heights = jnp.asarray(field.heights)
     (ny, nx), dtype = heights.shape, heights.dtype
@@ -97,7 +99,10 @@ def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Se
     z = jnp.where(finite, heights / unit_height - lowest / unit_height, jnp.nan)
     z_top = jnp.max(lax.stop_gradient(jnp.where(finite, z, 0)))
 
-    cell = jnp.stack([jnp.full((), field.dx, dtype), jnp.full((), field.dy, dtype), unit_height])
+    (cells_x, cells_y), (dx, dy) = (nx - 1, ny - 1), (field.dx, field.dy)
+    if size is not None:
+        (cells_x, cells_y), (dx, dy) = size.cells, size.spacing
+    cell = jnp.stack([jnp.full((), dx, dtype), jnp.full((), dy, dtype), unit_height])
     ground = jnp.stack([jnp.zeros((), dtype), jnp.zeros((), dtype), lowest])
     if world_from_object is None:
         world_from_grid = Affine(jnp.diag(cell), ground)
@@ -109,12 +114,13 @@ def make_grid(field: Heightfield, world_from_object: Affine | None, settings: Se
         grid_from_world = Affine(object_from_world.linear / cell[:, None], (object_from_world.offset - ground) / cell)
     normals = None
     if settings.shading == "smooth":
-        normals = _at_seam(field, vertex_normals(heights, field.dx, field.dy, settings.normals or "six")).reshape(-1, 3)
+        normals = _at_seam(field, vertex_normals(heights, dx, dy, settings.normals or "six")).reshape(-1, 3)
     levels = 0 if settings.traversal == "dda" else levels_of((ny, nx))
-    pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels)
-    most = enough_steps(nx - 1, ny - 1, levels)
-    most = most if settings.max_steps is None else min(settings.max_steps, most)
-    cells, extent = ((jnp.asarray(nx - 1, kind), jnp.asarray(ny - 1, kind)) for kind in (jnp.int32, dtype))
+    cells, extent = ((jnp.asarray(cells_x, kind), jnp.asarray(cells_y, kind)) for kind in (jnp.int32, dtype))
+    pyramid = make_pyramid(lax.stop_gradient(z), z_top, levels, cells)
+    most: Any = enough_steps(cells_x, cells_y, levels)
+    if settings.max_steps is not None:
+        most = min(settings.max_steps, most) if size is None else jnp.minimum(settings.max_steps, most)
     return Grid(
         z.reshape(-1), z_top, pyramid, normals, world_from_grid, grid_from_world, object_from_world,
         cells, extent, (ny, nx), jnp.int32(most), None if settings.early_exit else most,

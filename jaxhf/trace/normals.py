@@ -7,7 +7,7 @@ from jax import lax
 from jaxtyping import Float
 
 from ..core.settings import NormalScheme
-from ..core.types import AnyArray
+from ..core.types import AnyArray, Scalar
 from ..core.vector import floor_to_power_of_two, quotient
 from ..xla.materialise import materialise
 
@@ -19,7 +19,7 @@ _FANS = {
 
 
 def vertex_normals(
-    heights: Float[AnyArray, "ny nx"], dx: float, dy: float, scheme: NormalScheme
+    heights: Float[AnyArray, "ny nx"], dx: float | Scalar, dy: float | Scalar, scheme: NormalScheme
 ) -> Float[jax.Array, "ny nx 3"]:
     """Normals at the vertices, shape (ny, nx, 3), on the +z side; their lengths are the weights of the interpolation.
 

@@ -1,12 +1,12 @@
 """Bounds of the heights over square blocks of cells, at every size: a min-max quadtree in the form of a mip chain."""
 
-import math
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ..core.types import Flag, Index, Scalar
 from ..scene.heightfield import next_power_of_two
@@ -61,13 +61,14 @@ def levels_of(shape: tuple[int, ...]) -> int:
     return next_power_of_two(min(shape) - 1).bit_length() - 1
 
 
-def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int) -> Pyramid:
+def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int, cells: tuple[Index, Index]) -> Pyramid:
     """Builds the bounds by dense reductions: no loop on the host, and none over the cells.
 
     Args:
       z: heights, 0 to `z_top`; nan in holes.
       z_top: the largest.
       levels: how many above the finest.
+      cells: of the terrain along x and along y; what lies beyond is nan.
     """
     ny, nx = z.shape
     width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)
@@ -76,7 +77,7 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int) -> Py
     gone = jnp.pad(hole[:-1] | hole[1:], ((1, 1), (0, 0)), constant_values=True)
     gone = jnp.pad(gone[:, :-1] | gone[:, 1:], ((0, 0), (1, 1)), constant_values=True)  # of cells, with those beyond the border
     gone = gone[:-2] & gone[1:-1] & gone[2:]
-    amid_gone = gone[:, :-2] & gone[:, 1:-1] & gone[:, 2:]
+    amid_gone = (gone[:, :-2] & gone[:, 1:-1] & gone[:, 2:]) | beyond((ny - 1, nx - 1), cells)
 
     def chain(values: jax.Array) -> jax.Array:
         values = jnp.where(hole, jnp.inf, values)
@@ -104,11 +105,17 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int) -> Py
     )
 
 
-def enough_steps(cells_x: int, cells_y: int, levels: int) -> int:
+def beyond(shape: tuple[int, ...], cells: tuple[Index, Index]) -> Bool[jax.Array, "cells_y cells_x"]:
+    """Which cells of an array of this shape lie beyond a terrain of so many along x and along y."""
+    iy, ix = (lax.broadcasted_iota(jnp.int32, shape, axis) for axis in (0, 1))
+    return (ix >= cells[0]) | (iy >= cells[1])
+
+
+def enough_steps(cells_x: Any, cells_y: Any, levels: int) -> Any:
     """A number of steps that suffices for any ray.
 
     A ray moves one way along each axis, so on each level it passes through at most (blocks along x) + (blocks along y) - 1
     blocks. It comes to each of them at most once: it grows to a block only on entering it, and goes down into one
     only from the block around it. Each step deals with at least one of them.
     """
-    return sum(math.ceil(cells_x / 2**level) + math.ceil(cells_y / 2**level) - 1 for level in range(levels + 1))
+    return sum(-(-cells_x // 2**level) - (-cells_y // 2**level) - 1 for level in range(levels + 1))

@@ -11,6 +11,7 @@ from ..core.affine import Affine
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import greater, largest_component, lesser, quotient, time_to, unit, within
+from ..scene.heightfield import Size
 from ..scene.skirt import Skirt
 from .hit import Hit, hit_of_closed_form, orthogonal_tangents
 
@@ -92,16 +93,18 @@ class Walls(eqx.Module):
         return dataclasses.replace(hit, dp_du=dp_du, dp_dv=dp_dv, dn_du=jnp.zeros_like(n), dn_dv=jnp.zeros_like(n))
 
 
-def make_walls(skirt: Skirt, world_from_object: Affine | None) -> Walls:
+def make_walls(skirt: Skirt, world_from_object: Affine | None, size: Size | None = None) -> Walls:
+    """Prepares a skirt for tracing. With a `size` that is data its sides may be longer: then the order of `tops` and the
+    `known_shape` are those of the sides."""
     tops = jnp.concatenate([jnp.asarray(side) for side in (skirt.south, skirt.north, skirt.west, skirt.east)])
     dtype = tops.dtype
     world = Affine(jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)) if world_from_object is None else world_from_object
-    shape = ny, nx = len(skirt.west), len(skirt.south)
-    size = jnp.asarray((nx - 1) * skirt.dx, dtype), jnp.asarray((ny - 1) * skirt.dy, dtype)
-    cells = jnp.int32(nx - 1), jnp.int32(ny - 1)
+    shape = len(skirt.west), len(skirt.south)
+    size = Size.of(shape, skirt.dx, skirt.dy, dtype) if size is None else size
+    lengths, cells = ((jnp.asarray(x), jnp.asarray(y)) for x, y in (size.lengths, size.cells))
     base = jnp.asarray(skirt.base, dtype)
     tallest = jnp.max(jnp.where(jnp.isfinite(tops), tops, base)) - base
-    return Walls(tops, base, tallest, size, cells, shape, world, world.inverse())
+    return Walls(tops, base, tallest, lengths, cells, shape, world, world.inverse())
 
 
 def _upright(walls: Walls) -> list[tuple[int, Scalar, int, Scalar, Index, Index]]:

@@ -39,6 +39,21 @@ def test_a_second_run_does_not_trace(tmp_path):
     np.testing.assert_array_equal(*pictures)
 
 
+@pytest.mark.deep
+def test_a_view_of_another_terrain_compiles_nothing(tmp_path):
+    """Of another size and other cells, round which mountains hide the sky."""
+    kept = []
+    for k, shape in enumerate([(70, 90), (110, 80)]):
+        heights = np.random.default_rng(k).random(shape).cumsum(0)
+        np.savez(tmp_path / f"{k}.npz", heights=heights.astype(np.float32), dx=1.5 + k, dy=1.5 + k)
+        command = [sys.executable, "-m", "jaxhf", "view", f"{k}.npz", "-o", f"{k}.npy", "--size", "300x260"]
+        run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240, env=own(tmp_path / "kept"))
+        assert run.returncode == 0, run.stderr
+        kept.append({path.name for path in (tmp_path / "kept").glob("jaxhf-*/*") if not path.name.endswith("-atime")})
+    assert any(name.startswith("jaxhf.rendering.render._made_world") for name in kept[0])
+    assert kept[1] == kept[0]
+
+
 PROGRAM = """
 import warnings
 import jax

@@ -1,6 +1,8 @@
 """Pictures of terrains of many sizes from one program, beside those from a program for a terrain's size."""
 
 import dataclasses
+import functools
+import itertools
 import math
 
 import jax
@@ -81,18 +83,45 @@ def test_another_terrain_needs_no_other_program(make, pixels, traced):
     ],
 )
 def test_pictures_are_those_of_a_program_for_their_terrain(make, shapes, monkeypatch):
-    """To the bit. Terrains without room, which are narrow or have a seam, are prepared by the same program either way."""
+    """To the bit, of worlds of the same bits. Terrains without room, which are narrow or have a seam, are prepared by the same
+    program either way."""
+    rooms = any_size._rooms
+    monkeypatch.setattr(any_size, "_rooms", lambda shapes, squared: rooms(shapes, False))
     for shape in shapes:
         aovs = ("depth", "uv", "cell", "normal", "shadow", "steps", "status")
         found = jaxhf.render(make(shape), SETTINGS, aovs=aovs)
         with monkeypatch.context() as patched:
-            patched.setattr(render, "with_room", lambda world: world)
+            patched.setattr(any_size, "_room", lambda shape: None)
             jax.clear_caches()
-            assert not roomy(make(shape)).has_room
+            assert all(grid.rows.size == math.prod(grid.shape) for _, grid, _ in roomy(make(shape)).grids)
             expected = jaxhf.render(make(shape), SETTINGS, aovs=aovs)
         jax.clear_caches()
         jax.tree.map(np.testing.assert_array_equal, found, expected)
         assert expected[0].std() > 0.005
+
+
+def with_holes(shape: tuple[int, int]) -> jaxhf.Scene:
+    plain = solid(shape)
+    return plain.with_heights(holed(shape).heights).with_lights([jaxhf.Directional((-0.2, 1.0, 0.6)), *plain.lights])
+
+
+@pytest.mark.parametrize("make", [solid, pytest.param(with_holes, marks=pytest.mark.deep)])
+def test_one_program_makes_worlds_of_many_sizes_where_mountains_hide_the_sky(make, compilations, monkeypatch):
+    """As one for their size does, but for the rounding of normals; also what is made of them for another light."""
+    shapes = (40, 50), (60, 47), (65, 34), (66, 40)  # the last one has a side beyond 65, up to which a program serves
+    scenes = [make(shape) for shape in shapes]
+    moved = [jaxhf.Directional(light.towards * (-1, 1, 1)) for light in scenes[0].lights[:-1]]
+    others = [one.with_lights([*moved, one.lights[-1]]) for one in scenes]
+    made = []
+    for number, (one, other) in enumerate(zip(scenes, others, strict=True)):
+        compilations.clear()
+        ready = jaxhf.prepare(one, SETTINGS)
+        made += [ready._world, ready.with_lights(other.lights)._world]
+        assert bool(compilations) == (number in (0, 3))
+    rooms = any_size._rooms
+    monkeypatch.setattr(any_size, "_rooms", lambda shapes, squared: rooms(shapes, False))
+    for world, one in zip(made, itertools.chain(*zip(scenes, others, strict=True)), strict=True):
+        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6, atol=4e-6), world, roomy(one))
 
 
 def roomy(scene: jaxhf.Scene) -> World:
