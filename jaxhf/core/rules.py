@@ -5,6 +5,8 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, get_args
 
+from jax.core import Tracer
+
 from .errors import ArgumentError, whole_number
 
 Rule = Callable[[Any], str | None]
@@ -19,6 +21,8 @@ class Whole(NamedTuple):
     unit: str = ""
 
     def __call__(self, value: Any) -> str | None:
+        if isinstance(value, Tracer):
+            return "must be known when programs are compiled, it is traced by JAX"
         if type(whole_number(value)) is not int or value < self.least:
             return f"must be a whole number {self.unit and f'of {self.unit} '}from {self.least} on, it is {value!r}"
         return f"must be at most {self.most}, it is {value}" if value > self.most else None

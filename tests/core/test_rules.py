@@ -59,6 +59,11 @@ RULES = {
 }  # fmt: skip
 
 
+def test_a_whole_number_that_is_traced_is_refused_as_such():
+    with pytest.raises(jaxhf.ArgumentError, match="edge_samples must be known when programs are compiled, it is traced"):
+        jax.jit(lambda n: jaxhf.Settings(edge_samples=n))(4)
+
+
 @pytest.mark.parametrize("name", RULES)
 def test_a_rule_says_what_is_wrong(name):
     rule, kept, broken = RULES[name]
