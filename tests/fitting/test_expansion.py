@@ -11,11 +11,11 @@ import pytest
 from small_fits import SETTINGS, SIZE, TRUTH, expanded, given, posed, rms, scenes
 
 import jaxhf
-from jaxhf.fitting.model.expansion import Expansion, expand
+from jaxhf.fitting.model.expansion import Expansion, expand, found_scenes
 from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.model.rows import pictures_by_heights
 from jaxhf.fitting.model.surface import Unknowns
-from jaxhf.fitting.model.view import moved
+from jaxhf.fitting.model.view import differences, moved
 from jaxhf.fitting.trust.deviations import _on_boundaries
 
 PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])
@@ -191,3 +191,22 @@ def test_the_derivative_in_an_albedo_is_a_difference_of_two_pictures(name):
         # To rounding of the pictures, whose largest value is 3 in units of the noise.
         np.testing.assert_allclose(in_row(here.push((surface, change))), expected, atol=1e-5)
     assert rms(expected) > 1e-3
+
+
+@pytest.mark.parametrize("kind", [jaxhf.Perspective, jaxhf.Orthographic])
+def test_lights_and_far_cameras_that_were_found_are_said(kind):
+    """A far camera's rays begin in front of the terrain; its eye moves as far as was found, whatever it is turned by."""
+    lens = 1.0 if kind is jaxhf.Orthographic else 0.2
+    far = kind.look_at((0.5, 0.0, 300.0), (0.5, 0.5, 0.0), (0, 1, 0), lens, width=SIZE, height=SIZE)
+    seen, images = scenes(camera=far), [np.zeros((SIZE, SIZE), np.float32)] * 3
+    off = jaxhf.Unknown(light_std=1.0, camera_std=(0.3, 1.0))
+    problem, unknowns = posed(seen, images, given(unknown=off, settings=SETTINGS))
+    unknowns = eqx.tree_at(lambda unknowns: unknowns.view, unknowns, jax.tree.map(lambda leaf: leaf + 0.02, unknowns.view))
+    for group in problem.groups:
+        assert group.scenes.camera._ahead is not None
+        moves = np.asarray(problem.moves(unknowns, group).camera)
+        for k, move, turn in zip(group.indices, moves[:, :3], moves[:, 3:], strict=True):
+            light, distance, rotation = differences(seen[k], found_scenes(seen, unknowns, problem)[k])
+            assert light > 0.1
+            angle = np.degrees(2 * np.arctan(np.linalg.norm(turn) / 2))
+            np.testing.assert_allclose([distance, rotation], [np.linalg.norm(move), angle], rtol=1e-3)

@@ -194,8 +194,10 @@ def found_scenes(scenes: Sequence[Scene], unknowns: Unknowns, problem: Problem) 
     heights, found = problem.basis.crop(surface_of(unknowns, problem.basis)), list(scenes)
     factors = problem.factors(unknowns)
     for group in problem.groups:
-        views = moved_each(group.scenes, problem.moves(unknowns, group))
-        new, old = ((part.lights, part.camera) for part in (views, group.scenes))
+        # A far camera moves as one whose rays begin at its matrix: by that the eye moves, and given ones have no `_ahead`.
+        plain = eqx.tree_at(lambda scenes: scenes.camera._ahead, group.scenes, None, is_leaf=lambda leaf: leaf is None)
+        views = moved_each(plain, problem.moves(unknowns, group))
+        new, old = ((part.lights, part.camera) for part in (views, plain))
         change = jax.tree.map(lambda new, old: np.asarray(new) - np.asarray(old), new, old)
         for n, k in enumerate(group.indices):
             scene = with_material(scenes[k].with_heights(heights), jax.tree.map(np.asarray, _common(unknowns, problem)))
