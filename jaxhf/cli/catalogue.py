@@ -89,14 +89,18 @@ _RENDER = Command(
 _FIT = Command(
     "fit",
     "recover heights from pictures",
-    examples=("case.toml -o heights.tif --report report.html", "case.toml -o heights.tif --resume"),
+    examples=(
+        "case.toml -o heights.tif --report report.html",
+        "case.toml -o heights.tif --resume",
+        "case.toml -o heights.tif --window 128",
+    ),
     options={
         "": (
             option("case", metavar="CASE", help="a .toml file: a scene, its pictures, and what is known"),
             output("the heights: .npy, .npz or .tif"),
             option("--report", metavar="PAGE", help="an .html page with plots of heights, pictures and convergence"),
             flag("--resume", "go on from OUT.checkpoint, if it is there"),
-            whole("--window", "N", "fit windows of N x N heights one after the other: it takes the memory of one", least=32),
+            whole("--window", "N", "fit windows of N x N heights, 64 to 256, one after the other, for less memory", least=32),
             whole("--overlap", "M", "heights that neighbouring windows share [a quarter of N]", least=8),
             whole("--sweeps", "K", "how often all windows are fitted, each to the others as they are by then [2]", least=1),
         ),

@@ -29,9 +29,6 @@ from ..overwriting import require_no_input
 from ..progress import CompileTime, duration, told
 from ..scene_warnings import warn
 
-_USUAL_STEPS = 30  # of a fit, until it says what is to come
-_EARLY = 50.0  # seconds: most fits compile no longer, and JAX reports a compilation only when it is done
-
 
 def run(options: argparse.Namespace) -> None:
     for name in ("overlap", "sweeps"):
@@ -82,7 +79,8 @@ def _fit(case: Case, checkpoint: Path, options: argparse.Namespace) -> Fit | Mos
     """What the file asks for. KeyboardInterrupt says how to go on, an error of an argument in which line it stands."""
     interruption.raise_from_now_on()
     windows = options.window is not None
-    progress = _Progress(", then deviations" if case.options.get("draws") and not windows else "")
+    drawn = ", then deviations" if case.options.get("draws") else ""
+    progress = _Progress(" of this window" if windows else drawn)
     try:
         noise = case.noise and [Noise(**one) if isinstance(one, dict) else one for one in case.noise]
         given: dict[str, Any] = {
@@ -131,24 +129,21 @@ class _Progress:
 
     def __init__(self, later: str):
         self._compiling, self._begin, self._pace, self._later = CompileTime(), time.monotonic(), Pace(0.0), later
-        self._done, self._details, self._remaining, self._noted = "first step", "", None, 0.0
+        self._done, self._details, self._remaining, self._noted = "compiling, then the first step", "", None, 0.0
 
     def note(self, done: Step | Draws, place: str = "") -> None:
         self._noted = time.monotonic() - self._begin
         if isinstance(done, Draws):
             self._done, self._details = f"{place}deviations: sample {done.drawn} of {done.wanted}", " (Ctrl-C: enough)"
-            self._remaining, self._later = done.remaining, ""
+            self._remaining = done.remaining, ""
         else:
             self._done, self._details = f"{place}step {done.step}", f"; {done.level} DCT modes a side, loss {done.loss:.6g}"
-            self._remaining = self._pace.remaining(self._noted - self._compiling.seconds, done.to_come)
+            remaining = self._pace.remaining(self._noted - self._compiling.seconds, done.to_come)
+            self._remaining = None if remaining is None else (remaining, self._later)
 
     def line(self) -> str:
-        seconds, remaining = time.monotonic() - self._begin, self._remaining
-        if self._noted == 0.0:  # the step that is under way takes this long at least
-            remaining = _USUAL_STEPS * (seconds - self._compiling.seconds)
-            if seconds < _EARLY or remaining < seconds:
-                return f"compiling, {duration(seconds)} so far"
-        elif remaining is not None:
-            remaining -= seconds - self._noted
-        to_come = "" if remaining is None else f", about {duration(max(remaining, 1))} to come{self._later}"
+        seconds, to_come = time.monotonic() - self._begin, ""
+        if self._remaining is not None:  # before the first step nothing says it: JAX tells of a compilation when it is done
+            remaining, later = self._remaining
+            to_come = f", about {duration(max(remaining - (seconds - self._noted), 1))} to come{later}"
         return f"{self._done}, {duration(seconds)} so far{to_come}{self._details}"
