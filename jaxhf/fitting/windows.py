@@ -107,8 +107,8 @@ def fit_windows(
       window: heights along a window's sides; 64 to 256 are of use. Where the terrain has fewer along a side, all of these.
       overlap: heights that neighbours share at least; None: a quarter of a window. Take two correlation lengths of the prior or
         more: so far the rim is felt.
-      sweeps: how often it goes through all windows. A second time takes half as long as the first; seams, which are about a
-        deviation then, come to 0.6 of it, see docs/measurements/fits.md.
+      sweeps: how often it goes through all windows. A second time takes half as long as the first and makes seams smaller, see
+        docs/measurements/fits.md.
       progress: called after each step and each draw with how many windows are done, how many will be in all sweeps, and
         a `Step` or `Draws`.
       checkpoint: a file for the terrain so far, written after each window, whatever its `every`.
