@@ -57,6 +57,7 @@ def _sky(written: str, *special: Option, azimuths: int = 32) -> dict[str, Sequen
 
 
 _SHARE = "share of the sky's solid angle, or of its light on horizontal ground or on the slope [solid-angle]"
+_END = "as --begin, ten years later at most; a day ends with the next date"
 _TIME = "2026-06-21 (midnight of mean solar time there), or a time with its offset from UTC, 2026-06-21T07:00-05:00"
 _OBSERVER = "x and y in the file's coordinates; may be said several times"
 _RADIUS = "of the sphere on which the terrain lies [it lies on a plane; for light over the Earth 7.44e6, as GDAL's 6/7]"
@@ -183,7 +184,7 @@ MAPS = (
         options=_sky(
             "the map: .tif or .npy, kWh/m² of each vertex's own tilted surface, or hours",
             option("--begin", type=moment, metavar="TIME", required=True, help=_TIME),
-            option("--end", type=moment, metavar="TIME", required=True, help="ten years later at most"),
+            option("--end", type=moment, metavar="TIME", required=True, help=_END),
             choice(
                 "--wanted", SUNLIGHT, "all energy, its parts, or the hours in which the sun shines there [energy]", "energy"
             ),

@@ -96,8 +96,10 @@ def _unexpected(words: Sequence[str], parser: _Parser) -> str:
     import difflib
 
     word = word.partition("=")[0]
-    close = difflib.get_close_matches(word[2:], _options(parser), n=1)
-    others = [name for name, command in COMMANDS.items() if word[2:] in _options(parser_of(command))]
+    name, known = word.lstrip("-"), _options(parser)
+    begun = [option for option in known if option.startswith(name)]  # as GDAL's -az and -alt, which have one dash
+    close = begun if len(begun) == 1 else difflib.get_close_matches(name, known, n=1)
+    others = [command.name for command in COMMANDS.values() if name in _options(parser_of(command))]
     tail = f"; jaxhf {others[0]} has it" if others else ""
     return f"unknown option {word}" + (f"; did you mean --{close[0]}?" if close else tail)
 

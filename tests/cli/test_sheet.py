@@ -128,6 +128,7 @@ def test_the_command(tmp_path, command, ending):
     ("words", "message"),
     [
         ("-o a.tif --annotate", "cannot write a sheet with the ending '.tif'"),
+        ("-o a.pdf", "a.pdf: only a sheet is written with this ending, which --annotate makes"),
         ("-o a.png --contours 5", "--contours would change nothing: without --annotate there is no sheet"),
         ("-o a.png --annotate --alpha", "--alpha would change nothing: a sheet is white where there is no height"),
         ("-o a.png --annotate --contours 1e-310", "--contours must leave at most 500 lines, heights go from"),

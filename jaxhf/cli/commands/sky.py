@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...core.errors import counted
+from ...core.errors import UserError, counted
 from ...io.files import replacing_all, write_npy
 from ...io.terrain.rasters import geotiff, require_writable_raster, save_raster
 from ...io.terrain.terrain import Terrain
@@ -79,6 +79,8 @@ def _insolation(options: argparse.Namespace, path: Path, stored: Terrain, terrai
     """The same for the energy that arrives, or the hours of sun."""
     latitude, longitude = place_of("insolation", options, stored)
     begin, end = (_instant(time, longitude) for time in (options.begin, options.end))
+    if not begin < end:
+        raise UserError("insolation: --end must come after --begin; dates are their midnights, a day ends with the next date")
     chosen = arguments.given(options, "wanted", "turbidity", "azimuths")
     with compiled_bar(unit=" heights", unit_scale=True) as advance:
         values = np.asarray(insolation(terrain, begin, end, (latitude, longitude), **chosen, progress=advance))
