@@ -143,7 +143,7 @@ _CONVERT = Command(
         "": (
             IN,
             option("output", metavar="OUT", help=_WRITTEN),
-            number("--base", "Z", "close a mesh by walls down to this height [open]"),
+            number("--base", "Z", "close a mesh by walls down to this height, after --z-scale [open]"),
             number("--longer-side", "MM", "of a mesh's footprint, to which all is scaled, as for printers [as in the terrain]"),
         ),
         **RASTER,

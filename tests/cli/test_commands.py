@@ -65,6 +65,7 @@ REFUSED = [
     ("rendr scene.toml", "unknown command 'rendr'; did you mean 'render'?"),
     ("terrain.tif", "'terrain.tif' is no command; one stands before its files, as in 'jaxhf info terrain.tif'"),
     ("slope a.tif -o b.tif --percnt", "unknown option --percnt; did you mean --percent?"),
+    ("hillshade a.tif -o b.tif -az 315", "unknown option -az; did you mean --azimuth?"),
     ("render a.toml -o b.png --preset exact", "unknown option --preset; jaxhf view has it (see"),
     ("hillshade a.tif -o b.tif --variant igo", "--variant must be one of regular, combined, "),
     ("render a.toml -o b.png --samples 1.5", "--samples must be a whole number, it is '1.5'"),
@@ -202,6 +203,13 @@ def test_an_input_is_never_replaced(folder, command, line, where):
     output = line.split()[-1].removeprefix("./")
     assert said == (2, "", f"jaxhf: error: {output}: the output cannot replace an input of the same command{where}\n")
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_a_print_says_its_size(folder, command):
+    pytest.importorskip("trimesh")
+    np.save("hills.npy", np.arange(12, dtype=np.float32).reshape(3, 4))
+    code, said, err = command("convert", "hills.npy", "a.stl", "--base", -1, "--longer-side", 150, "--z-scale", 2)
+    assert (code, said.endswith("; in the file 150 x 100 x 1150\n")) == (0, True), err
 
 
 def test_nor_is_what_lies_beside_it(folder, command):

@@ -5,9 +5,12 @@ import dataclasses
 import warnings
 from pathlib import Path
 
+import numpy as np
+
 from ...io.terrain.load import load_heights
 from ...io.terrain.meshes import MESHES, require_writable_mesh, save_mesh
 from ...io.terrain.save import HEIGHTS, require_writable_heights, save_heights
+from ...io.terrain.terrain import Terrain
 from .. import arguments
 from .info import heightfield_line
 
@@ -33,4 +36,14 @@ def run(options: argparse.Namespace) -> None:
     alone = f" ({ending} holds the heights alone)" if ending in (".npy", ".exr") else ""
     if ending == ".png" and (terrain.heights % 1 != 0).any():
         alone = " (.png holds whole numbers: heights are rounded to steps of 1)"
-    print(f"{options.output}: {heightfield_line(terrain)}{alone}")
+    print(f"{options.output}: {heightfield_line(terrain)}{alone}{_printed(options, terrain)}")
+
+
+def _printed(options: argparse.Namespace, terrain: Terrain) -> str:
+    """Width, depth and height of a mesh that is scaled for a printer."""
+    if options.longer_side is None:
+        return ""
+    (ny, nx), low = terrain.heights.shape, np.nanmin(terrain.heights) if options.base is None else options.base
+    size = np.array([(nx - 1) * terrain.dx, (ny - 1) * terrain.dy, np.nanmax(terrain.heights) - low])
+    sides = " x ".join(f"{side:.4g}" for side in size * (options.longer_side / size[:2].max()))
+    return f"; in the file {sides}"
