@@ -16,6 +16,7 @@ from ..core.rules import OneOf, require
 from ..core.settings import Settings
 from ..core.types import POSITIVE, Index, Number, Scalar, Vector
 from ..core.vector import greater
+from ..io.terrain.georeference import corners_said
 from ..io.terrain.terrain import Terrain
 from ..preparation.horizon import TILE, assemble, tile_count
 from ..scene.heightfield import Heightfield
@@ -283,10 +284,9 @@ def cells_of(
     for k, cell in enumerate(cells):
         if not ((cell >= -rounding) & (cell <= last + rounding)).all():
             spans = [f"{a:.10g} to {a + (n - 1) * d:.10g}" for a, d, n in zip(begin, step, (nx, ny), strict=True)]
+            where = corners_said(begin, step, (nx, ny), rotation) if rotation else f"x from {spans[0]} and y from {spans[1]}"
             x, y = given.reshape(-1, 2)[k]
-            turned = f", rotated by {rotation:.6g} degrees clockwise about the first of both" if rotation else ""
-            rule = f"must be on the terrain, x from {spans[0]} and y from {spans[1]}{turned}; one is {x:.10g} {y:.10g}"
-            raise ArgumentError(owner, name, rule)
+            raise ArgumentError(owner, name, f"must be on the terrain, {where}; one is {x:.10g} {y:.10g}")
     return np.clip(cells, 0, last)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...core.errors import counted
 from ...io.files import by_ending
-from ...io.terrain.georeference import Georeference, coordinate_system
+from ...io.terrain.georeference import Georeference, coordinate_system, corners_said
 from ...io.terrain.load import ENDINGS, read_terrain
 from ...io.terrain.terrain import Terrain
 
@@ -63,8 +63,10 @@ def _terrain_lines(path: str, terrain: Terrain) -> Iterator[str]:
             metres = f", in the middle {local.dx:.6g} x {local.dy:.6g} metres"
         yield f"cells: {dx:.9g} x {dy:.9g}{place.unit and ' '}{place.unit}{metres}"
         x, y = ("longitude", "latitude") if crs is not None and crs.degrees else ("x", "y")
-        turned = f", rotated by {terrain.rotation:.9g} degrees clockwise about the first of both" if terrain.rotation else ""
-        yield f"place: {x} {x0:.10g} to {x0 + (nx - 1) * dx:.10g}, {y} {y0:.10g} to {y0 + (ny - 1) * dy:.10g}{turned}"
+        if terrain.rotation:
+            yield f"place: {corners_said((x0, y0), (dx, dy), (nx, ny), terrain.rotation)}"
+        else:
+            yield f"place: {x} {x0:.10g} to {x0 + (nx - 1) * dx:.10g}, {y} {y0:.10g} to {y0 + (ny - 1) * dy:.10g}"
     code = f" (EPSG:{crs.code})" if crs is not None and crs.code else ""
     yield f"system: {place.name or 'not known'}{code}"
     holes = int(np.count_nonzero(np.isnan(terrain.heights)))

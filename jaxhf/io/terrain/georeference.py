@@ -132,3 +132,17 @@ def metres_per_degree(latitude: float, globe: Ellipsoid = WGS84) -> tuple[float,
     phi = math.radians(latitude)
     w = 1 - squared * math.sin(phi) ** 2
     return math.radians(axis * math.cos(phi) / math.sqrt(w)), math.radians(axis * (1 - squared) / w**1.5)
+
+
+def corners_said(begin: tuple[float, float], step: tuple[float, float], count: tuple[int, int], rotation: float) -> str:
+    """Where the outermost vertices of a rotated grid stand, in words.
+
+    Vertex (0, 0) stands at `begin`, rows and columns are `step` apart in x and y, and y of the grid points `rotation` degrees
+    clockwise of the map's.
+    """
+    cos, sin = math.cos(math.radians(rotation)), math.sin(math.radians(rotation))
+    sides = (np.array(count) - 1) * step
+    corners = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * sides @ [(cos, -sin), (sin, cos)] + begin
+    side = "clockwise" if rotation > 0 else "counterclockwise"
+    said = ", ".join(f"{x:.10g} {y:.10g}" for x, y in corners)
+    return f"x and y of the corners {said}, rotated by {abs(rotation):.6g} degrees {side}"
