@@ -74,12 +74,16 @@ def _rooms(shapes: Sequence[Shape | Surface], squared: bool) -> Rooms:
     pays where mountains hide the sky: to look round takes as long for the cells that are there, and compiles for seconds. The
     rest would take 1.6 to 2.5 times as long (by hand, 1024 x 1024 and 600 x 600 heights), and compiles in 0.8 s.
     """
-    fields = (shape for shape in shapes if isinstance(shape, Heightfield | Grid) and shape.seam is None)
-    fields = (field for field in fields if isinstance(field, Heightfield) or field.fixed_steps is None)
-    rooms = {known: _room(known) for known in map(_known_shape, fields) if known is not None}
+
+    def may_have_room(shape: Shape | Surface) -> bool:
+        if isinstance(shape, Heightfield):
+            return shape.seam is None
+        return isinstance(shape, Grid) and shape.seam is None and shape.fixed_steps is None
+
+    rooms = {known: _room(known) for known in map(_known_shape, filter(may_have_room, shapes)) if known is not None}
 
     def room_of(shape: Shape | Surface) -> Room | None:
-        known = _known_shape(shape)
+        known = _known_shape(shape) if may_have_room(shape) or isinstance(shape, Skirt | Walls) else None
         room = None if known is None else rooms.get(known)
         if room is None or known is None or not squared:
             return room
@@ -100,8 +104,8 @@ def _known_shape(shape: Shape | Surface) -> tuple[int, int] | None:
 
 
 def in_room(scene: Scene, settings: Settings) -> tuple[Scene, tuple[Size | None, ...], Rooms]:
-    """What `make_roomy_world` takes for a `localise`d scene: this without a camera, in arrays that are as long as those of
-    other terrains; for each object its size, where that is data; and its room."""
+    """What `make_roomy_world` takes for a `localise`d scene: the scene without its camera, its arrays as long as those of other
+    terrains; for each object its size, where that is data; and its room."""
     shapes, rooms = [obj.shape for obj in scene.objects], (None,) * len(scene.objects)
     if settings.early_exit:
         rooms = _rooms(shapes, squared=scene.sky_occlusion is not None)
@@ -154,7 +158,11 @@ def _longer(values: Any, *lengths: int, shape: tuple[int, ...] | None = None, **
     widths = [(0, length - n) for length, n in zip(lengths, given.shape, strict=False)]
     widths += [(0, 0)] * (given.ndim - len(widths))
     padded = (jnp if isinstance(given, jax.Array) else np).pad(given, widths, **how)
-    return jax.device_put(padded, values.sharding if values.committed else None) if on_cpu else padded
+    if not on_cpu:
+        return padded
+    # A part of them on each device would not be one of the longer array.
+    place = values.sharding if values.is_fully_replicated else min(values.devices(), key=lambda device: device.id)
+    return jax.device_put(padded, place if values.committed else None)
 
 
 def make_roomy_world(scene: Scene, sizes: tuple[Size | None, ...], rooms: Rooms, settings: Settings) -> World:

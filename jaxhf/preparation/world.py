@@ -47,7 +47,7 @@ class World(eqx.Module):
         heightfield under a directional light, and where no walk is to be spared.
       sky: for each object, what it leaves to see of the sky at its vertices, see `visible_sky`; None for all but heightfields,
         and where no sky is hidden.
-      has_room: see `with_room`.
+      has_room: see `make_roomy_world`.
       settings: nothing in them is left to the scene, see `resolve_settings`.
     """
 

@@ -53,6 +53,19 @@ def of_two(shape: tuple[int, int]) -> jaxhf.Scene:
     )
 
 
+def test_a_terrain_with_a_seam_has_no_room_of_another_of_its_size():
+    """So what lies far below it changes nothing: neither its normals at the seam nor the horizons of both its parts."""
+    x, y = np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-1, 1, 16))
+    region = jaxhf.Heightfield((np.sin(3 * x) * np.cos(2 * y)).astype(np.float32), 0.5, 0.5)
+    site = jaxhf.Heightfield(np.random.default_rng(0).uniform(0, 1, (17, 17)).astype(np.float32), 0.125, 0.125, 2.0, 2.0)
+    surface = [jaxhf.Object(part) for part in jaxhf.nested(site, region)]
+    below = jaxhf.Object(jaxhf.Heightfield(np.full((16, 20), -50, np.float32), 0.5, 0.5))
+    camera = jaxhf.Orthographic.look_at((3, 3, 9), (3, 3, 0), up=(0, 1, 0), extent=3.0, width=24, height=24)
+    lights = [jaxhf.Directional((1.0, 0.3, 0.6)), jaxhf.Sky(0.4, occlusion=4)]
+    expected = jaxhf.render(jaxhf.Scene(surface, camera, lights), SETTINGS)
+    np.testing.assert_allclose(jaxhf.render(jaxhf.Scene([*surface, below], camera, lights), SETTINGS), expected, atol=1e-6)
+
+
 @pytest.mark.parametrize("make", [scene, pytest.param(solid, marks=pytest.mark.deep)])
 @pytest.mark.parametrize("pixels", [72, 24])  # by the program for any size, by one for this
 def test_another_terrain_needs_no_other_program(make, pixels, traced):
