@@ -94,7 +94,7 @@ def test_figures_have_a_source(name):
 def test_figures_are_those_of_the_measurements(name):
     """The site's builder makes them; README and CHANGELOG have them written out, and the macro beside each as a comment."""
     text = (ROOT / name).read_text()
-    for call in re.findall(r"\{\{\s+((?:figure|span|count)\(.*?\))\s+\}\}", text, re.DOTALL):
+    for call in re.findall(r"\{\{\s*((?:figure|span|count)\(.*?\))\s*\}\}", text, re.DOTALL):
         assert evaluated(call)
     assert len(WRITTEN.findall(text)) == len(re.findall(r"<!-- (?:figure|span|count)\(", text)), "beside no number"
     for said, call in WRITTEN.findall(text):

@@ -40,8 +40,8 @@ class Fitted(NamedTuple):
       pictures: how many show it; without any its heights stay as they were.
       result: why its fit stopped, see `Stop`; empty where there was none.
       steps, seconds, chi2: of its fit.
-      seam: root mean square difference between its heights and those of the windows fitted before, in the middle of where they
-        overlap and are seen; nan: nowhere.
+      seam: root mean square difference between its heights and the terrain before it, in the middle of where it overlaps with
+        other windows and is seen; nan: nowhere. In the first sweep that terrain is the neighbours', later it is half its own.
       warnings: of its fit.
     """
 
@@ -107,8 +107,8 @@ def fit_windows(
       window: heights along a window's sides; 64 to 256 are of use. Where the terrain has fewer along a side, all of these.
       overlap: heights that neighbours share at least; None: a quarter of a window. Take two correlation lengths of the prior or
         more: so far the rim is felt.
-      sweeps: how often it goes through all windows. A second time takes half as long as the first and makes seams smaller, see
-        docs/measurements/fits.md.
+      sweeps: how often it goes through all windows; what a second time gains is in docs/measurements/fits.md. With a checkpoint
+        as often as that has, or more.
       progress: called after each step and each draw with how many windows are done, how many will be in all sweeps, and
         a `Step` or `Draws`.
       checkpoint: a file for the terrain so far, written after each window, whatever its `every`.
@@ -144,10 +144,14 @@ def fit_windows(
     sides = sides_in_sight(scenes, terrain.heights, off + float(np.ptp(known_heights, axis=0).max()), order)
     path = None if checkpoint is None else Path(checkpoint.path)
     values = scenes, targets, weights, mean, std, begin, noise
-    name = digest((prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)), values)
+    asked = prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values), Fitted._fields
+    name = digest(asked, values)
     if path is not None and path.exists():
         terrain = _load(path, terrain, name)
     count = len(order) * (sweeps if len(order) > 1 else 1)
+    if len(terrain.windows) > count:
+        done = math.ceil(len(terrain.windows) / len(order))
+        raise ArgumentError("fit_windows", "sweeps", f"must be the {done} that the checkpoint has, or more, it is {sweeps}")
     for number in range(len(terrain.windows), count):
         sweep, turn = divmod(number, len(order))
         place, held = order[turn], _held_sides(order[turn], shape, sweep > 0)
@@ -221,13 +225,13 @@ def _fit(
 
 
 def _joined(terrain: Mosaic, prior: Prior, found: Fit, window: Window, sides: _Sides, overlap: int) -> tuple[Mosaic, float]:
-    """The terrain with a window's heights, and the difference in its overlap with those before."""
+    """The terrain with a window's heights, and how far these were off it in the window's overlap."""
     here, done = window.place, prior.std == 0
     for before in terrain.windows:
         if before.result:
             done[Window(*before[:4]).place] = True
     done = done[here]
-    # From 0 at sides in windows before to 1, where these end; what is at the right was fitted in the row before.
+    # From 0 at sides beyond which the terrain is known to 1. At the right that was, in the first sweep, in the row before.
     rows = _ramp(*sides[:2], window.ny, overlap)
     columns = _ramp(window.x > 0, window.x + window.nx < terrain.heights.shape[1], window.nx, overlap)
     share = np.where(done, rows[:, None] * columns, 1)

@@ -110,7 +110,8 @@ def trace_in_parts(
         done = min(first + size, tiling.count)
         for name, values in on_host(part).items():
             tiles = in_order(mesh.devices.size, values)[: done - first]
-            found.setdefault(name, tiling.room(tiles))
+            if name not in found:
+                found[name] = tiling.room(tiles)
             tiling.place(tiles, first, found[name])
         if progress is not None:
             progress(min(pixels, done * pixels // tiling.count), pixels)

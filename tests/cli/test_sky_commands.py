@@ -127,7 +127,8 @@ def test_insolation(run, tmp_path):
     [
         ("--begin 2026-06-21 --end 2026-06-22", "insolation: times need --latitude and --longitude for "),
         ("--begin 2026-06-21T10:00 --end 2026-06-22", "--begin must be a date, as 2026-06-21, or a time with its offset"),
-        ("--begin 2026-06-22 --end 2026-06-21 --latitude 4 --longitude 4", "--end must come after --begin; dates"),
+        ("--begin 2026-06-22 --end 2026-06-21 --latitude 4 --longitude 4",
+         "--end must come after --begin, they are 2026-06-21 and 2026-06-22; dates are"),
         ("--begin 2026-06-21 --end 2026-06-22 --latitude 4", "insolation: --latitude and --longitude belong"),
         ("--begin 2026-06-21 --end 2026-06-22 --wanted hours --turbidity 2",
          "--turbidity would change nothing: hours of sun are the same in any air"),

@@ -86,6 +86,7 @@ OF_HEIGHTS = {
     "hillshade": lambda z: jaxhf.hillshade(z, 1.0),
     "color_relief": lambda z: jaxhf.color_relief(z, "terrain"),
     "horizon": lambda z: jaxhf.horizon(z, 2, dx=1.0),
+    "sky_view": lambda z: jaxhf.sky_view(z, 2, dx=1.0, weighting="horizontal"),
 }
 FILL = -9999
 WHOLE = RNG.integers(0, 9, HEIGHTS.shape)

@@ -141,7 +141,7 @@ def test_windows_come_near_the_truth_without_seams():
     assert found.std is not None
     deviation = np.median(found.std[found.seen])
     for done in found.windows[1:]:
-        assert done.seam < (np.sqrt(2) if done.sweep == 1 else 1) * deviation  # of two estimates
+        assert done.seam < np.sqrt(2) * deviation  # of two estimates
     for along in (np.abs(np.diff(error, axis=0)), np.abs(np.diff(error, axis=1)).T):
         joint, rest = along[[15, 31]].mean(), np.delete(along, [15, 16, 30, 31], axis=0).mean()
         assert joint < 1.5 * rest
@@ -235,6 +235,8 @@ def test_in_a_second_sweep_windows_are_held_all_around(tmp_path, monkeypatch):
     assert max(np.abs(np.diff(off, axis=axis)).max() for axis in (0, 1)) < 0.03
     more = fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=jaxhf.Checkpoint(path, resume=True), **dict(options, sweeps=3))
     assert [done.sweep for done in more.windows] == [1] * 4 + [2] * 4 + [3] * 4
+    with pytest.raises(ValueError, match="sweeps must be the 3 that the checkpoint has, or more, it is 1"):
+        fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=jaxhf.Checkpoint(path, resume=True), **dict(options, sweeps=1))
 
 
 def test_what_is_around_a_window_may_rise_to_its_prior(monkeypatch):

@@ -46,4 +46,4 @@ def _printed(options: argparse.Namespace, terrain: Terrain) -> str:
     (ny, nx), low = terrain.heights.shape, np.nanmin(terrain.heights) if options.base is None else options.base
     size = np.array([(nx - 1) * terrain.dx, (ny - 1) * terrain.dy, np.nanmax(terrain.heights) - low])
     sides = " x ".join(f"{side:.4g}" for side in size * (options.longer_side / size[:2].max()))
-    return f"; in the file {sides}"
+    return f"; in the file {sides} at most"

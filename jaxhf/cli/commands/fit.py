@@ -117,6 +117,8 @@ def _tell_of_fit(made: str, case: Case, found: Fit) -> None:
 
 def _tell_of_windows(found: Mosaic) -> None:
     for done in found.windows:
+        if done.sweep < found.windows[-1].sweep:
+            continue
         where = f"rows {done.y}-{done.y + done.ny - 1} columns {done.x}-{done.x + done.nx - 1}"
         seam = "" if math.isnan(done.seam) else f", {done.seam:.3g} off its neighbours"
         print(f"{where}: {done.result or 'in no picture'}; {counted(done.steps, 'step')}, chi2 {done.chi2:.4g}{seam}")
@@ -135,7 +137,7 @@ class _Progress:
         self._noted = time.monotonic() - self._begin
         if isinstance(done, Draws):
             self._done, self._details = f"{place}deviations: sample {done.drawn} of {done.wanted}", " (Ctrl-C: enough)"
-            self._remaining = done.remaining, ""
+            self._remaining = done.remaining, self._later if place else ""
         else:
             self._done, self._details = f"{place}step {done.step}", f"; {done.level} DCT modes a side, loss {done.loss:.6g}"
             remaining = self._pace.remaining(self._noted - self._compiling.seconds, done.to_come)
@@ -143,7 +145,7 @@ class _Progress:
 
     def line(self) -> str:
         seconds, to_come = time.monotonic() - self._begin, ""
-        if self._remaining is not None:  # before the first step nothing says it: JAX tells of a compilation when it is done
-            remaining, later = self._remaining
+        if (told := self._remaining) is not None:  # before the first step nothing says it: a compilation is told of afterwards
+            remaining, later = told
             to_come = f", about {duration(max(remaining - (seconds - self._noted), 1))} to come{later}"
         return f"{self._done}, {duration(seconds)} so far{to_come}{self._details}"

@@ -99,7 +99,7 @@ def _chosen(options: argparse.Namespace) -> tuple[Callable[..., Any], float | No
         arguments.refuse(options, "alpha", because="a sheet is white where there is no height")
     elif name == "relief":
         arguments.refuse(options, "contours", "title", because="without --annotate there is no sheet")
-        if Path(options.output).suffix.lower() in (".pdf", ".svg", ".webp"):
+        if Path(options.output).suffix.lower() in set(SHEETS) - {".png"}:
             raise UserError(f"{options.output}: only a sheet is written with this ending, which --annotate makes")
     if name == "relief" and not options.shading:
         arguments.refuse(options, *_LIGHT, because="--no-shading leaves the light out")

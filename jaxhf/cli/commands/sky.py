@@ -80,7 +80,8 @@ def _insolation(options: argparse.Namespace, path: Path, stored: Terrain, terrai
     latitude, longitude = place_of("insolation", options, stored)
     begin, end = (_instant(time, longitude) for time in (options.begin, options.end))
     if not begin < end:
-        raise UserError("insolation: --end must come after --begin; dates are their midnights, a day ends with the next date")
+        rule = f"--end must come after --begin, they are {options.end} and {options.begin}"
+        raise UserError(f"insolation: {rule}; dates are their midnights, a day ends with the next date")
     chosen = arguments.given(options, "wanted", "turbidity", "azimuths")
     with compiled_bar(unit=" heights", unit_scale=True) as advance:
         values = np.asarray(insolation(terrain, begin, end, (latitude, longitude), **chosen, progress=advance))
