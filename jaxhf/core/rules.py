@@ -2,10 +2,9 @@
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple, get_args
-
-from jax.core import Tracer
 
 from .errors import ArgumentError, whole_number
 
@@ -21,7 +20,7 @@ class Whole(NamedTuple):
     unit: str = ""
 
     def __call__(self, value: Any) -> str | None:
-        if isinstance(value, Tracer):
+        if isinstance(value, getattr(sys.modules.get("jax.core"), "Tracer", ())):  # --help does without JAX
             return "must be known when programs are compiled, it is traced by JAX"
         if type(whole_number(value)) is not int or value < self.least:
             return f"must be a whole number {self.unit and f'of {self.unit} '}from {self.least} on, it is {value!r}"

@@ -53,7 +53,7 @@ def test_a_terrain_counts_on_each_device(refused, monkeypatch):
     scene = jaxhf.Scene([jaxhf.Object(field)], camera, [])
     monkeypatch.setattr(limits, "available_bytes", lambda: 5e5)
     limits.require_memory(scene, 1)
-    with pytest.raises(UserError, match=r"take more than 0\.000904 GB of memory on 2 devices, 0\.0005 GB are free"):
+    with pytest.raises(UserError, match=r"take more than 0\.000903 GB of memory on 2 devices, 0\.0005 GB are free"):
         limits.require_memory(scene, 2)
 
 

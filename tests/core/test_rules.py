@@ -59,7 +59,7 @@ RULES = {
 }  # fmt: skip
 
 
-def test_a_whole_number_that_is_traced_is_refused_as_such():
+def test_a_whole_number_that_is_traced_is_refused_as_such(as_users_call_it):
     with pytest.raises(jaxhf.ArgumentError, match="edge_samples must be known when programs are compiled, it is traced"):
         jax.jit(lambda n: jaxhf.Settings(edge_samples=n))(4)
 
