@@ -102,7 +102,6 @@ _FIT = Command(
             flag("--resume", "go on from OUT.checkpoint, if it is there"),
             whole("--window", "N", "fit windows of N x N heights, 64 to 256, one after the other, for less memory", least=32),
             whole("--overlap", "M", "heights that neighbouring windows share [a quarter of N]", least=8),
-            whole("--sweeps", "K", "how often all windows are fitted, each to the others as they are by then [2]", least=1),
         ),
         **MACHINE,
     },

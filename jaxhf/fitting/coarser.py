@@ -54,13 +54,21 @@ def coarser(
         cell = factor * max(old.dx, old.dy)
         length = None if prior.length is None or prior.length < cell else prior.length
         std = np.asarray(numbers(prior.std), np.float64)
-        prior = Prior(reduced(prior.heights), std if std.ndim == 0 else resample(std, shape), length)
+        held = None if prior.held is None else _held(np.asarray(numbers(prior.held), np.float64), shape)
+        prior = Prior(reduced(prior.heights), std if std.ndim == 0 else resample(std, shape), length, held)
     start = None if given.start is None else reduced(given.start)
     return (
         [_coarser_scene(scene, camera, shape) for scene, (camera, _, _) in zip(scenes, pictures, strict=True)],
         [target for _, target, _ in pictures],
         dataclasses.replace(given, prior=prior, start=start, weights=[weight for _, _, weight in pictures]),
     )
+
+
+def _held(heights: Float[np.ndarray, "ny nx"], shape: tuple[int, ...]) -> Float[np.ndarray, "my mx"]:
+    """Heights that are held, nan elsewhere, where most of what is there is held."""
+    there = np.isfinite(heights)
+    share = resample(there.astype(np.float64), shape)
+    return np.where(share > 0.5, resample(np.where(there, heights, 0), shape) / np.maximum(share, 0.5), np.nan)
 
 
 def _coarser_scene(scene: Scene, camera: Camera, shape: tuple[int, ...]) -> Scene:

@@ -37,11 +37,14 @@ class Prior:
         s, L is about s / √2: cells of 30 m smoothed over 8 of them have s = 240 m and L = 170 m, see docs/concepts/recovery.md.
         None: it is not known. The pictures say how large errors of each wavelength are, octave by octave (restricted maximum
         likelihood, Patterson and Thompson, 1971); where they do not tell it errors count as independent.
+      held: heights that are known better than the others, and held as they are: shape (ny, nx), nan elsewhere. Unlike where std
+        is 0 they may differ from `heights`, and with a length that tells of the errors beside them. None: there are none.
     """
 
     heights: Any
     std: Any
     length: float | int | None = None
+    held: Any = None
 
     def __post_init__(self):
         require_heights("Prior", "heights", self.heights)

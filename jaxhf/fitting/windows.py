@@ -36,12 +36,11 @@ class Fitted(NamedTuple):
 
     Attributes:
       y, x, ny, nx: which heights it has: ny rows from row y on, nx columns from column x on.
-      sweep: in which sweep it was fitted, from 1.
       pictures: how many show it; without any its heights stay as they were.
       result: why its fit stopped, see `Stop`; empty where there was none.
       steps, seconds, chi2: of its fit.
-      seam: root mean square difference between its heights and the terrain before it, in the middle of where it overlaps with
-        other windows and is seen; nan: nowhere. In the first sweep that terrain is the neighbours', later it is half its own.
+      seam: root mean square difference between its heights and those of the windows before, in the middle of where they
+        overlap and are seen; nan: nowhere.
       warnings: of its fit.
     """
 
@@ -49,7 +48,6 @@ class Fitted(NamedTuple):
     x: int
     ny: int
     nx: int
-    sweep: int
     pictures: int
     result: str = ""
     steps: int = 0
@@ -67,7 +65,7 @@ class Mosaic:
       heights: shape (ny, nx), in the dtype of the scenes' heights.
       std: standard deviation of each, as that of `Fit`; None where no draws were asked for.
       seen: whether a change of the height would change any picture, shape (ny, nx).
-      windows: what became of each, sweep after sweep.
+      windows: what became of each.
     """
 
     heights: Float[np.ndarray, "ny nx"]
@@ -83,7 +81,6 @@ def fit_windows(
     prior: Prior | None,
     window: int,
     overlap: int | None = None,
-    sweeps: int = 2,
     weights: Sequence[Any] | None = None,
     start: Any = None,
     noise: Any = None,
@@ -94,10 +91,10 @@ def fit_windows(
     """Recovers a terrain by fits of windows of it, one after the other, row by row from y = y0 on.
 
     Each is fitted within the terrain that goes on around it, as it is known by then: that is seen and casts its shadows into
-    the window. The first row and column of each window, which lie in windows before, are held as these found them, and in their
-    overlap heights go over from the one to the other. Once more through all windows, each is held at all sides, as windows are
-    known all around it: Schwarz's alternating method (Toselli and Widlund, Domain Decomposition Methods, 2005, chapter 1). Time
-    grows as the number of windows, memory as the size of one, besides terrain and pictures themselves.
+    the window. The first row and column of each window, which lie in windows before, are held as these found them: the window's
+    prior is that of the rest where these are known (see `Prior.held`). In their overlap heights go over from the one to the
+    other. Time grows as the number of windows, memory as the size of one,
+    besides terrain and pictures themselves.
 
     What all windows share must be known: lights, cameras, exposures, albedo. `fit` finds them on coarser heights.
 
@@ -107,12 +104,10 @@ def fit_windows(
       window: heights along a window's sides; 64 to 256 are of use. Where the terrain has fewer along a side, all of these.
       overlap: heights that neighbours share at least; None: a quarter of a window. Take two correlation lengths of the prior or
         more: so far the rim is felt.
-      sweeps: how often it goes through all windows; what a second time gains is in docs/measurements/fits.md. With a checkpoint
-        as often as that has, or more.
-      progress: called after each step and each draw with how many windows are done, how many will be in all sweeps, and
-        a `Step` or `Draws`.
+      progress: called after each step and each draw with the number of windows that are done, how many there are, and a `Step`
+        or `Draws`.
       checkpoint: a file for the terrain so far, written after each window, whatever its `every`.
-      options: of `fit`: draws, settings, max_steps, mesh. Draws are taken in the first sweep, in which sides are free.
+      options: of `fit`: draws, settings, max_steps, mesh.
 
     Returns:
       A `Mosaic`.
@@ -129,7 +124,6 @@ def fit_windows(
     if options.get("unknown") is not None:
         raise ArgumentError("fit_windows", "unknown", "must be left out: windows share no unknowns. Find them by `fit` first")
     require("fit_windows", "window", window, Whole(_LEAST_WINDOW))
-    require("fit_windows", "sweeps", sweeps, Whole(1))
     overlap = window // 4 if overlap is None else overlap
     require("fit_windows", "overlap", overlap, Whole(_LEAST_OVERLAP, window // 2))
     mean, std = (make_heights("Prior", name, getattr(prior, name), field) for name in ("heights", "std"))
@@ -144,26 +138,19 @@ def fit_windows(
     sides = sides_in_sight(scenes, terrain.heights, off + float(np.ptp(known_heights, axis=0).max()), order)
     path = None if checkpoint is None else Path(checkpoint.path)
     values = scenes, targets, weights, mean, std, begin, noise
-    asked = prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values), Fitted._fields
-    name = digest(asked, values)
+    name = digest((prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)), values)
     if path is not None and path.exists():
         terrain = _load(path, terrain, name)
-    count = len(order) * (sweeps if len(order) > 1 else 1)
-    if len(terrain.windows) > count:
-        done = math.ceil(len(terrain.windows) / len(order))
-        raise ArgumentError("fit_windows", "sweeps", f"must be the {done} that the checkpoint has, or more, it is {sweeps}")
-    for number in range(len(terrain.windows), count):
-        sweep, turn = divmod(number, len(order))
-        place, held = order[turn], _held_sides(order[turn], shape, sweep > 0)
+    for number in range(len(terrain.windows), len(order)):
+        place = order[number]
         here = place.place
         off = _REACH * std[here] + np.where(std[here] > 0, np.abs(mean[here] - terrain.heights[here]), 0)
-        seen = cropped(scenes, targets, weights, terrain.heights, float(off.max()), place, around[turn], sides)
-        tell = False if progress is None else lambda done, number=number: progress(number, count, done)
-        asked = {**options, "draws": 0} if sweep else options
-        found = _fit(seen, terrain, known, place, held, noise, tell, asked) if seen else None
-        done = Fitted(*place, sweep + 1, len(seen))
+        seen = cropped(scenes, targets, weights, terrain.heights, float(off.max()), place, around[number], sides)
+        tell = False if progress is None else lambda done, number=number: progress(number, len(order), done)
+        found = _fit(seen, terrain, known, place, noise, tell, options) if seen else None
+        done = Fitted(*place, len(seen))
         if found is not None:
-            terrain, seam = _joined(terrain, known, found, place, held, overlap)
+            terrain, seam = _joined(terrain, known, found, place, overlap)
             stats = {key: found.stats[key] for key in ("steps", "seconds", "chi2")}
             done = done._replace(result=found.result.value, seam=seam, warnings=found.warnings, **stats)
         terrain = dataclasses.replace(terrain, windows=(*terrain.windows, done))
@@ -194,28 +181,18 @@ def divided(shape: tuple[int, ...], side: int, overlap: int) -> list[Window]:
     return [Window(y, x, *sizes) for y in along[0] for x in along[1]]
 
 
-_Sides = tuple[bool, bool, bool, bool]
-"""Whether the first row of a window is held, its last row, its first column, its last column."""
-
-
-def _held_sides(window: Window, shape: tuple[int, ...], all_known: bool) -> _Sides:
-    """Those beyond which the terrain goes on and is known, in the first sweep by the windows before."""
-    last = window.y + window.ny < shape[0], window.x + window.nx < shape[1]
-    return window.y > 0, all_known and last[0], window.x > 0, all_known and last[1]
-
-
 def _fit(
-    seen: Sequence[Seen], terrain: Mosaic, prior: Prior, window: Window, sides: _Sides, noise: Any, progress: Any,
-    options: dict[str, Any],
-) -> Fit | None:  # fmt: skip
+    seen: Sequence[Seen], terrain: Mosaic, prior: Prior, window: Window, noise: Any, progress: Any, options: dict[str, Any]
+) -> Fit | None:
     """The fit of a window; None where all of its heights are held."""
     here = window.place
     held = prior.std[here] == 0
-    for side, is_held in zip((np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]), sides, strict=True):
-        held[side] |= is_held
+    held[0] |= window.y > 0
+    held[:, 0] |= window.x > 0
     if held.all():
         return None
-    known = Prior(np.where(held, terrain.heights[here], prior.heights[here]), np.where(held, 0, prior.std[here]), prior.length)
+    rim = np.where(held & (prior.std[here] > 0), terrain.heights[here], np.nan)
+    known = Prior(prior.heights[here], prior.std[here], prior.length, rim)
     if noise is not None and np.ndim(noise) == 1:
         noise = numbers(noise)[[part.number for part in seen]]
     return fit(
@@ -224,15 +201,15 @@ def _fit(
     )  # fmt: skip
 
 
-def _joined(terrain: Mosaic, prior: Prior, found: Fit, window: Window, sides: _Sides, overlap: int) -> tuple[Mosaic, float]:
-    """The terrain with a window's heights, and how far these were off it in the window's overlap."""
+def _joined(terrain: Mosaic, prior: Prior, found: Fit, window: Window, overlap: int) -> tuple[Mosaic, float]:
+    """The terrain with a window's heights, and the difference in its overlap with those before."""
     here, done = window.place, prior.std == 0
     for before in terrain.windows:
         if before.result:
             done[Window(*before[:4]).place] = True
     done = done[here]
-    # From 0 at sides beyond which the terrain is known to 1. At the right that was, in the first sweep, in the row before.
-    rows = _ramp(*sides[:2], window.ny, overlap)
+    # From 0 at sides in windows before to 1, where these end; what is at the right was fitted in the row before.
+    rows = _ramp(window.y > 0, False, window.ny, overlap)
     columns = _ramp(window.x > 0, window.x + window.nx < terrain.heights.shape[1], window.nx, overlap)
     share = np.where(done, rows[:, None] * columns, 1)
     heights, std, seen = (np.array(getattr(terrain, part)) for part in _ARRAYS)

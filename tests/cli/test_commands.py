@@ -136,7 +136,6 @@ REFUSED = [
     ("tradeoff scene.toml --width 0", "--width must be positive, it is 0"),
     ("tradeoff scene.toml --devices -1", "--devices must be positive, it is -1"),
     ("fit case.toml -o a.npy --overlap 8", "--overlap must stand with --window"),
-    ("fit case.toml -o a.npy --sweeps 1", "--sweeps must stand with --window"),
     ("fit case.toml -o a.npy --window 32 --report page.html", "--report must stand without --window: it shows one fit"),
     ("fit hills.npz -o a.npy", "hills.npz: cannot read what to fit from"),
     ("fit scene.toml -o a.npz", "scene.toml: a fit must have 'pictures'"),

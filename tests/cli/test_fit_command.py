@@ -138,9 +138,8 @@ def windowed(options: dict, ends: bool = True):
         save_checkpoint(checkpoint.path, {}, ())
         if not ends:
             raise KeyboardInterrupt
-        first = jaxhf.Fitted(0, 0, 9, 6, 1, 1, jaxhf.Stop.CONVERGED.value, 3, 1.0, 0.98765, float("nan"), ("chi2 is 9",))
-        done = first, jaxhf.Fitted(0, 3, 9, 6, 1, 1, jaxhf.Stop.MAX_STEPS.value, 1, 1.0, 1.5, 0.125)
-        done = (*(window._replace(chi2=7.0) for window in done), *(window._replace(sweep=2) for window in done))
+        first = jaxhf.Fitted(0, 0, 9, 6, 1, jaxhf.Stop.CONVERGED.value, 3, 1.0, 0.98765, float("nan"), ("chi2 is 9",))
+        done = first, jaxhf.Fitted(0, 3, 9, 6, 1, jaxhf.Stop.MAX_STEPS.value, 1, 1.0, 1.5, 0.125)
         return jaxhf.Mosaic(TRUTH, 0 * TRUTH + 1.5, TRUTH <= 15, done)
 
     return fit_windows
@@ -154,7 +153,7 @@ def test_windows_are_told_one_by_one(folder, monkeypatch, run):
     code, _, said = run("all.npz", "--window", 32, "--overlap", 8)
     assert (code, said) == (130, f"\njaxhf: interrupted; the same command with --resume goes on from {checkpoint}\n")
     monkeypatch.setattr("jaxhf.cli.commands.fit.fit_windows", windowed(options))
-    code, said, warned = run("all.npz", "--window", 32, "--overlap", 8, "--sweeps", 3, "--resume")
+    code, said, warned = run("all.npz", "--window", 32, "--overlap", 8, "--resume")
     lines = said.splitlines()
     assert code == 0
     assert re.fullmatch(rf"{folder}/all.npz: 9 x 9 heights from 1 picture in 2 windows, [0-9.e-]+ s", lines[0])
@@ -163,7 +162,7 @@ def test_windows_are_told_one_by_one(folder, monkeypatch, run):
         f"rows 0-8 columns 3-8: {jaxhf.Stop.MAX_STEPS.value}; 1 step, chi2 1.5, 0.125 off its neighbours",
     ]
     assert warned == "jaxhf: warning: rows 0-8 columns 0-5: chi2 is 9\n"
-    assert [options[name] for name in ("window", "overlap", "sweeps", "resume", "draws")] == [32, 8, 3, True, 2]
+    assert [options[name] for name in ("window", "overlap", "resume", "draws")] == [32, 8, True, 2]
     assert (options["prior"].std, options["unknown"].camera_std) == (30, [5, 1])
     np.testing.assert_array_equal(jaxhf.load_heights(folder / "all.npz").heights, TRUTH)
     np.testing.assert_array_equal(jaxhf.load_heights(folder / "all_std.npz").heights, 0 * TRUTH + 1.5)

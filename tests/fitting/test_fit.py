@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 from small_fits import HALF, LIGHTS, SETTINGS, SIZE, TRUTH, off_in_shape, pictures, rms, scenes
 
 import jaxhf
@@ -266,6 +267,21 @@ def test_heights_that_are_held_stay_as_they_are(targets):
     assert (found.std[std == 0] == 0).all()
     assert (found.std[std > 0] > 0).all()
     np.testing.assert_allclose(np.sqrt(np.mean((found.samples - heights) ** 2, axis=0)), found.std, atol=1e-7)
+
+
+def test_a_height_that_is_held_tells_of_those_beside_it(targets):
+    """As the errors of the prior hang together, by Whittle's correlation (r/L) K₁(r/L): pictures of such noise tell nothing."""
+    held = np.full(TRUTH.shape, np.nan)
+    held[5, 6] = 0.12
+    found = jaxhf.fit(scenes(), targets, settings=SETTINGS, noise=1e3, prior=jaxhf.Prior(0.1, 0.02, 0.25, held))
+    y, x = (np.indices(TRUTH.shape).T - (5, 6)).T / (len(TRUTH) - 1)
+    r = np.maximum(np.hypot(x, y) / 0.25, 1e-9)
+    np.testing.assert_allclose(np.asarray(found.heights) - 0.1, 0.02 * r * scipy.special.k1(r), rtol=0, atol=1e-3)
+    assert found.heights[5, 6] == np.float32(0.12)
+    with pytest.raises(
+        jaxhf.ArgumentError, match=r"Prior: held must be finite, nan where heights are sought, of shape \(12, 12\)"
+    ):
+        jaxhf.fit(scenes(), targets, settings=SETTINGS, prior=jaxhf.Prior(0.1, 0.02, 0.25, held[1:]))
 
 
 @pytest.mark.deep  # of test_expansion, too

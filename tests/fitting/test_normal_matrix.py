@@ -23,11 +23,12 @@ sp: Any = scipy.sparse  # whose stubs miss much
 OPTIONS = {"settings": SETTINGS, "noise": 0.01}
 VALUES = 3 * SIZE * SIZE
 HELD = np.where(np.indices(TRUTH.shape).sum(0) % 5 == 0, 0.0, 0.05)
+APART = np.where(np.indices(TRUTH.shape).sum(0) % 7 == 1, TRUTH + 0.02, np.nan)
 PRIORS = {
     "none": None,
     "independent, some held": jaxhf.Prior(TRUTH, HELD),
     "correlated": jaxhf.Prior(TRUTH, 0.05, 0.2),
-    "correlated, some held": jaxhf.Prior(TRUTH, HELD, 0.2),
+    "correlated, some held": jaxhf.Prior(TRUTH, HELD, 0.2, APART),
 }
 BOTH = "correlated, some held"  # of whose terms the others have a part
 EACH = pytest.mark.parametrize(

@@ -28,7 +28,7 @@ STD = 0.01
 WINDOW = Window(8, 16, 24, 24)
 # From straight above, without shadows and a border in sight: points on edges take a minute to compile.
 PLAIN = jaxhf.Settings(samples=4, chunk=256, shadows=False, edge_samples=0)
-OPTIONS: dict[str, Any] = {"window": 32, "overlap": 16, "sweeps": 1, "settings": PLAIN, "draws": 10}
+OPTIONS: dict[str, Any] = {"window": 32, "overlap": 16, "settings": PLAIN, "draws": 10}
 
 
 def scenes(heights: Any, camera: Any = CAMERA, albedo: Any = 0.7) -> list[jaxhf.Scene]:
@@ -134,7 +134,7 @@ def test_a_window_at_a_seam_has_its_part_of_it():
 def test_windows_come_near_the_truth_without_seams():
     """As near as one fit of all; where windows join, steps in the error are those of the rest."""
     targets = pictures()
-    found = fit_windows(scenes(known().heights, ABOVE), targets, prior=known(), **dict(OPTIONS, sweeps=2))
+    found = fit_windows(scenes(known().heights, ABOVE), targets, prior=known(), **OPTIONS)
     error = found.heights - TRUTH
     at_once = np.asarray(jaxhf.fit(scenes(known().heights, ABOVE), targets, prior=known(), settings=PLAIN).heights) - TRUTH
     assert np.std(error[found.seen]) < 1.2 * np.std(at_once[found.seen]) < 0.6 * STD
@@ -162,9 +162,8 @@ class Fits:
         heights = TRUTH[y : y + 32, x : x + 32] + self.off * (1 + y + 2 * x)
         shape = heights.shape
         return jaxhf.Fit(
-            heights=np.where(prior.std == 0, prior.heights, heights).astype(np.float32), result=jaxhf.Stop.CONVERGED,
-            std=np.full(shape, 1.0 + y) if given["draws"] else None, samples=None, seen=np.ones(shape, bool), albedo=None,
-            exposures=None, offsets=None,
+            heights=np.where(np.isnan(prior.held), heights, prior.held).astype(np.float32), result=jaxhf.Stop.CONVERGED,
+            std=np.full(shape, 1.0 + y), samples=None, seen=np.ones(shape, bool), albedo=None, exposures=None, offsets=None,
             noise=np.ones(3), scenes=(), settings=PLAIN, images=(), residuals=(), regions=(), warnings=("said",),
             stats={"steps": 3, "seconds": 1.0, "chi2": 1.0}, history=(),
         )  # fmt: skip
@@ -177,11 +176,11 @@ def test_windows_go_over_into_one_another(tmp_path, monkeypatch):
     monkeypatch.setattr(_windows, "fit", fits)
     found = fit_windows(scenes(TRUTH, ABOVE), targets, **options)
     assert [(done.y, done.x) for done in found.windows] == [(0, 0), (0, 16), (16, 0), (16, 16)]
-    held = [given["prior"].std == 0 for _, given in fits.given]
+    held = [np.isfinite(given["prior"].held) for _, given in fits.given]
     assert [mask.sum() for mask in held] == [0, 32, 32, 63]
     assert held[1][:, 0].all()
     assert held[2][0].all()
-    np.testing.assert_array_equal(fits.given[1][1]["prior"].heights[:, 0], np.asarray(TRUTH + 0.01, np.float64)[:32, 16])
+    np.testing.assert_array_equal(fits.given[1][1]["prior"].held[:, 0], np.asarray(TRUTH + 0.01, np.float64)[:32, 16])
     np.testing.assert_array_equal(fits.given[0][1]["noise"], [0.1, 0.2, 0.3])
     off = found.heights - TRUTH
     np.testing.assert_allclose(off[:16, :17], 0.01, atol=1e-6)
@@ -209,34 +208,6 @@ def test_windows_go_over_into_one_another(tmp_path, monkeypatch):
     options["overlap"] = 12
     with pytest.raises(ValueError, match="another fit"):
         fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=again, **options)
-
-
-def test_in_a_second_sweep_windows_are_held_all_around(tmp_path, monkeypatch):
-    """At what the others found; deviations stay those of the first, and what is done is not done again."""
-    targets, path = [np.zeros((48, 48), np.float32)] * 3, tmp_path / "windows"
-    options: dict[str, Any] = {"prior": known(), "noise": 0.1, **OPTIONS, "sweeps": 2}
-    monkeypatch.setattr(_windows, "fit", once := Fits())
-    first = fit_windows(scenes(TRUTH, ABOVE), targets, **dict(options, sweeps=1))
-    monkeypatch.setattr(_windows, "fit", Fits(6))
-    with pytest.raises(KeyboardInterrupt):
-        fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=jaxhf.Checkpoint(path), **options)
-    monkeypatch.setattr(_windows, "fit", rest := Fits())
-    found = fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=jaxhf.Checkpoint(path, resume=True), **options)
-    assert [(done.sweep, done.y, done.x) for done in found.windows[4:]] == [(2, 0, 0), (2, 0, 16), (2, 16, 0), (2, 16, 16)]
-    assert (len(once.given), len(rest.given)) == (4, 2)
-    assert [given["draws"] for _, given in (*once.given, *rest.given)] == [10] * 4 + [0] * 2
-    held = [given["prior"].std == 0 for _, given in rest.given]
-    for mask, corner in zip(held, (np.s_[0, -1], np.s_[0, 0]), strict=True):
-        assert mask.sum() == 63
-        assert mask[corner]
-    np.testing.assert_array_equal(found.std, first.std)
-    off = found.heights - TRUTH
-    assert np.abs(off - (first.heights - TRUTH)).max() > 0.01  # heights are the second's
-    assert max(np.abs(np.diff(off, axis=axis)).max() for axis in (0, 1)) < 0.03
-    more = fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=jaxhf.Checkpoint(path, resume=True), **dict(options, sweeps=3))
-    assert [done.sweep for done in more.windows] == [1] * 4 + [2] * 4 + [3] * 4
-    with pytest.raises(ValueError, match="sweeps must be the 3 that the checkpoint has, or more, it is 1"):
-        fit_windows(scenes(TRUTH, ABOVE), targets, checkpoint=jaxhf.Checkpoint(path, resume=True), **dict(options, sweeps=1))
 
 
 def test_what_is_around_a_window_may_rise_to_its_prior(monkeypatch):
@@ -283,7 +254,6 @@ def test_a_window_at_the_camera_does_not_enlarge_the_others():
         ({"prior": None}, "prior must be a jaxhf.Prior, it is None"),
         ({"window": 8}, "window must be a whole number from 32"),
         ({"overlap": 17}, "overlap must be"),
-        ({"sweeps": 0}, "sweeps must be a whole number from 1"),
         ({"unknown": jaxhf.Unknown(exposures=True)}, "unknown must be left out"),
     ],
 )

@@ -31,9 +31,8 @@ from ..scene_warnings import warn
 
 
 def run(options: argparse.Namespace) -> None:
-    for name in ("overlap", "sweeps"):
-        if options.window is None and getattr(options, name) is not None:
-            raise UserError(f"--{name} must stand with --window")
+    if options.window is None and options.overlap is not None:
+        raise UserError("--overlap must stand with --window")
     if options.window is not None and options.report:
         raise UserError("--report must stand without --window: it shows one fit")
     heights, checkpoint = Path(options.output), Path(f"{options.output}.checkpoint")
@@ -63,8 +62,7 @@ def run(options: argparse.Namespace) -> None:
     made = f"{heights}: {ny} x {nx} heights from {counted(len(case.targets), 'picture')}"
     if isinstance(found, Mosaic):
         checkpoint.unlink(missing_ok=True)
-        count = sum(done.sweep == 1 for done in found.windows)
-        print(f"{made} in {counted(count, 'window')}, {time.monotonic() - begin:.3g} s")
+        print(f"{made} in {counted(len(found.windows), 'window')}, {time.monotonic() - begin:.3g} s")
         return _tell_of_windows(found)
     if found.albedo is not None:
         factors = np.asarray(found.albedo)[::-1]  # a texture begins at v = 0, an image at its top
@@ -93,7 +91,7 @@ def _fit(case: Case, checkpoint: Path, options: argparse.Namespace) -> Fit | Mos
             if not windows:
                 return fit(case.scenes, case.targets, progress=progress.note, **given)
             return fit_windows(
-                case.scenes, case.targets, window=options.window, overlap=options.overlap, sweeps=options.sweeps or 2, **given,
+                case.scenes, case.targets, window=options.window, overlap=options.overlap, **given,
                 progress=lambda number, count, done: progress.note(done, f"window {number + 1} of {count}: "),
             )  # fmt: skip
     except KeyboardInterrupt:
@@ -117,8 +115,6 @@ def _tell_of_fit(made: str, case: Case, found: Fit) -> None:
 
 def _tell_of_windows(found: Mosaic) -> None:
     for done in found.windows:
-        if done.sweep < found.windows[-1].sweep:
-            continue
         where = f"rows {done.y}-{done.y + done.ny - 1} columns {done.x}-{done.x + done.nx - 1}"
         seam = "" if math.isnan(done.seam) else f", {done.seam:.3g} off its neighbours"
         print(f"{where}: {done.result or 'in no picture'}; {counted(done.steps, 'step')}, chi2 {done.chi2:.4g}{seam}")

@@ -99,7 +99,7 @@ class NormalMatrix:
         """H x."""
         surface, others = self.split(x)
         result = self._pulled(self.seen(x) * self.roots)
-        result[: surface.size] += self._prior_pull(self._prior_push(surface)).ravel()
+        result[: surface.size] += (self.free * self._prior_pull(self._prior_push(self.free * surface))).ravel()
         result[surface.size :] += self.others_weight**2 * others
         return result
 
@@ -136,7 +136,7 @@ class NormalMatrix:
     def gathered(self, residuals: Residuals) -> Flat:
         """Jᵀ times a number for each residual."""
         result = self._pulled(residuals.pictures * self.roots)
-        result[: residuals.modes.size] += self._prior_pull(residuals.modes).ravel()
+        result[: residuals.modes.size] += (self.free * self._prior_pull(residuals.modes)).ravel()
         result[residuals.modes.size :] += self.others_weight * residuals.others
         return result
 
@@ -151,7 +151,7 @@ class NormalMatrix:
 
     def modes_of(self, x: Flat) -> Float[np.ndarray, "my mx"]:
         """The modes of the surface's prior by which it moves, in units of their deviations."""
-        return self._prior_push(self.split(x)[0])
+        return self._prior_push(self.free * self.split(x)[0])
 
     def modes_before(self) -> Float[np.ndarray, "my mx"]:
         """By which the surface differs from its prior."""

@@ -150,12 +150,17 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: 
     length = None if given.prior is None else given.prior.length
     start = _without_holes(np.asarray(first.heights)) if given.start is None else given.start
     heights = make_heights("fit", "start", start, field)
-    free, held = None, np.zeros(heights.shape, bool)
+    free, counts, held = None, None, np.zeros(heights.shape, bool)
     if given.prior is not None and not np.asarray(numbers(given.prior.std)).all():
         held = np.broadcast_to(np.asarray(numbers(given.prior.std)) == 0, heights.shape)
         heights = np.where(held, make_heights("Prior", "heights", given.prior.heights, field), heights)
     if field.seam is not None:
         held, heights = held | np.isfinite(np.asarray(field.seam)).all(-1), with_seam(field, heights)
+    if held.any():
+        counts = pad((~held).astype(np.float64), padding(field, length))
+    if given.prior is not None and given.prior.held is not None:
+        known = _held_heights(given.prior.held, field)
+        held, heights = held | np.isfinite(known), np.where(held | np.isnan(known), heights, known)
     if held.any():
         free = pad((~held).astype(np.float64), padding(field, length))
     base = pad(heights, padding(field, length))
@@ -170,7 +175,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: 
     problem = Problem(
         groups=groups,
         basis=basis,
-        terms=make_terms(field, given.prior, given.unknown, base, free, view_unit, albedo),
+        terms=make_terms(field, given.prior, given.unknown, base, counts, view_unit, albedo),
         loss_scale=jnp.asarray(LOSS_SCALE, dtype),
         noise=np.ones(len(scenes)),
         brightness=brightness,
@@ -184,6 +189,15 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: 
         known=given.prior is not None,
     ).with_noise(_noise(given.noise, brightness))
     return problem.with_edge_samples(problem.edge_samples_for(jnp.asarray(heights, dtype), given.settings)), unknowns
+
+
+def _held_heights(held: Any, field: Heightfield) -> Float[np.ndarray, "ny nx"]:
+    """ArgumentError where those of a prior have another shape than the heights, or are infinite."""
+    known, shape = np.asarray(numbers(held), np.float64), field.heights.shape
+    if known.shape != shape or np.isinf(known).any():
+        rule = f"must be finite, nan where heights are sought, of shape {shape}, as the heights; its shape is {known.shape}"
+        raise ArgumentError("Prior", "held", rule)
+    return known
 
 
 def _view_unit(scenes: Sequence[Scene], unknown: Unknown) -> View:

@@ -104,11 +104,12 @@ def make_terms(
     prior: Prior | None,
     unknown: Unknown,
     start: Float[np.ndarray, "my mx"],
-    free: Float[np.ndarray, "my mx"] | None,
+    counts: Float[np.ndarray, "my mx"] | None,
     view_unit: View,
     albedo: AlbedoField | None,
 ) -> Terms:
-    """The priors of a fit from `start`, which is padded; `free` is `Basis`'s, `view_unit` and `albedo` are `Problem`'s.
+    """The priors of a fit from `start`, which is padded; `counts`: 0 where heights are held whose errors tell of no others,
+    else 1; `view_unit` and `albedo` are `Problem`'s.
 
     Factors have their mean 1, offsets 0, and what else is not told the deviation 1.
     """
@@ -119,8 +120,8 @@ def make_terms(
         return Term(mean, weight, one)
 
     surface = _shape_term(field, start) if prior is None else _prior_term(field, prior)
-    if free is not None:
-        surface = eqx.tree_at(lambda term: term.weight, surface, surface.weight * jnp.asarray(free, dtype))
+    if counts is not None:
+        surface = eqx.tree_at(lambda term: term.weight, surface, surface.weight * jnp.asarray(counts, dtype))
     others = []
     if unknown.albedo is not None:
         others.append(term(one, one / unknown.albedo_std) if albedo is None else term(none, albedo.weight))

@@ -73,7 +73,8 @@ def on_finer(state: State, problems: Sequence[Problem], level: int, given: Given
     there = surface_of(state.unknowns, state.posed(coarse, stage.share).basis)
     change = coarse.basis.crop(np.asarray(there, np.float64) - np.asarray(coarse.basis.base, np.float64))
     shape, dtype = fine.field.heights.shape, fine.field.heights.dtype
-    base = np.asarray(fine.basis.base, np.float64) + pad(resample(change, shape), fine.basis.padding)
+    free = 1.0 if fine.basis.free is None else np.asarray(fine.basis.free, np.float64)
+    base = np.asarray(fine.basis.base, np.float64) + free * pad(resample(change, shape), fine.basis.padding)
     unknowns = state.unknowns.with_modes(jnp.zeros_like(fine.basis.base))
     factors = coarse.factors(unknowns)
     if factors is not None and factors.shape != fine.albedo_shape:  # one factor for each vertex
