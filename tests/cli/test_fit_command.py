@@ -247,6 +247,6 @@ def test_elsewhere_a_line_a_minute_tells_it(folder, quiet):
         assert lines == []
         return
     assert 3 <= len(lines) <= 6
-    assert lines[0] == "jaxhf: compiling, 1 s so far"
+    assert lines[0] == "jaxhf: compiling, then the first step, 1 s so far"
     assert re.fullmatch(r"jaxhf: step \d, \d s so far, about \d+ s to come, then deviations; 9 DCT modes .*", lines[-2])
     assert "\r" not in err
