@@ -49,6 +49,7 @@ class Prior:
     def __post_init__(self):
         require_heights("Prior", "heights", self.heights)
         require_heights("Prior", "std", self.std)
+        require_heights("Prior", "held", self.held)
         std = np.asarray(numbers(self.std), np.float64)
         if not (np.isfinite(std).all() and (std >= 0).all() and (std > 0).any()):
             given = f"{std:g}" if std.ndim == 0 else f"{std.min():g} to {std.max():g}"

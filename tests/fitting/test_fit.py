@@ -282,6 +282,10 @@ def test_a_height_that_is_held_tells_of_those_beside_it(targets):
         jaxhf.ArgumentError, match=r"Prior: held must be finite, nan where heights are sought, of shape \(12, 12\)"
     ):
         jaxhf.fit(scenes(), targets, settings=SETTINGS, prior=jaxhf.Prior(0.1, 0.02, 0.25, held[1:]))
+    with pytest.raises(jaxhf.ArgumentError, match="its shape is \\(12, 12\\), 0 of them nan"):
+        jaxhf.fit(scenes(), targets, settings=SETTINGS, prior=jaxhf.Prior(0.1, 0.02, 0.25, 0 * TRUTH))
+    with pytest.raises(jaxhf.ArgumentError, match="Prior: held must be heights, it is a name"):
+        jaxhf.Prior(0.1, 0.02, 0.25, "held.tif")
 
 
 @pytest.mark.deep  # of test_expansion, too

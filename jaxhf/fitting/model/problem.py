@@ -192,11 +192,11 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: 
 
 
 def _held_heights(held: Any, field: Heightfield) -> Float[np.ndarray, "ny nx"]:
-    """ArgumentError where those of a prior have another shape than the heights, or are infinite."""
+    """ArgumentError where those of a prior have another shape than the heights, are infinite, or leave none to be sought."""
     known, shape = np.asarray(numbers(held), np.float64), field.heights.shape
-    if known.shape != shape or np.isinf(known).any():
+    if known.shape != shape or np.isinf(known).any() or not np.isnan(known).any():
         rule = f"must be finite, nan where heights are sought, of shape {shape}, as the heights; its shape is {known.shape}"
-        raise ArgumentError("Prior", "held", rule)
+        raise ArgumentError("Prior", "held", f"{rule}, {np.count_nonzero(np.isnan(known))} of them nan")
     return known
 
 
