@@ -238,12 +238,14 @@ def test_it_goes_on_with_coarse_and_with_fine_heights(tmp_path, monkeypatch):
     monkeypatch.setattr(_coarser, "_FACTOR", 2)
     scenes, targets = problem(33)
     unknown = jaxhf.Unknown(albedo="map", light_std=1.0)
-    options = OPTIONS | {"noise": 1.0, "prior": jaxhf.Prior(0.1, 1.0, 0.1), "unknown": unknown}
+    held = np.where(np.indices((33, 33)).sum(0) % 7 == 3, 0.15, np.nan)
+    options = OPTIONS | {"noise": 1.0, "prior": jaxhf.Prior(0.1, 1.0, 0.1, held), "unknown": unknown}
 
     def fit(path: Path | None = None, resume: bool = False, **more: Any) -> jaxhf.Fit:
         return jaxhf.fit(scenes, targets, **options, **more, checkpoint=path and jaxhf.Checkpoint(path, resume=resume))
 
     whole = fit()
+    assert (np.asarray(whole.heights)[np.isfinite(held)] == np.float32(0.15)).all()
     coarse = sum(step.level < 33 for step in whole.history)  # 17 heights a side, with 2 beyond each border
     assert 2 < coarse < len(whole.history) - 2
     for last in (1, coarse - 1, coarse, coarse + 1, len(whole.history) - 1):

@@ -211,7 +211,8 @@ def test_coarser_pictures_are_means_of_the_pixels_that_count():
     picture, weight = rng.uniform(size=(24, 26)), np.ones((24, 26))
     weight[:4, 1:5] = 0.0
     weight[0, 1] = 2.0
-    known = given_with(weights=[weight], prior=jaxhf.Prior(TRUTH, 0.1, 0.4))
+    held = np.where(np.indices(TRUTH.shape)[0] == 0, TRUTH + 0.01, np.nan)
+    known = given_with(weights=[weight], prior=jaxhf.Prior(TRUTH, 0.1, 0.4, held))
     (scene,), (target,), arguments = coarser([scenes(TRUTH)[0].with_camera(camera)], [picture], known, 4)
     assert (scene.camera.height, scene.camera.width) == target.shape == (6, 7)
     np.testing.assert_allclose(target[2, 3], picture[8:12, 11:15].mean())
@@ -229,6 +230,8 @@ def test_coarser_pictures_are_means_of_the_pixels_that_count():
     assert arguments.prior is not None
     np.testing.assert_allclose(arguments.prior.heights, field.heights, atol=1e-6)
     assert arguments.prior.length == 0.4
+    np.testing.assert_allclose(arguments.prior.held[0], np.interp(np.linspace(0, 11, 4), np.arange(12), held[0]))
+    assert np.isnan(arguments.prior.held[1:]).all()
 
 
 def test_many_samples_ask_for_coarser_levels():
