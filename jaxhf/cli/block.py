@@ -120,21 +120,27 @@ def photograph(
     field = ready.scene.heightfields[0]
     ny, nx = field.heights.shape
     size = math.hypot((nx - 1) * field.dx, (ny - 1) * field.dy)
-    total = np.zeros((camera.height, camera.width, 3))
+    total = np.zeros((camera.height, camera.width, 3), np.float32)
     for k in range(side * side):
         dx, dy = ((k % side + 0.5) / side - 0.5, (k // side + 0.5) / side - 0.5)
         moved = cropped(camera, dx, dy, camera.width, camera.height)
-        image, aovs = render(ready.with_camera(moved), aovs=("depth",))
-        total += _in_haze(np.asarray(image, np.float64), np.asarray(aovs["depth"], np.float64), size, look.haze)
+        image, aovs = render(ready.with_camera(moved), aovs=("depth",), progress=_on_host)
+        total += _in_haze(image.astype(np.float32), aovs["depth"].astype(np.float32), size, look.haze)
         if progress is not None:
             progress()
-    return (total / side**2).astype(np.float32)
+    return total / np.float32(side**2)
 
 
-def _in_haze(image: np.ndarray, depth: np.ndarray, size: float, haze: float) -> np.ndarray:
-    rows = np.linspace(0, 1, len(image))[:, None, None]
-    behind = (1 - rows) * np.array(_ABOVE) + rows * np.array(_BELOW)
+def _on_host(done: int, pixels: int) -> None:
+    """With a `progress` pictures are put together on the host, where they are needed here."""
+
+
+def _in_haze(
+    image: Float[np.ndarray, "h w 3"], depth: Float[np.ndarray, "h w"], size: float, haze: float
+) -> Float[np.ndarray, "h w 3"]:
     met = np.isfinite(depth)
-    near = depth[met].min(initial=np.inf)
-    share = (1 - haze) ** (np.where(met, depth - near, 0) / size)
-    return np.where(met[..., None], image * share[..., None] + np.array(_HAZE) * (1 - share[..., None]), behind)
+    far = np.where(met, depth - depth.min(where=met, initial=np.inf), 0)
+    share = np.exp(far * np.float32(math.log1p(-haze) / size))[..., None]
+    hazy = image + (1 - share) * (np.float32(_HAZE) - image)
+    rows = np.linspace(0, 1, len(image), dtype=np.float32)[:, None, None]
+    return np.where(met[..., None], hazy, (1 - rows) * np.float32(_ABOVE) + rows * np.float32(_BELOW))

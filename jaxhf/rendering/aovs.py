@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 from ..core.errors import ArgumentError
 from ..core.ray import Ray
-from ..preparation.world import World, first_hit
+from ..preparation.world import World
 from ..shade.lighting import in_shadow
+from ..trace.hit import Hit
 
 AOVS = ("depth", "normal", "uv", "status", "object", "cell", "shadow", "steps", "exhausted")
 """Arbitrary output variables, each (h, w) or (h, w, c), of the ray through the pixel's centre:
@@ -32,9 +33,8 @@ def known_aovs(owner: str, names: Any) -> tuple[str, ...]:
     return names
 
 
-def observe(world: World, ray: Ray, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
-    """Those of `aovs` that belong to one ray: all but "exhausted"."""
-    hit = first_hit(world, ray, count_steps="steps" in aovs)
+def observe(world: World, ray: Ray, hit: Hit, aovs: tuple[str, ...]) -> dict[str, jax.Array]:
+    """Those of `aovs` that belong to one ray and its first hit: all but "exhausted"."""
     found = hit.object >= 0
     makers: dict[str, Callable[[], jax.Array]] = {
         "depth": lambda: jnp.where(found, hit.t if ray.before is None else hit.t + ray.before, jnp.inf),

@@ -105,7 +105,7 @@ def trace_in_parts(
         if progress is not None:
             progress(pixels, pixels)
         return found
-    size = most if progress is None else min(most, math.ceil(tiling.count / 64))
+    size = most if progress is None else min(most, max(math.ceil(tiling.count / 64), most // tiling.samples))
     for first, part in _parts(world, camera, aovs, mesh, size):
         done = min(first + size, tiling.count)
         for name, values in on_host(part).items():

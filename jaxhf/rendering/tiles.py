@@ -13,10 +13,10 @@ from jaxtyping import Float, Int
 
 from ..core.autodiff import recomputed
 from ..core.settings import Settings
-from ..core.types import Index
-from ..preparation.world import World
+from ..core.types import Index, Scalar, Vector
+from ..preparation.world import World, first_hit
 from ..scene.camera import Camera
-from ..shade.radiance import radiance
+from ..shade.radiance import radiance, radiance_and_hit
 from ..xla.devices import map_first, map_over
 from ..xla.kernel import one_kernel
 from ..xla.materialise import materialise
@@ -107,16 +107,40 @@ def light_along(
     return jax.vmap(lambda x, y: radiance(world, materialise(camera.ray(x, y))))(x, y)
 
 
+def _seen_along(
+    aovs: tuple[str, ...], world: World, camera: Camera, x: Float[jax.Array, " n"], y: Float[jax.Array, " n"]
+) -> tuple[Float[jax.Array, "n 3"], Int[jax.Array, " n"], dict[str, jax.Array]]:
+    """As `light_along`, and the AOVs of the same rays."""
+
+    def seen(x: Scalar, y: Scalar) -> tuple[Vector, Index, dict[str, jax.Array]]:
+        ray = materialise(camera.ray(x, y))
+        light, exhausted, hit = radiance_and_hit(world, ray, count_steps="steps" in aovs)
+        return light, exhausted, observe(world, ray, hit, aovs)
+
+    return recomputed(jax.vmap(seen))(x, y)
+
+
 def _trace_tile(aovs: tuple[str, ...], world: World, camera: Camera, corner: jax.Array) -> dict[str, jax.Array]:
     dtype = camera.world_from_camera.dtype
     columns, rows = (place.astype(dtype) for place in pixels_from(corner, tile_side(world.settings)))
-    image, exhausted = _pixels(world, camera, columns, rows)
-    outputs = {"image": image}
-    if aovs:
-        outputs |= jax.vmap(lambda x, y: observe(world, camera.ray(x + 0.5, y + 0.5), aovs))(columns, rows)
+    at_centres = columns + 0.5, rows + 0.5
+    observed = tuple(name for name in aovs if name != "exhausted")
+    if not observed:
+        image, exhausted = _pixels(world, camera, columns, rows)
+        outputs = {}
+    elif world.settings.samples in (None, 1):  # the sample's ray is the observed one
+        image, exhausted, outputs = _seen_along(observed, world, camera, *at_centres)
+    else:
+        image, exhausted = _pixels(world, camera, columns, rows)
+        outputs = jax.vmap(functools.partial(_observed_along, observed, world, camera))(*at_centres)
     if "exhausted" in aovs:
         outputs["exhausted"] = exhausted
-    return outputs
+    return outputs | {"image": image}
+
+
+def _observed_along(aovs: tuple[str, ...], world: World, camera: Camera, x: Scalar, y: Scalar) -> dict[str, jax.Array]:
+    ray = camera.ray(x, y)
+    return observe(world, ray, first_hit(world, ray, count_steps="steps" in aovs), aovs)
 
 
 def _pixels(

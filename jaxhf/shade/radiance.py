@@ -26,6 +26,13 @@ def radiance(world: World, ray: Ray) -> tuple[Vector, Index]:
     return _path(world, ray, no_hit(ray.d.dtype), jnp.ones((), bool), world.settings.max_depth + 1)
 
 
+def radiance_and_hit(world: World, ray: Ray, count_steps: bool) -> tuple[Vector, Index, Hit]:
+    """`radiance`, and the ray's first hit."""
+    if not has_mirrors(world.materials, world.settings):
+        return direct(world, ray, count_steps=count_steps)
+    return *radiance(world, ray), first_hit(world, ray, count_steps=count_steps)
+
+
 def radiance_from(world: World, ray: Ray, hit: Hit, active: Flag) -> Vector:
     """`radiance` along a ray whose first hit is known; zero unless active."""
     light, _ = _outgoing(world, ray, hit, active)
@@ -70,9 +77,11 @@ def has_mirrors(materials: Iterable[Material | Mirror], settings: Settings) -> b
     return settings.max_depth > 0 and any(isinstance(material, Mirror) for material in materials)
 
 
-def direct(world: World, ray: Ray, leaving: Hit | None = None, active: Flag | None = None) -> tuple[Vector, Index, Hit]:
-    """`radiance` of a scene without mirrors, and the hit that it comes from; `leaving` and `active` as for `first_hit`."""
-    hit = first_hit(world, ray, leaving, active)
+def direct(
+    world: World, ray: Ray, leaving: Hit | None = None, active: Flag | None = None, count_steps: bool = False
+) -> tuple[Vector, Index, Hit]:
+    """`radiance` of a scene without mirrors, and the hit that it comes from; the other arguments as for `first_hit`."""
+    hit = first_hit(world, ray, leaving, active, count_steps)
     ran_out = hit.status == int(Status.EXHAUSTED)
     light, exhausted = _outgoing(world, ray, hit, ~ran_out if active is None else active & ~ran_out)
     return light, exhausted + ran_out.astype(jnp.int32), hit

@@ -60,6 +60,17 @@ def test_programs_stay_small(settings, transform, bound):
     assert 0.9 * bound < count < bound
 
 
+def test_aovs_of_one_sample_a_pixel_take_no_walk_of_their_own():
+    def program(samples: int, aovs: tuple[str, ...]) -> list[Any]:
+        settings = jaxhf.Settings(samples=samples)
+        return list(equations(jax.make_jaxpr(lambda scene: jaxhf.render(scene, settings, aovs=aovs))(SCENE).jaxpr))
+
+    alone = len(program(1, ()))
+    observed = ("depth", "normal", "uv", "status", "object", "cell")
+    assert len(program(1, observed)) < alone + 50
+    assert len(program(4, observed)) > alone + 500  # which look at the centre, where there is no sample
+
+
 def test_a_gradient_stores_little_of_each_sample():
     """Of each sample only what its walks found is stored for the way back; its shading is computed again."""
     stored = [

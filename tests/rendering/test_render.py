@@ -11,6 +11,7 @@ import oracle
 import pytest
 
 import jaxhf
+from jaxhf.rendering import picture
 from jaxhf.rendering.render import require_key
 from jaxhf.rendering.tiles import Tiling
 
@@ -201,7 +202,8 @@ def test_tiles_cover_the_picture_and_no_more():
     assert Tiling(camera.width, camera.height, jaxhf.Settings(chunk=64)).count == 5 * 3  # of 8 x 8 pixels
 
 
-def test_progress_gives_the_same_bits():
+def test_progress_gives_the_same_bits(monkeypatch):
+    monkeypatch.setattr(picture, "_PIXELS", 2**9)  # traced at once
     camera = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=70, height=67)
     settings = jaxhf.Settings(chunk=64)  # 9 x 9 tiles, the last of each row and column partly outside
     calls = []
