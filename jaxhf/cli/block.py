@@ -141,6 +141,6 @@ def _in_haze(
     met = np.isfinite(depth)
     far = np.where(met, depth - depth.min(where=met, initial=np.inf), 0)
     share = np.exp(far * np.float32(math.log1p(-haze) / size))[..., None]
-    hazy = image + (1 - share) * (np.float32(_HAZE) - image)
+    hazy = image + (1 - share) * (np.array(_HAZE, np.float32) - image)
     rows = np.linspace(0, 1, len(image), dtype=np.float32)[:, None, None]
-    return np.where(met[..., None], hazy, (1 - rows) * np.float32(_ABOVE) + rows * np.float32(_BELOW))
+    return np.where(met[..., None], hazy, (1 - rows) * np.array(_ABOVE, np.float32) + rows * np.array(_BELOW, np.float32))
