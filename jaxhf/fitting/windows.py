@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ..core.errors import ArgumentError
+from ..core.errors import ArgumentError, counted
 from ..core.precision import numbers
 from ..core.rules import Whole, require
 from ..core.settings import Settings
@@ -24,7 +24,7 @@ from .history import Draws, Step
 from .model.pictures import EDGE_SAMPLES, checked_pictures, choose_edge_samples, choose_samples
 from .model.surface import Window, make_heights, with_seam
 from .solve.state import digest
-from .trust.judge import Fit
+from .trust.judge import Fit, in_short
 
 _LEAST_WINDOW, _LEAST_OVERLAP = 32, 8  # heights: the outermost four or so of a window are hardly told by its pictures
 _REACH = 3.0  # deviations by which heights may differ from what is known of them
@@ -72,6 +72,10 @@ class Mosaic:
     std: Float[np.ndarray, "ny nx"] | None
     seen: Bool[np.ndarray, "ny nx"]
     windows: tuple[Fitted, ...]
+
+    def __repr__(self) -> str:
+        """In one line, without arrays."""
+        return f"Mosaic({in_short(self.heights, self.std)}, {counted(len(self.windows), 'window')})"
 
 
 def fit_windows(
@@ -141,12 +145,12 @@ def fit_windows(
     name = digest((prior.length, window, overlap, sorted(options.items()), jax.tree.structure(values)), values)
     if path is not None and path.exists():
         terrain = _load(path, terrain, name)
-    for number in range(len(terrain.windows), len(order)):
-        place = order[number]
+    for at in range(len(terrain.windows), len(order)):
+        place = order[at]
         here = place.place
         off = _REACH * std[here] + np.where(std[here] > 0, np.abs(mean[here] - terrain.heights[here]), 0)
-        seen = cropped(scenes, targets, weights, terrain.heights, float(off.max()), place, around[number], sides)
-        tell = False if progress is None else lambda done, number=number: progress(number, len(order), done)
+        seen = cropped(scenes, targets, weights, terrain.heights, float(off.max()), place, around[at], sides)
+        tell = False if progress is None else lambda done, at=at: progress(at, len(order), done)
         found = _fit(seen, terrain, known, place, noise, tell, options) if seen else None
         done = Fitted(*place, len(seen))
         if found is not None:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError, require_kind
 from ..core.types import AnyArray, height_leaf
-from .record import known, number, numbers
+from .record import known, number, numbers, span
 
 # So that a walk's state fits into 32 bits; each side of the grid counts as the next power of two.
 MOST_CELLS = 2**28
@@ -110,10 +110,8 @@ class Heightfield(eqx.Module):
 
     def __repr__(self) -> str:
         heights = known(self.heights)
-        size, span = numbers(self.heights), ""
+        size, reach = numbers(self.heights), ""
         if heights is not None and heights.ndim == 2:
-            finite = heights[np.isfinite(heights)]
-            lowest, highest = (finite.min(), finite.max()) if finite.size else (np.nan, np.nan)
-            size, span = f"{len(heights)} x {heights.shape[1]}", f", heights {number(lowest)} .. {number(highest)}"
+            size, reach = f"{len(heights)} x {heights.shape[1]}", f", heights {span(heights)}"
         grid = ", ".join(f"{name}={number(getattr(self, name))}" for name in ("dx", "dy", "x0", "y0"))
-        return f"Heightfield({size}, {grid}{span})"
+        return f"Heightfield({size}, {grid}{reach})"

@@ -52,3 +52,10 @@ def number(value: Any) -> str:
     """A float by its first three digits after the point, or by its first three where it is below 1: "4500000.25", "0.0159"."""
     value = float(value) + 0.0  # -0 becomes 0
     return f"{value:.3f}".rstrip("0").rstrip(".") if 1 <= abs(value) < 1e15 else f"{value:.3g}"
+
+
+def span(values: np.ndarray) -> str:
+    """The lowest and the highest of an array's finite values: "-1.5 .. 27.25"."""
+    finite = values[np.isfinite(values)]
+    lowest, highest = (finite.min(), finite.max()) if finite.size else (np.nan, np.nan)
+    return f"{number(lowest)} .. {number(highest)}"

@@ -1,6 +1,7 @@
 """Fits of small pictures, one for each kind of unknown, by what comes out: each against the truth, in single precision."""
 
 import dataclasses
+import re
 from typing import Any
 
 import equinox as eqx
@@ -234,6 +235,9 @@ def test_what_no_picture_shows_is_marked():
     assert found.seen[4:8, 1:5].all()
     assert np.isinf(found.std[unseen]).all()
     assert np.isfinite(found.std[found.seen]).all()
+    ended = r"MAX_STEPS after 5 steps, [\d.]+ s, chi2 [\d.]+, \d+ warnings"
+    said = rf"Fit\(12 x 12, heights [\d.]+ \.\. [\d.]+ ± [\d.]+, {ended}\)"
+    assert re.fullmatch(said, repr(found))
 
 
 def test_a_loss_that_is_not_finite_stops_the_fit(targets):

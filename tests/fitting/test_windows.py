@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import re
 from typing import Any
 
 import numpy as np
@@ -190,6 +191,7 @@ def test_windows_go_over_into_one_another(tmp_path, monkeypatch):
     assert found.std is not None
     np.testing.assert_allclose(found.std[:, 4], np.interp(np.arange(SIDE), [16, 32], [1, 17]))
     np.testing.assert_allclose(found.windows[1].seam, 0.32, rtol=1e-5)
+    assert re.fullmatch(rf"Mosaic\({SIDE} x {SIDE}, heights [-\d.]+ \.\. [\d.]+ ± [\d.]+, \d windows\)", repr(found))
     # Cut short in the third window, it goes on from its file.
     path = tmp_path / "windows"
     monkeypatch.setattr(_windows, "fit", Fits(2))
