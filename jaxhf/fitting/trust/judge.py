@@ -76,16 +76,16 @@ class Fit:
 
     def __repr__(self) -> str:
         """In one line, without arrays."""
-        ended = f"{self.result.name} after {counted(self.stats['steps'], 'step')}, {number(self.stats['seconds'])} s"
+        ended = f"{self.result.name} after {counted(int(self.stats['steps']), 'step')}, {number(self.stats['seconds'])} s"
         said = f"chi2 {number(self.stats['chi2'])}, {counted(len(self.warnings), 'warning')}"
-        return f"Fit({in_short(self.heights, self.std)}, {ended}, {said})"
+        return f"Fit({in_short(np.asarray(self.heights), self.std)}, {ended}, {said})"
 
 
-def in_short(heights: Float[AnyArray, "ny nx"], std: Float[np.ndarray, "ny nx"] | None) -> str:
+def in_short(heights: Float[np.ndarray, "ny nx"], std: Float[np.ndarray, "ny nx"] | None) -> str:
     """Heights found, and the median of what deviations are finite: "64 x 64, heights 0.2 .. 1.4 ± 0.0125"."""
     known = np.empty(0) if std is None else std[np.isfinite(std)]
     deviation = f" ± {number(np.median(known))}" if known.size else ""
-    return f"{heights.shape[0]} x {heights.shape[1]}, heights {span(np.asarray(heights))}{deviation}"
+    return f"{heights.shape[0]} x {heights.shape[1]}, heights {span(heights)}{deviation}"
 
 
 @np.errstate(over="ignore")  # of a fit that ended as not finite
