@@ -70,9 +70,8 @@ TEXELS = np.random.default_rng(3).uniform(0.3, 0.9, (SIDE, SIDE, 3)).astype(np.f
 PAINTED = jaxhf.ImageTexture(TEXELS, at_vertices=True)
 
 
-@pytest.mark.parametrize(
-    ("name", "albedo"), [("perspective", PAINTED), pytest.param("orthographic", 0.7, marks=pytest.mark.deep)]
-)
+@pytest.mark.deep
+@pytest.mark.parametrize(("name", "albedo"), [("perspective", PAINTED), ("orthographic", 0.7)])
 def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
     """Where it counts it is the whole picture's part, with its texture and shadows from outside; the rim does not count."""
     whole = scenes(TRUTH, CAMERAS[name], albedo)
