@@ -19,7 +19,7 @@ from ..preparation.any_size import of_any_terrain
 from ..preparation.world import World
 from ..scene.camera import Camera, of_any_size
 from ..xla.compilation import compiled, is_part_of_more
-from ..xla.devices import everywhere, in_order, map_over, on_every_device, on_host
+from ..xla.devices import by_device, everywhere, map_over, on_every_device, room
 from ..xla.kernel import in_turn, one_kernel
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, tile_side, trace_tiles
@@ -106,16 +106,26 @@ def trace_in_parts(
             progress(pixels, pixels)
         return found
     size = most if progress is None else min(most, max(math.ceil(tiling.count / 64), most // tiling.samples))
+    whole, devices = (tiling.rows * tiling.side, tiling.columns * tiling.side), mesh.devices.size
     for first, part in _parts(world, camera, aovs, mesh, size):
         done = min(first + size, tiling.count)
-        for name, values in on_host(part).items():
-            tiles = in_order(mesh.devices.size, values)[: done - first]
-            if name not in found:
-                found[name] = tiling.room(tiles)
-            tiling.place(tiles, first, found[name])
+        for name, values in part.items():
+            for device, tiles in enumerate(by_device(values, mesh)):
+                numbers = np.arange(first + device, done, devices)
+                if name not in found:
+                    found[name] = room((*whole, *tiles.shape[2:]), tiles.dtype)
+                tiling.place(tiles[: len(numbers)], numbers, found[name])
         if progress is not None:
             progress(min(pixels, done * pixels // tiling.count), pixels)
-    return {name: values[: tiling.height, : tiling.width] for name, values in found.items()}
+    return {name: _cropped(values, tiling.height, tiling.width) for name, values in found.items()}
+
+
+def _cropped(values: np.ndarray, height: int, width: int) -> np.ndarray:
+    if values.shape[:2] == (height, width):
+        return values
+    cropped = room((height, width, *values.shape[2:]), values.dtype)
+    cropped[...] = values[:height, :width]
+    return cropped
 
 
 def _parts(

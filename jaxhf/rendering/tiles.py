@@ -47,14 +47,10 @@ class Tiling:
         grid = tiles.reshape(self.rows, self.columns, self.side, self.side, *tail).swapaxes(1, 2)
         return grid.reshape(self.rows * self.side, self.columns * self.side, *tail)[: self.height, : self.width]
 
-    def room(self, tiles: np.ndarray) -> np.ndarray:
-        """For a picture of tiles like these, and what they reach beyond it."""
-        return np.zeros((self.rows * self.side, self.columns * self.side, *tiles.shape[2:]), tiles.dtype)
-
-    def place(self, tiles: np.ndarray, first: int, into: np.ndarray) -> None:
-        """Writes tiles, (n, side * side, ...), the first of which has this number, where they belong in such a picture."""
+    def place(self, tiles: np.ndarray, numbers: Int[np.ndarray, " n"], into: np.ndarray) -> None:
+        """Writes tiles, (n, side * side, ...), of these numbers where they belong in a picture of whole tiles."""
         grid = into.reshape(self.rows, self.side, self.columns, self.side, *into.shape[2:])
-        rows, columns = np.divmod(np.arange(first, first + len(tiles)), self.columns)
+        rows, columns = np.divmod(numbers, self.columns)
         grid[rows, :, columns] = tiles.reshape(-1, self.side, self.side, *tiles.shape[2:])
 
 

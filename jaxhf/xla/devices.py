@@ -26,6 +26,7 @@ Result = TypeVar("Result")
 # A device more of a CPU costs 7 ms a run, and so many rays take 10 (one terrain) to 300 ms (mirrors) to trace.
 _RAYS_A_DEVICE = 2**16
 _LEAST_DIVIDED = 2**14  # numbers of an array
+_ALIGNMENT = 64  # bytes, of XLA's arrays on CPUs
 
 
 class Spread(eqx.Module):
@@ -135,7 +136,8 @@ def held_everywhere(tree: Any, mesh: Mesh) -> Any:
 
 
 def everywhere(tree: Any, mesh: Mesh) -> Any:
-    """NumPy's arrays, the same ones in each process, on each device of a mesh."""
+    """NumPy's arrays, the same ones in each process, on each device of a mesh; they may not be changed from then on, as CPU
+    devices take those of `room` as they are."""
 
     def copied(values: np.ndarray) -> jax.Array:
         return jax.make_array_from_callback(values.shape, NamedSharding(mesh, P()), lambda index: values[index])
@@ -186,6 +188,23 @@ def on_host(tree: Any) -> Any:
         return np.asarray(leaf if leaf.is_fully_addressable else multihost_utils.process_allgather(leaf, tiled=True))
 
     return jax.tree.map(whole, tree)
+
+
+def by_device(leaf: jax.Array, mesh: Mesh) -> list[np.ndarray]:
+    """What each device of a mesh has of an array whose first axis is divided among them; without a copy, but of what devices
+    of other processes hold."""
+    if mesh.devices.size == 1 or not leaf.is_fully_addressable:
+        return np.split(on_host(leaf), mesh.devices.size)
+    parts = {shard.device: shard.data for shard in leaf.addressable_shards}
+    return [np.asarray(parts[device]) for device in mesh.devices.ravel()]
+
+
+def room(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An array without values that `everywhere` does not copy to CPU devices: it begins where XLA's own do."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + _ALIGNMENT, np.uint8)
+    begin = -memory.ctypes.data % _ALIGNMENT
+    return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
 def where_called(owner: str, tree: Any) -> Any:

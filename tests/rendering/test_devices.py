@@ -46,6 +46,10 @@ if "pictures" in parts:
         results[f"image {name}"] = jaxhf.render(large, settings, mesh=each)
     results["of its size"] = jaxhf.render(scene, settings, mesh=mesh)
     results["in parts"] = jaxhf.render(large, settings, progress=lambda done, total: None, mesh=mesh)
+    shown = jaxhf.render(large, settings, mesh=mesh)
+    results["memories"] = len({shard.data.unsafe_buffer_pointer() for shard in shown.addressable_shards})
+    brighter = jax.jit(lambda image: image + 1, donate_argnums=0)(shown)
+    results["donated"] = np.stack([shard.data for shard in brighter.addressable_shards])
     prepared = jaxhf.prepare(large, settings, mesh=mesh)
     results["prepared"] = jaxhf.render(prepared)
     results["prepared on"] = min(len(leaf.sharding.device_set) for leaf in jax.tree.leaves(prepared._world))
@@ -148,6 +152,9 @@ def test_pictures_have_the_same_bits_on_any_number_of_devices(found, name):
         np.testing.assert_array_equal(each["of its size"], one["of its size"])
         for picture in (*pictures, "in parts", "prepared"):
             np.testing.assert_array_equal(each[picture], one["image none"], err_msg=picture)
+        assert each["memories"] == 1  # all devices of a process share the picture's, which a program may not change
+        for donated in each["donated"]:
+            np.testing.assert_array_equal(donated, one["image none"] + 1)
         assert "render: the scene was prepared on Mesh" in str(each["refused"])
     assert one["image none"].std() > 0.05
 
