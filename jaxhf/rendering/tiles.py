@@ -51,7 +51,7 @@ class Tiling:
         """Writes tiles, (n, side * side, ...), of these numbers where they belong in a picture of whole tiles."""
         grid = into.reshape(self.rows, self.side, self.columns, self.side, *into.shape[2:])
         rows, columns = np.divmod(numbers, self.columns)
-        grid[rows, :, columns] = tiles.reshape(-1, self.side, self.side, *tiles.shape[2:])
+        grid[rows, :, columns] = tiles.reshape(len(tiles), self.side, self.side, *tiles.shape[2:])
 
 
 def tile_side(settings: Settings) -> int:

@@ -202,6 +202,16 @@ def test_tiles_cover_the_picture_and_no_more():
     assert Tiling(camera.width, camera.height, jaxhf.Settings(chunk=64)).count == 5 * 3  # of 8 x 8 pixels
 
 
+def test_tiles_lie_where_they_belong():
+    tiling = Tiling(33, 17, jaxhf.Settings(chunk=64))
+    tiles = np.random.default_rng(0).random((15, 64, 3))
+    whole = np.zeros((24, 40, 3))
+    for first in range(2):
+        tiling.place(tiles[first::2], np.arange(first, 15, 2), whole)
+    np.testing.assert_array_equal(whole[:17, :33], tiling.assemble(tiles))
+    tiling.place(tiles[..., :0], np.arange(15), whole[..., :0])  # as shadows under a sky alone, whose last axis counts lights
+
+
 def test_progress_gives_the_same_bits(monkeypatch):
     monkeypatch.setattr(picture, "_PIXELS", 2**9)  # traced at once
     camera = jaxhf.Perspective.look_at(EYE, TARGET, fov=FOV, width=70, height=67)
