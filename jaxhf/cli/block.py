@@ -139,7 +139,7 @@ def _in_haze(
     image: Float[np.ndarray, "h w 3"], depth: Float[np.ndarray, "h w"], size: float, haze: float
 ) -> Float[np.ndarray, "h w 3"]:
     met = np.isfinite(depth)
-    far = np.where(met, depth - depth.min(where=met, initial=np.inf), 0)
+    far = np.subtract(depth, depth.min(where=met, initial=np.inf), out=np.zeros_like(depth), where=met)
     share = np.exp(far * np.float32(math.log1p(-haze) / size))[..., None]
     hazy = image + (1 - share) * (np.array(_HAZE, np.float32) - image)
     rows = np.linspace(0, 1, len(image), dtype=np.float32)[:, None, None]

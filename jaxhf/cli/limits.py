@@ -9,10 +9,10 @@ from ..scene.scene import Scene
 from ..xla.machine import available_bytes, default_devices, usable_cores
 from .cache import keep_programs
 
-# Bytes in single precision. Measured at the peak: 57 to 65 for each height and device, 32 for each pixel with `exhausted`, 111
+# Bytes in single precision. Measured at the peak: 57 to 65 for each height and device, 16 for each pixel with `exhausted`, 111
 # while a .png is written (docs/guides/devices.md). Less than each is asked for, so that what might fit is tried.
 _BYTES_A_HEIGHT = 45
-_BYTES_A_PIXEL = 30
+_BYTES_A_PIXEL = 14
 _BYTES_A_HEIGHT_OF = {"viewshed": 90, "insolation": 95, "skyview": 60, "horizon": 55}  # docs/measurements/maps.md
 
 

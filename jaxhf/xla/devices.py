@@ -137,9 +137,12 @@ def held_everywhere(tree: Any, mesh: Mesh) -> Any:
 
 def everywhere(tree: Any, mesh: Mesh) -> Any:
     """NumPy's arrays, the same ones in each process, on each device of a mesh; they may not be changed from then on, as CPU
-    devices take those of `room` as they are."""
+    devices take those that begin as XLA's do, see `room`, as they are."""
 
     def copied(values: np.ndarray) -> jax.Array:
+        if not values.flags.c_contiguous:
+            values, parts = room(values.shape, values.dtype), values
+            values[...] = parts
         return jax.make_array_from_callback(values.shape, NamedSharding(mesh, P()), lambda index: values[index])
 
     return jax.tree.map(copied, tree)
@@ -190,13 +193,13 @@ def on_host(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
-def by_device(leaf: jax.Array, mesh: Mesh) -> list[np.ndarray]:
-    """What each device of a mesh has of an array whose first axis is divided among them; without a copy, but of what devices
-    of other processes hold."""
-    if mesh.devices.size == 1 or not leaf.is_fully_addressable:
-        return np.split(on_host(leaf), mesh.devices.size)
-    parts = {shard.device: shard.data for shard in leaf.addressable_shards}
-    return [np.asarray(parts[device]) for device in mesh.devices.ravel()]
+def by_device(leaf: jax.Array, devices: int) -> list[np.ndarray]:
+    """What each of so many devices has of an array whose first axis is divided among them, as `map_first` leaves it; where CPU
+    devices of one process hold it, without a copy."""
+    if devices == 1 or not leaf.is_fully_addressable:
+        return np.split(on_host(leaf), devices)
+    shards = sorted(leaf.addressable_shards, key=lambda shard: shard.index[0].start)
+    return [np.asarray(shard.data) for shard in shards]
 
 
 def room(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
@@ -248,8 +251,8 @@ def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any
 def map_first(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any, count: Any) -> Any:
     """`fun(shared, item)` for the first `count` items, a number that is data, dealt out in turn to the devices of a mesh.
 
-    Results stay where they are made, those of one device after those of the other; `in_order` puts them in order. Those of
-    further items are 0. Has no reverse derivative.
+    Results stay where they are made, those of one device after those of the other; see `by_device`. Those of further
+    items are 0. Has no reverse derivative.
     """
 
     def the_first(shared: Any, items: Any, numbers: jax.Array, count: jax.Array) -> Any:
@@ -292,8 +295,7 @@ def _turns(n: int, devices: int) -> np.ndarray:
 
 
 def in_order(devices: int, values: Any) -> Any:
-    """Results in the order of the items that were dealt out in turn to so many devices, and those of the last one again; for
-    NumPy and JAX arrays."""
+    """Results in the order of the items that were dealt out in turn to so many devices, and those of the last one again."""
     tail = values.shape[1:]
     return values.reshape(devices, -1, *tail).swapaxes(0, 1).reshape(-1, *tail)
 

@@ -50,6 +50,7 @@ def test_haze_grows_with_distance_before_a_background():
     assert (hazy[1, 1] > hazy[1, 0]).all()
     assert not np.allclose(hazy[0], hazy[3])
     np.testing.assert_array_equal(in_haze(image, depth, 20.0, 0.0)[1:3], 0.2)
+    np.testing.assert_array_equal(in_haze(image, np.full_like(depth, np.inf), 20.0, 0.5)[[0, 3]], hazy[[0, 3]])
 
 
 @pytest.mark.parametrize(("name", "value"), [("altitude", 0.0), ("altitude", 91.0), ("haze", 1.0), ("haze", -0.1)])

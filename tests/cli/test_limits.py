@@ -36,13 +36,13 @@ def test_devices_that_cannot_pay(refused, monkeypatch):
 
 
 def test_a_picture_that_does_not_fit(refused, monkeypatch):
-    """What may fit is tried: 30 bytes a pixel."""
+    """What may fit is tried: 14 bytes a pixel."""
     monkeypatch.setattr(limits, "available_bytes", lambda: 4e9)
     line = refused("render", SCENE, "--width", "20000", "--devices", "1")
-    assert line.startswith("20000 x 15000 pixels of 16 heights take more than 9 GB of memory on 1 device, 4 GB are free")
-    monkeypatch.setattr(limits, "available_bytes", lambda: 29.5 * 320 * 240)
+    assert line.startswith("20000 x 15000 pixels of 16 heights take more than 4.2 GB of memory on 1 device, 4 GB are free")
+    monkeypatch.setattr(limits, "available_bytes", lambda: 13.5 * 320 * 240)
     assert "pixels of 16 heights" in refused("render", SCENE, "--devices", "1")
-    monkeypatch.setattr(limits, "available_bytes", lambda: 30.5 * 320 * 240)
+    monkeypatch.setattr(limits, "available_bytes", lambda: 14.5 * 320 * 240)
     with pytest.raises(pytest.fail.Exception, match="began to render"):
         refused("render", SCENE, "--devices", "1")
 
@@ -53,7 +53,7 @@ def test_a_terrain_counts_on_each_device(refused, monkeypatch):
     scene = jaxhf.Scene([jaxhf.Object(field)], camera, [])
     monkeypatch.setattr(limits, "available_bytes", lambda: 5e5)
     limits.require_memory(scene, 1)
-    with pytest.raises(UserError, match=r"take more than 0\.000903 GB of memory on 2 devices, 0\.0005 GB are free"):
+    with pytest.raises(UserError, match=r"take more than 0\.000901 GB of memory on 2 devices, 0\.0005 GB are free"):
         limits.require_memory(scene, 2)
 
 

@@ -70,11 +70,17 @@ TEXELS = np.random.default_rng(3).uniform(0.3, 0.9, (SIDE, SIDE, 3)).astype(np.f
 PAINTED = jaxhf.ImageTexture(TEXELS, at_vertices=True)
 
 
-@pytest.mark.deep
-@pytest.mark.parametrize(("name", "albedo"), [("perspective", PAINTED), ("orthographic", 0.7)])
-def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo):
+@pytest.mark.parametrize(
+    ("name", "albedo", "count"),
+    [
+        ("perspective", PAINTED, 1),
+        pytest.param("perspective", PAINTED, 3, marks=pytest.mark.deep),
+        pytest.param("orthographic", 0.7, 3, marks=pytest.mark.deep),
+    ],
+)
+def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo, count):
     """Where it counts it is the whole picture's part, with its texture and shadows from outside; the rim does not count."""
-    whole = scenes(TRUTH, CAMERAS[name], albedo)
+    whole = scenes(TRUTH, CAMERAS[name], albedo)[:count]
     images = [np.asarray(jaxhf.render(scene, SETTINGS)) for scene in whole]
     (around,) = surroundings(whole, (0.0, 0.15), [WINDOW])
     assert 24 < around.ny < SIDE

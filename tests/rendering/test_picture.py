@@ -66,7 +66,8 @@ def test_pictures_and_aovs_are_those_of_a_program_for_their_size(kind, size, mon
     assert expected.std() > 0.05
     for name in aovs:
         assert also[name].dtype == besides[name].dtype
-        np.testing.assert_allclose(also[name][same], besides[name][same], rtol=2e-5, atol=3e-6, err_msg=name)
+        few = 3e-6 if name == "normal" else 1e-6  # roundings of a unit vector's smaller components
+        np.testing.assert_allclose(also[name][same], besides[name][same], rtol=2e-5, atol=few, err_msg=name)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 600), (701, 300)])

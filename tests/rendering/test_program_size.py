@@ -66,7 +66,7 @@ def test_aovs_of_one_sample_a_pixel_take_no_walk_of_their_own():
         return list(equations(jax.make_jaxpr(lambda scene: jaxhf.render(scene, settings, aovs=aovs))(SCENE).jaxpr))
 
     alone = len(program(1, ()))
-    observed = ("depth", "normal", "uv", "status", "object", "cell")
+    observed = ("depth", "normal", "uv", "status", "object", "cell", "steps")
     assert len(program(1, observed)) < alone + 50
     assert len(program(4, observed)) > alone + 500  # which look at the centre, where there is no sample
 
