@@ -17,7 +17,7 @@ import jaxhf
 from jaxhf.boundary import guiding, sample
 from jaxhf.core import affine, autodiff
 from jaxhf.preparation import ceiling, sky, world as worlds
-from jaxhf.rendering import aovs as rendering_aovs
+from jaxhf.rendering import tiles
 from jaxhf.scene import material as materials, texture
 from jaxhf.shade import lighting, radiance, reflectance
 from jaxhf.trace import cylinder, grid, intersect, normals, search, skirt, skyline
@@ -140,7 +140,7 @@ FEATURES: dict[str, tuple[str, Case, list[Watch]]] = {
         case(edge_samples=64, differentiated=True),
         [*map(everywhere, (sample.draw, guiding.initial_weights, autodiff.with_tangent))],
     ),
-    "AOVs": ("plain", case(aovs=("depth",)), [everywhere(rendering_aovs.observe)]),
+    "AOVs": ("plain", case(aovs=("depth",)), [within(tiles, "observe")]),
     "step counting": (
         "AOVs",
         case(aovs=("depth", "steps")),
