@@ -124,15 +124,11 @@ def photograph(
     for k in range(side * side):
         dx, dy = ((k % side + 0.5) / side - 0.5, (k // side + 0.5) / side - 0.5)
         moved = cropped(camera, dx, dy, camera.width, camera.height)
-        image, aovs = render(ready.with_camera(moved), aovs=("depth",), progress=_on_host)
-        total += _in_haze(image.astype(np.float32), aovs["depth"].astype(np.float32), size, look.haze)
+        image, aovs = render(ready.with_camera(moved), aovs=("depth",))
+        total += _in_haze(np.asarray(image, np.float32), np.asarray(aovs["depth"], np.float32), size, look.haze)
         if progress is not None:
             progress()
     return total / np.float32(side**2)
-
-
-def _on_host(done: int, pixels: int) -> None:
-    """With a `progress` pictures are put together on the host, where they are needed here."""
 
 
 def _in_haze(

@@ -121,14 +121,12 @@ def _trace_tile(aovs: tuple[str, ...], world: World, camera: Camera, corner: jax
     columns, rows = (place.astype(dtype) for place in pixels_from(corner, tile_side(world.settings)))
     at_centres = columns + 0.5, rows + 0.5
     observed = tuple(name for name in aovs if name != "exhausted")
-    if not observed:
-        image, exhausted = _pixels(world, camera, columns, rows)
-        outputs = {}
-    elif world.settings.samples in (None, 1):  # the sample's ray is the observed one
+    if observed and (world.settings.samples or 1) == 1:  # the sample's ray is the observed one
         image, exhausted, outputs = _seen_along(observed, world, camera, *at_centres)
     else:
         image, exhausted = _pixels(world, camera, columns, rows)
-        outputs = jax.vmap(functools.partial(_observed_along, observed, world, camera))(*at_centres)
+        alone = functools.partial(_observed_along, observed, world, camera)
+        outputs = jax.vmap(alone)(*at_centres) if observed else {}
     if "exhausted" in aovs:
         outputs["exhausted"] = exhausted
     return outputs | {"image": image}

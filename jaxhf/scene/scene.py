@@ -133,8 +133,8 @@ class Scene(Record):
     def with_camera(self, camera: Camera) -> "Scene":
         """The same scene seen by another camera.
 
-        Nothing is compiled again if its picture is as large. If both have more than 64 tiles of `Settings.chunk` pixels, on
-        one device what puts these together is, in 0.05 s.
+        Nothing is compiled again if its picture is as large. If both have more than 64 tiles of `Settings.chunk` pixels, only
+        what puts these together is, in 0.05 s, and on several devices nothing.
         """
         return dataclasses.replace(self, camera=camera)
 
