@@ -14,7 +14,7 @@ from ..core.affine import affine, invertible
 from ..core.errors import whole_number
 from ..core.ray import Ray
 from ..core.rules import OneOf, Whole, require
-from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, AnyArray, MatrixLeaf, Scalar, ScalarLeaf, Vector, float_leaf
+from ..core.types import ANGLE_OF_VIEW, FINITE, POSITIVE, AnyArray, MatrixLeaf, Scalar, ScalarLeaf, float_leaf
 from ..core.vector import dot, unit
 from .framing import framing_pose
 from .heightfield import Heightfield
@@ -214,9 +214,9 @@ class Perspective(Record):
         """
         return projected(self, points, lambda depth: depth * np.tan(np.radians(np.asarray(self.fov, np.float64)) / 2))
 
-    def viewpoint(self) -> tuple[Vector, bool]:
+    def viewpoint(self) -> tuple[Float[AnyArray, "3"], bool]:
         """The position of the eye, and True: it is a point."""
-        world = affine(jnp.asarray(self.world_from_camera))
+        world = affine(self.world_from_camera)
         return world.offset if self._ahead is None else world.offset - self._ahead * world.linear[:, 2], True
 
     def __repr__(self) -> str:
@@ -290,9 +290,9 @@ class Orthographic(Record):
         """Where points of the world are seen, as `Perspective.project`."""
         return projected(self, points, lambda depth: np.asarray(self.extent, np.float64) / 2)
 
-    def viewpoint(self) -> tuple[Vector, bool]:
+    def viewpoint(self) -> tuple[Float[AnyArray, "3"], bool]:
         """The direction towards the eye, and False: it is infinitely far away."""
-        return -affine(jnp.asarray(self.world_from_camera)).linear[:, 2], False
+        return -affine(self.world_from_camera).linear[:, 2], False
 
     def __repr__(self) -> str:
         return _shown(self, f"extent={numbers(self.extent)}")

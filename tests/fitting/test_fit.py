@@ -45,6 +45,14 @@ def test_heights_come_back_from_a_flat_start(targets):
     assert np.all(found.residuals[0][4:7, 5:9] == 0)
 
 
+def test_another_fit_of_the_same_size_compiles_nothing(targets, compilations):
+    jaxhf.fit(scenes(), targets, **OPTIONS)
+    compilations.clear()
+    other = jaxhf.fit(scenes(), [0.9 * target for target in targets], **OPTIONS)
+    assert not compilations
+    assert other.result is jaxhf.Stop.CONVERGED
+
+
 @pytest.mark.x64
 @pytest.mark.deep
 def test_heights_come_back_to_double_precision():

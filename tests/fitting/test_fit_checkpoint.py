@@ -208,8 +208,7 @@ def without_pictures(setattr: Callable[..., None]) -> None:
 
     setattr(_run, "expand", lambda unknowns, problem: Expansion(problem, unknowns, (None,) * len(problem.groups)))
     setattr(_run, "advance", advance)
-    setattr(_run, "first_position", lambda expansion: None)
-    setattr(_run, "position_at", lambda first, unknowns, step_size: Position(unknowns, step_size, True))
+    setattr(_run, "first_position", lambda expansion, step_size: Position(expansion.unknowns, step_size, True))
     setattr(_run, "spreads", lambda expansion: np.ones(1))
     setattr(_run, "balanced", units_of_one)
     setattr(_fit, "judged", judged_as_it_is)

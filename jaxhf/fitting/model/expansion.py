@@ -44,7 +44,7 @@ class Expansion(eqx.Module):
 
     @property
     def heights(self) -> Float[Array, "ny nx"]:
-        return self.problem.basis.heights(self.unknowns.coefficients)
+        return self.problem.basis.crop(surface_of(self.unknowns, self.problem.basis))
 
     def of(self, problem: Problem) -> "Expansion":
         """The same pictures in a problem that differs in noise, priors or basis alone."""
@@ -59,10 +59,10 @@ class Expansion(eqx.Module):
         """As they would be measured."""
         return _pictures(on_every_device(self, self.problem.mesh))
 
-    def left(self) -> Rows:
-        """(picture - target) / noise."""
+    def left(self) -> list[Float[np.ndarray, "n h w c"]]:
+        """(picture - target) / noise, by NumPy: each operation of JAX's would be a program to compile."""
         pairs = zip(self.problem.groups, self.pictures(), strict=True)
-        return [group.weights * (image - group.targets) for group, image in pairs]
+        return [np.asarray(group.weights) * (np.asarray(image) - np.asarray(group.targets)) for group, image in pairs]
 
     def informing(self) -> list[Bool[np.ndarray, "n h w c"]]:
         """Which values depend on the heights; all of those with a weight where that is not known."""
@@ -136,7 +136,8 @@ def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None
 
 @functools.partial(compiled, jit=eqx.filter_jit, newer=None)
 def _pictures(expansion: Expansion) -> Rows:
-    return _simulate(expansion.unknowns, expansion, expansion.heights)
+    unknowns = expansion.unknowns
+    return _simulate(unknowns, expansion, expansion.problem.basis.heights(unknowns.coefficients))
 
 
 def _by_surface(expansion: Expansion) -> tuple[Callable[[Float[Array, "my mx"], Unknowns], Rows], Surface]:
@@ -219,16 +220,10 @@ def soften(residual: Array, scale: Float[AnyArray, ""]) -> Array:
     return residual / jnp.sqrt(1 + (residual / scale) ** 2)
 
 
-def robust_weight(residual: AnyArray, scale: Float[AnyArray, ""]) -> Array:
-    """ρ'(r) / r: the weight that a residual has in iteratively reweighted least squares."""
-    return 1 / (1 + (residual / scale) ** 2) ** 2
-
-
-@compiled
 def influence_function(
-    residual: Float[AnyArray, " n"], scale: Float[AnyArray, ""]
-) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
-    """ψ = ρ', its derivative, and the weight ψ / r of residuals."""
-    square = (residual / scale) ** 2
+    residual: Float[np.ndarray, " n"], scale: Float[AnyArray, ""]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """ψ = ρ', its derivative, and ψ / r, the weight of residuals in iteratively reweighted least squares."""
+    square = (residual / float(scale)) ** 2
     weight = 1 / (1 + square) ** 2
     return weight * residual, weight * (1 - 3 * square) / (1 + square), weight

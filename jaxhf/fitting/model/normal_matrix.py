@@ -19,7 +19,7 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from ...scene.heightfield import Heightfield
-from .expansion import Expansion, robust_weight, surface_of
+from .expansion import Expansion, influence_function, surface_of
 from .rows import THREADS, Sparse, pictures_by_heights, scaled
 from .surface import Unknowns, Window, interpolation, slope_units
 
@@ -197,8 +197,8 @@ def in_groups(row: np.ndarray, expansion: Expansion) -> list[Any]:
 
 def robust_matrix(expansion: Expansion) -> NormalMatrix:
     """`normal_matrix` with the weights of the robust loss."""
-    weights = robust_weight(jnp.asarray(in_row(expansion.left())), expansion.problem.loss_scale)
-    return normal_matrix(expansion, np.sqrt(np.asarray(weights)))
+    _, _, weights = influence_function(in_row(expansion.left()), expansion.problem.loss_scale)
+    return normal_matrix(expansion, np.sqrt(weights))
 
 
 def normal_matrix(expansion: Expansion, roots: Float[np.ndarray, " rows"]) -> NormalMatrix:

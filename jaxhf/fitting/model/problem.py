@@ -311,11 +311,11 @@ def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknow
             raise ArgumentError("Unknown", "albedo", rule)
         image = known.texels.shape[:2] if isinstance(known, ImageTexture) else shape
         shape = (*(image if unknown.albedo == "map" else (1, 1)), 1 if unknown.albedo_shared else channels)
-        albedo = (jnp.ones if unknown.albedo_length is None else jnp.zeros)(shape, dtype)
+        albedo = jax.device_put(np.full(shape, 1 if unknown.albedo_length is None else 0, dtype))
     return Unknowns(
-        jnp.zeros_like(basis.base),
+        jax.device_put(np.zeros(basis.base.shape, dtype)),
         albedo,
-        jnp.ones(count, dtype) if unknown.exposures else None,
-        jnp.zeros(count, dtype) if unknown.offsets else None,
+        jax.device_put(np.ones(count, dtype)) if unknown.exposures else None,
+        jax.device_put(np.zeros(count, dtype)) if unknown.offsets else None,
         _at_rest(view_unit, count),
     )

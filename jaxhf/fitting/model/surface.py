@@ -44,7 +44,7 @@ class Unknowns(eqx.Module):
 
     def at_base(self) -> "Unknowns":
         """The same but for the modes, which are 0: those of a surface that has become the base."""
-        return self.with_modes(jnp.zeros_like(self.coefficients))
+        return self.with_modes(jax.device_put(np.zeros(self.coefficients.shape, self.coefficients.dtype)))
 
     def with_modes(self, coefficients: Any) -> Any:
         return eqx.tree_at(lambda u: u.coefficients, self, coefficients, is_leaf=lambda leaf: leaf is None)

@@ -28,7 +28,6 @@ from .steps import (
     WholeStep,
     advance,
     first_position,
-    position_at,
     relaxed,
     whole_step,
 )  # fmt: skip
@@ -161,9 +160,7 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
         edge_samples=edge_samples,
     )
     begun = _begun(problems, following, here)
-    goes_on = place is not None and begun.linearised is place.expansion.linearised  # and so its state's compiled functions
-    form = place.position if place is not None and goes_on else first_position(begun)
-    return following, _Place(begun, position_at(form, begin, following.step_size))
+    return following, _Place(begun, first_position(begun, following.step_size))
 
 
 def _ends_by_factors(expansion: Expansion) -> bool:
@@ -198,7 +195,7 @@ def _resumed(problems: Sequence[Problem], state: State) -> _Place:
         here = expand(state.unknowns, here.problem)
     if stages(problems)[state.stage].by_factors:
         return _Place(here, whole_step=whole_step(here))
-    position = position_at(first_position(here), state.unknowns, state.step_size)
+    position = first_position(here, state.step_size)
     if state.steps:
         _, position, _ = advance(state.unknowns, position, here, state.others, 0)
     return _Place(here, position)

@@ -17,10 +17,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from ...core.types import Flag, Scalar
+from ...core.types import AnyArray, Flag, Scalar
 from ...xla.compilation import compiled
 from ...xla.devices import divided, on_every_device
-from ..model.expansion import Expansion, residuals, soften
+from ...xla.plain import insides
+from ..model.expansion import Expansion, residuals
 from ..model.normal_matrix import in_row, robust_matrix
 from ..model.surface import Unknowns
 
@@ -48,8 +49,8 @@ class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
     modes.
     """
 
-    tolerance: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    iterations: Int[Array, ""] = eqx.field(converter=jnp.asarray)
+    tolerance: Float[AnyArray, ""] = eqx.field(converter=np.asarray)
+    iterations: Int[AnyArray, ""] = eqx.field(converter=np.asarray)
     others: Any
 
     def init(self, y: Unknowns, f_info_struct: Any) -> Any:
@@ -94,18 +95,26 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         self.rtol = self.atol = 0.0  # when a fit ends, `run` decides
         self.norm = optx.rms_norm
         self.descent = ConjugateGradients(*exactly, others)
-        self.search = optx.ClassicalTrustRegion(
+        search = optx.ClassicalTrustRegion(
             high_cutoff=_GOOD,
             low_cutoff=_LEAST_GAIN,
-            high_constant=jnp.asarray(_HIGHER if rejections == 0 else 1.0),
-            low_constant=jnp.asarray(_REJECTED / 2**rejections),
+            high_constant=_HIGHER if rejections == 0 else 1.0,
+            low_constant=_REJECTED / 2**rejections,
         )
+        # As arrays, so that one program serves whatever they are; made of numbers first, which it checks by no program.
+        constants = jax.tree.map(np.asarray, (search.high_constant, search.low_constant))
+        self.search = eqx.tree_at(lambda search: (search.high_constant, search.low_constant), search, constants)
         self.verbose = _silent
 
 
 def _empty(form: Any) -> Any:
     """The same with zeros for its arrays."""
-    return jax.tree.map(lambda leaf: jnp.zeros_like(leaf) if isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) else leaf, form)
+
+    def zeros(leaf: Any) -> Any:
+        # By NumPy: JAX's own zeros are a program for each shape.
+        return jax.device_put(np.zeros(leaf.shape, leaf.dtype)) if isinstance(leaf, jax.Array | jax.ShapeDtypeStruct) else leaf
+
+    return jax.tree.map(zeros, form)
 
 
 def _silent(**_: Any) -> None:
@@ -123,11 +132,26 @@ class Outcome(NamedTuple):
     change: Scalar | float
 
 
-def first_position(expansion: Expansion) -> Any:
-    """The form of optimistix's state of a fit, with `jax.ShapeDtypeStruct`s for its arrays.
+def first_position(expansion: Expansion, step_size: Float[Array, ""]) -> Any:
+    """optimistix's state where the unknowns are those of an expansion, before anything is evaluated there.
 
-    Call it once for each size of a problem: a state also holds compiled functions, which compare by identity, so that a step
-    that is given the state of another call would be compiled again.
+    The next step evaluates there, and always accepts: the state is then, to the bit, what it was after the step that reached
+    them, if 1 / λ is the same. So a checkpoint need not hold linearised pictures.
+    """
+    leaves, structure = jax.tree.flatten(expansion)
+    forms = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
+    module = insides()
+    empty = _empty(_form(structure, forms, None if module is None else module.configuration()))
+    begin = jnp.ones_like(empty.first_step), expansion.unknowns, step_size.astype(empty.search_state.step_size.dtype)
+    return eqx.tree_at(lambda state: (state.first_step, state.y_eval, state.search_state.step_size), empty, begin)
+
+
+@functools.lru_cache(maxsize=16)
+def _form(structure: Any, leaves: tuple[Any, ...], _: Any) -> Any:
+    """The form of optimistix's state of a fit, with `jax.ShapeDtypeStruct`s for its arrays; under one configuration of JAX.
+
+    Once for each form of an expansion: a state also holds compiled functions, which compare by identity, so that a step that is
+    given others would be compiled again.
     """
 
     def first(expansion: Expansion) -> Any:
@@ -135,18 +159,7 @@ def first_position(expansion: Expansion) -> Any:
         shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, expansion)
         return solver.init(residuals, expansion.unknowns, expansion, {}, shape, None, frozenset())
 
-    return eqx.filter_eval_shape(first, expansion)
-
-
-def position_at(form: Any, unknowns: Unknowns, step_size: Float[Array, ""]) -> Any:
-    """optimistix's state at these unknowns, before anything is evaluated there; `form`: `first_position`, or a state after it.
-
-    The next step evaluates there, and always accepts: the state is then, to the bit, what it was after the step that reached
-    them, if 1 / λ is the same. So a checkpoint need not hold linearised pictures.
-    """
-    empty = _empty(form)
-    begin = jnp.ones_like(empty.first_step), unknowns, step_size.astype(empty.search_state.step_size.dtype)
-    return eqx.tree_at(lambda state: (state.first_step, state.y_eval, state.search_state.step_size), empty, begin)
+    return eqx.filter_eval_shape(first, jax.tree.unflatten(structure, leaves))
 
 
 def advance(
@@ -213,11 +226,14 @@ def whole_step(expansion: Expansion) -> WholeStep:
     left, matrix = in_row(expansion.left()), robust_matrix(expansion)
     gradient = matrix.gradient(matrix.roots * left)
     change = matrix.solved(-gradient, _WHOLE_TOLERANCE)
-    soft = np.asarray(soften(jnp.asarray(left), expansion.problem.loss_scale), np.float64)
-    loss = (np.sum(soft**2) + np.sum(matrix.modes_before() ** 2) + np.sum(matrix.others_off**2)) / 2
+    softened = matrix.roots * left**2  # the squares of `soften`
+    loss = (np.sum(softened) + np.sum(matrix.modes_before() ** 2) + np.sum(matrix.others_off**2)) / 2
     length = float(np.sqrt(np.mean(matrix.heights_of(change) ** 2)))
     return WholeStep(matrix.unknowns_of(change), length, float(-(gradient @ change) / 2), float(loss))
 
 
 def relaxed(unknowns: Unknowns, step: WholeStep) -> Unknowns:
-    return jax.tree.map(lambda value, change: value + RELAXED * change, unknowns, step.change)
+    def moved(value: Array, change: Array) -> Array:
+        return jax.device_put(np.asarray(value) + RELAXED * np.asarray(change))
+
+    return jax.tree.map(moved, unknowns, step.change)

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float
@@ -97,7 +96,7 @@ def with_unexplained(
     problem = expansion.problem
     if len(residuals) == 0:
         return expansion, 1.0
-    psi, slope, weight = map(np.asarray, influence_function(jnp.asarray(residuals), problem.loss_scale))
+    psi, slope, weight = influence_function(residuals, problem.loss_scale)
     share = max(1 - problem.field.heights.size / len(residuals), 0.5) if free is None else free
     factor = float(np.sqrt(np.mean(psi**2) * np.mean(weight) / np.mean(slope) ** 2 / share))
     if not factor > 1:

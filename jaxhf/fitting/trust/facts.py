@@ -306,7 +306,7 @@ def chi_squared(
     """
     if residuals.size == 0 or freedom is None:
         return (float(np.mean(residuals**2)) if residuals.size else 0.0), None
-    psi, slope, _ = map(np.asarray, influence_function(residuals, problem.loss_scale))
+    psi, slope, _ = influence_function(residuals, problem.loss_scale)
     explained, free = (np.repeat(values, counts) for values in (freedom.explained, freedom.free))
     left = residuals + explained * (psi / max(np.mean(slope), _LEAST_SLOPE) - residuals)
     return float(np.sum(left**2) / np.sum(free)), float(np.mean(free))
