@@ -53,7 +53,7 @@ def intersect(
     valid = finite(ray.o) & finite(ray.d)
     ray = Ray(jnp.where(valid, ray.o, 0), jnp.where(valid, ray.d, 0))
     if not isinstance(surface, Grid):
-        t, found, side = surface.distance(ray, leaving, number)
+        t, found, side = materialise(surface.distance(ray, leaving, number))
         found = found if active is None else found & active
         valid = largest_component(ray.d) > 0
         met, t = found & valid, jnp.where(found, t, 0)
