@@ -24,7 +24,7 @@ from ..pictures.codecs import read_grey
 from .georeference import WGS84, WGS84_DEGREES, CoordinateSystem, Georeference, coordinate_system
 from .grids import read_asc, read_hgt, read_mujoco
 from .parts import Box, Window
-from .rasters import Rows, raster_rows, read_raster
+from .rasters import Rows, raster_rows
 from .sidecars import by_world_file
 from .terrain import Nodata, Terrain, heights_of
 
@@ -105,8 +105,9 @@ def read_terrain(
             raise FileError(f"z_scale must be finite and not zero, it is {z_scale}")
         if band is not None:
             require("load_heights", "band", band, Whole(1))
-        if reader is read_raster:
-            terrain = read_raster(path, chosen, band, bbox, window)
+        if reader is None:
+            with raster_rows(path, chosen, band, bbox, window) as rows:
+                terrain = rows.whole()
         elif band is not None:
             raise FileError(f"it has no bands, band must be left out; it is {band}")
         else:
@@ -143,7 +144,7 @@ def terrain_rows(
     """As `read_terrain`, for what needs a few rows at once: of a raster of more than `STRIP` heights only these are read."""
     path = require_file(path)
     with contextlib.ExitStack() as stack:
-        if by_ending(_READERS, path, "read heights from") is read_raster:
+        if by_ending(_READERS, path, "read heights from") is None:
             with reading(path):
                 if band is not None:
                     require("load_heights", "band", band, Whole(1))
@@ -263,13 +264,13 @@ def _read_image(path: Path, nodata: Nodata) -> Terrain:
     return by_world_file(path, heights) if path.suffix.lower() == ".png" else Terrain(heights)
 
 
-_READERS: dict[str, Callable[[Path, Nodata], Terrain]] = {
+_READERS: dict[str, Callable[[Path, Nodata], Terrain] | None] = {  # None: `raster_rows`
     ".npy": _read_npy,
     ".npz": _read_npz,
     ".asc": read_asc,
     ".hgt": read_hgt,
     **dict.fromkeys((".hfield", ".bin"), read_mujoco),
     **dict.fromkeys((".png", ".exr", ".pfm"), _read_image),
-    **dict.fromkeys(DRIVERS, read_raster),
+    **dict.fromkeys(DRIVERS),
 }
 ENDINGS = frozenset(_READERS)

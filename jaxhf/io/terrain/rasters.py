@@ -39,19 +39,9 @@ class Rows(NamedTuple):
         return self.read(slice(0, ny), 1)
 
 
-def read_raster(
-    path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None, window: Window | None = None
-) -> Terrain:
-    """The heights in a raster, in its own coordinates; of a band, from 1, and of a part, see `load_heights`."""
-    with raster_rows(path, nodata, band, box, window) as rows:
-        return rows.whole()
-
-
 @contextlib.contextmanager
-def raster_rows(
-    path: Path, nodata: Nodata, band: int | None = None, box: Box | None = None, window: Window | None = None
-) -> Iterator[Rows]:
-    """As `read_raster`, while the file is open."""
+def raster_rows(path: Path, nodata: Nodata, band: int | None, box: Box | None, window: Window | None) -> Iterator[Rows]:
+    """The heights in a raster, in its own coordinates, while the file is open; of a band and a part, see `load_heights`."""
     with opened(path) as dataset:
         if band is None and dataset.count != 1:
             raise FileError(f"heights must be one band, it has {dataset.count}: band must say which")
@@ -177,12 +167,11 @@ def writing_strips(path: Path, like: Terrain, nodata: float | None) -> Iterator[
             datasets: list[Any] = []
 
             def put(rows: slice, values: np.ndarray) -> None:
+                bands = np.ascontiguousarray(_bands(values))
                 if not datasets:
-                    profile = _profile(like, values.dtype, 1 if values.ndim == 2 else values.shape[2], nodata)
                     with _disk_full(rasterio):
-                        datasets.append(open_files.enter_context(rasterio.open(name, "w", **profile)))
-                        datasets[0].update_tags(AREA_OR_POINT=_area_or_point(like))
-                bands = np.ascontiguousarray(np.moveaxis(values[::-1].reshape(*values.shape[:2], -1), -1, 0))
+                        dataset = _created(partial(rasterio.open, name, "w"), bands, like, nodata)
+                        datasets.append(open_files.enter_context(dataset))
                 top = len(like.heights) - rows.stop
                 window = (top, top + len(values)), (0, values.shape[1])
                 with _disk_full(rasterio):
@@ -206,31 +195,33 @@ def _disk_full(rasterio: Any) -> Iterator[None]:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
 
 
-def _profile(like: Terrain, dtype: Any, count: int, nodata: float | None) -> dict[str, Any]:
-    """How rasterio creates a GeoTIFF where a terrain lies."""
+def _bands(values: np.ndarray) -> np.ndarray:
+    """Values of shape (ny, nx) or (ny, nx, bands), row 0 in the south, as rasterio takes them: (bands, ny, nx), north first."""
+    return np.moveaxis(values[::-1].reshape(*values.shape[:2], -1), -1, 0)
+
+
+def _created(create: Callable[..., Any], bands: np.ndarray, like: Terrain, nodata: float | None) -> Any:
+    """The dataset of a GeoTIFF where a terrain lies, for such bands, that `create` of rasterio makes."""
     rasterio = import_extra("rasterio", "writing .tif needs", "geo")
-    (ny, nx), place = like.heights.shape, like.georeference
-    return {
-        "driver": "GTiff", "width": nx, "height": ny, "count": count, "dtype": dtype, "nodata": nodata,
-        "crs": rasterio.crs.CRS.from_wkt(place.wkt) if place and place.wkt else None,
-        "transform": rasterio.Affine(*like.geotransform()),
-        "photometric": "rgb" if count > 1 else "minisblack", "interleave": "pixel", "bigtiff": "if_safer",
-    }  # fmt: skip
-
-
-def _area_or_point(like: Terrain) -> str:
-    return "Point" if like.georeference is None or like.georeference.point else "Area"
+    (ny, nx), place, count = like.heights.shape, like.georeference, len(bands)
+    dataset = create(
+        driver="GTiff", width=nx, height=ny, count=count, dtype=bands.dtype, nodata=nodata,
+        crs=rasterio.crs.CRS.from_wkt(place.wkt) if place and place.wkt else None,
+        transform=rasterio.Affine(*like.geotransform()),
+        photometric="rgb" if count > 1 else "minisblack", interleave="pixel", bigtiff="if_safer",
+    )  # fmt: skip
+    dataset.update_tags(AREA_OR_POINT="Point" if place is None or place.point else "Area")
+    return dataset
 
 
 def geotiff(values: np.ndarray, like: Terrain, nodata: float | None, unit: str = "") -> memoryview:
     """The bytes of a GeoTIFF; see `save_raster`. In memory first, as GDAL does not always say that a disk is full."""
     rasterio = import_extra("rasterio", "writing .tif needs", "geo")
-    bands = values[::-1, :, None] if values.ndim == 2 else values[::-1]
+    bands = _bands(values)
     with warnings.catch_warnings(), rasterio.io.MemoryFile() as memory:
         warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # pixels of 1 x 1 in a corner at 0, 0
-        with memory.open(**_profile(like, values.dtype, bands.shape[2], nodata)) as dataset:
-            dataset.update_tags(AREA_OR_POINT=_area_or_point(like))
-            dataset.write(np.moveaxis(bands, -1, 0))
+        with _created(memory.open, bands, like, nodata) as dataset:
+            dataset.write(bands)
             if unit:
                 dataset.units = (unit,)
         return memoryview(memory.read())
