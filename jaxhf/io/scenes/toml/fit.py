@@ -24,7 +24,7 @@ from .checks import Part
 from .priors import Provenance, known_heights
 from .scene import open_toml, read_camera, read_image, read_lights, read_samples, read_world
 from .tables import SCENE, Key, Keys, optional
-from .values import flag, not_negative, number, numbers, or_table, or_word, positive, table, tables, whole, word
+from .values import flag, not_negative, number, number_or_word, numbers, positive, positive_or_table, table, tables, whole, word
 
 # A scene, or where one stands, and what is known about it.
 _CASE: Keys = {
@@ -38,15 +38,15 @@ _CASE: Keys = {
 _PICTURE: Keys = {
     "image": Key(word, needed=True),
     **optional("transfer", "mask", "weights", kind=word),
-    **optional("noise", kind=or_table(positive)),
+    **optional("noise", kind=positive_or_table),
     **optional("camera", kind=table),
     **optional("lights", kind=tables),
 }
 _ABOUT = {"targets": ("image",), "weights": ("mask", "weights")}  # what an argument of `fit` is in such a table
 # Those of `fit`, `Prior` and `Unknown`, whose defaults they have and who check their values.
 _FIT: Keys = {
-    **optional("start", kind=or_word(number)),
-    **optional("noise", kind=or_table(positive)),
+    **optional("start", kind=number_or_word),
+    **optional("noise", kind=positive_or_table),
     **optional("draws", "max_steps", kind=whole),
     **optional("prior", "unknown", kind=table),
 }
@@ -56,7 +56,7 @@ _NOISE: Keys = {
     **optional("saturation", kind=positive),
     **optional("nodata", kind=number),
 }
-_PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(or_word(number), needed=True)), **optional("length", kind=number)}
+_PRIOR: Keys = {**dict.fromkeys(("heights", "std"), Key(number_or_word, needed=True)), **optional("length", kind=number)}
 _UNKNOWN: Keys = {
     **optional("albedo", kind=word),
     **optional("albedo_std", "albedo_length", "sky_std", "light_std", kind=number),

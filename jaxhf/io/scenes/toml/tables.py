@@ -50,7 +50,7 @@ def _point(position, intensity) -> Point:
 
 # What each parameter takes of the functions and classes that make the parts of a scene.
 _KINDS: Mapping[str, kinds.Kind] = {
-    **dict.fromkeys(("albedo", "w"), kinds.or_word(kinds.colour, ", or the name of a texture")),
+    **dict.fromkeys(("albedo", "w"), kinds.colour_or_texture),
     "altitude": kinds.angle_above_horizon,
     "convention": kinds.word,
     "size": kinds.size,

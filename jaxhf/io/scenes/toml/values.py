@@ -73,17 +73,9 @@ not_negative = _kind(lambda value: number(value) >= 0, "from 0 on")
 angle_above_horizon = _kind(lambda value: -90 <= number(value) <= 90, "from -90 to 90 degrees")
 
 
-def or_word(kind: Kind, tail: str = " or a string") -> Kind:
-    """A string, or what `kind` takes; `tail` goes behind what that must be."""
-    return _or(str, kind, tail)
-
-
-def or_table(kind: Kind) -> Kind:
-    """A table, or what `kind` takes."""
-    return _or(dict, kind, " or a table")
-
-
 def _or(other: type, kind: Kind, tail: str) -> Kind:
+    """A value of the type `other`, or what `kind` takes; `tail` goes behind what that must be."""
+
     def either(value: Any) -> Any:
         try:
             return value if isinstance(value, other) else kind(value)
@@ -91,6 +83,10 @@ def _or(other: type, kind: Kind, tail: str) -> Kind:
             raise ValueError(f"{error}{tail}") from None
 
     return either
+
+
+number_or_word = _or(str, number, " or a string")
+positive_or_table = _or(dict, positive, " or a table")
 
 
 def numbers(count: int) -> Kind:
@@ -116,6 +112,9 @@ def colour(value: Any) -> list[float]:
     if min(found) < 0:
         raise ValueError("0 or more")
     return found
+
+
+colour_or_texture = _or(str, colour, ", or the name of a texture")
 
 
 def grid(value: Any) -> Float[np.ndarray, "ny nx"]:
