@@ -54,8 +54,8 @@ def save_mesh(
         raise ArgumentError("save_mesh", "terrain", f"must be a jaxhf.Terrain, it is {kind_of(terrain)}")
     heights = np.asarray(terrain.heights, np.float64)
     ny, nx = heights.shape
-    if base is not None and not base < np.nanmin(heights, initial=np.inf):
-        lowest = np.nanmin(heights, initial=np.inf)
+    lowest = np.nanmin(heights, initial=np.inf)
+    if base is not None and not base < lowest:
         raise ArgumentError("save_mesh", "base", f"must lie below all heights, the lowest is {lowest:.6g}, it is {base}")
     is_number = isinstance(longer_side, int | float | np.number) and not isinstance(longer_side, bool)
     if longer_side is not None and not (is_number and 0 < longer_side < np.inf):
@@ -67,14 +67,15 @@ def save_mesh(
         if uv or colours.dtype != np.uint8 or colours.shape not in ((ny, nx, 3), (ny, nx, 4)):
             rule = f"must be uint8 of shape {(ny, nx, 3)} or {(ny, nx, 4)}, without uv"
             raise ArgumentError("save_mesh", "colours", f"{rule}; they are {colours.dtype} of shape {colours.shape}")
-    finite = np.isfinite(heights)
-    whole = finite[:-1, :-1] & finite[:-1, 1:] & finite[1:, 1:] & finite[1:, :-1]
+    whole = np.logical_and.reduce(_corners(np.isfinite(heights)))
     if not whole.any():
         raise ArgumentError("save_mesh", "terrain", "must have a cell without a hole, it has none")
     points = np.stack([*np.meshgrid(np.arange(nx) * terrain.dx, np.arange(ny) * terrain.dy), heights], axis=-1).reshape(-1, 3)
-    faces = _surface(whole)
+    corners = _corners(np.arange(ny * nx).reshape(ny, nx))
+    a, b, c, d = (corner[whole] for corner in corners)
+    faces = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)  # split along 00-11, counter-clockwise from above
     if base is not None:
-        faces = np.concatenate([faces, faces[:, ::-1] + ny * nx, _walls(whole, ny * nx)])
+        faces = np.concatenate([faces, faces[:, ::-1] + ny * nx, _walls(whole, corners, ny * nx)])
         points = np.concatenate([points, points * (1, 1, 0) + (0, 0, base)])
     if longer_side is not None:
         points = points * (longer_side / max((nx - 1) * terrain.dx, (ny - 1) * terrain.dy))
@@ -83,21 +84,14 @@ def save_mesh(
         temporary.write_bytes(mesh)
 
 
-def _corners(shape: tuple[int, ...]) -> list[np.ndarray]:
-    """The vertices of each cell, counter-clockwise from 00: 00, 10, 11, 01."""
-    index = np.arange((shape[0] + 1) * (shape[1] + 1)).reshape(shape[0] + 1, shape[1] + 1)
-    return [index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]]
+def _corners(values: np.ndarray) -> list[np.ndarray]:
+    """Those of each cell, of values at vertices, counter-clockwise from 00: 00, 10, 11, 01."""
+    return [values[:-1, :-1], values[:-1, 1:], values[1:, 1:], values[1:, :-1]]
 
 
-def _surface(whole: Bool[np.ndarray, "cy cx"]) -> _Triangles:
-    """Two triangles for each whole cell, split along 00-11, counter-clockwise from above."""
-    a, b, c, d = (corner[whole] for corner in _corners(whole.shape))
-    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
-
-
-def _walls(whole: Bool[np.ndarray, "cy cx"], count: int) -> _Triangles:
+def _walls(whole: Bool[np.ndarray, "cy cx"], corners: list[np.ndarray], count: int) -> _Triangles:
     """Two triangles below each edge of a whole cell that no other shares; a vertex's foot is `count` further."""
-    corners, padded, found = _corners(whole.shape), np.pad(whole, 1), []
+    padded, found = np.pad(whole, 1), []
     for k, (iy, ix) in enumerate(((0, 1), (1, 2), (2, 1), (1, 0))):  # the neighbours in the south, east, north and west
         alone = whole & ~padded[iy : iy + whole.shape[0], ix : ix + whole.shape[1]]
         p, q = corners[k][alone], corners[(k + 1) % 4][alone]
