@@ -56,17 +56,11 @@ def read_grey(path: Path) -> np.ndarray:
     return _decoded(data)
 
 
-def _read_jpeg(path: Path) -> UInt8[np.ndarray, "h w 3"]:
+def _read_lossy(path: Path, kind: str, begin: bytes) -> UInt8[np.ndarray, "h w 3"]:
+    """A "JPEG" or "WebP"; FileError where its first bytes are not these, a regular expression."""
     data = path.read_bytes()
-    if not data.startswith(b"\xff\xd8\xff"):
-        raise FileError("it is not a JPEG")
-    return _decoded(data, "RGB")
-
-
-def _read_webp(path: Path) -> UInt8[np.ndarray, "h w 3"]:
-    data = path.read_bytes()
-    if data[:4] + data[8:12] != b"RIFFWEBP":
-        raise FileError("it is not a WebP")
+    if not re.match(begin, data, re.DOTALL):
+        raise FileError(f"it is not a {kind}")
     return _decoded(data, "RGB")
 
 
@@ -159,8 +153,8 @@ def _write_pfm(path: Path, pixels: np.ndarray) -> None:
 # One reader a format: a path to shape (h, w, 3) or (h, w), float32 or, where values are encoded, uint8 or uint16.
 READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".png": read_png,
-    **dict.fromkeys((".jpg", ".jpeg"), _read_jpeg),
-    ".webp": _read_webp,
+    **dict.fromkeys((".jpg", ".jpeg"), partial(_read_lossy, kind="JPEG", begin=rb"\xff\xd8\xff")),
+    ".webp": partial(_read_lossy, kind="WebP", begin=rb"RIFF.{4}WEBP"),
     ".exr": read_exr,
     ".pfm": _read_pfm,
     ".npy": _read_npy,
