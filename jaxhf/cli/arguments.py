@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import datetime
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -115,12 +115,8 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(","))
 
 
-def settings_options(names: Collection[str]) -> Sequence[Option]:
-    """An option for each of these fields of `Settings`; one that is not given is absent from what is parsed."""
-    return [_knob(field) for field in dataclasses.fields(Settings) if field.name in names]
-
-
-def _knob(field: "dataclasses.Field[Any]") -> Option:
+def knob(field: "dataclasses.Field[Any]") -> Option:
+    """An option for a field of `Settings`; one that is not given is absent from what is parsed."""
     name, about = field.name.replace("_", "-"), field.metadata["help"]
     if field.type is bool:
         off, about = f"--no-{name}", f"leave out {about}"

@@ -1,7 +1,9 @@
 """The commands: what `jaxhf --help` and their own --help say, and their options. What they do stands in `commands`."""
 
+import dataclasses
+
 from ..core.settings import Settings
-from .arguments import choice, finite, flag, names, number, option, positive, settings_options, size, sun, whole
+from .arguments import choice, finite, flag, knob, names, number, option, positive, size, sun, whole
 from .command import DEGREES, IN, MACHINE, PLACE, RASTER, SCENE, TERRAIN, Command, output
 from .map_catalogue import MAPS
 
@@ -78,7 +80,7 @@ _RENDER = Command(
             whole("--height", "PIXELS", "of the picture", least=1),
         ),
         # Nothing is differentiated.
-        "accuracy and speed": settings_options(Settings.__dataclass_fields__.keys() - {"edge_samples"}),
+        "accuracy and speed": [knob(field) for field in dataclasses.fields(Settings) if field.name != "edge_samples"],
         **MACHINE,
     },
     placed=False,

@@ -19,8 +19,6 @@ class Command:
     placed: bool = True  # whether files beside an output that is a map say where it lies
 
 
-# What several take.
-
 TERRAIN = ".tif and others that GDAL reads, .npz, .npy, .asc, .hgt, .png (grey), .exr, .pfm or .hfield (MuJoCo)"
 IN = option("terrain", metavar="IN", help=f"heights: {TERRAIN}")
 SCENE = option("scene", metavar="SCENE", help="a .toml or .pbrt scene")
