@@ -4,7 +4,6 @@ import argparse
 import contextlib
 import dataclasses
 import datetime
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -15,14 +14,6 @@ from ..core.settings import Settings
 
 Option = tuple[tuple[str, ...], dict[str, Any]]
 """What argparse's `add_argument` takes: names, and keywords."""
-
-
-def finite(value: float) -> str | None:
-    return None if math.isfinite(value) else f"must be finite, it is {value}"
-
-
-def positive(value: float) -> str | None:
-    return None if 0 < value < math.inf else f"must be positive and finite, it is {value}"
 
 
 def option(*names: str, **keywords: Any) -> Option:

@@ -2,8 +2,9 @@
 
 import dataclasses
 
+from ..core.rules import finite, positive
 from ..core.settings import Settings
-from .arguments import choice, finite, flag, knob, names, number, option, positive, size, sun, whole
+from .arguments import choice, flag, knob, names, number, option, size, sun, whole
 from .command import DEGREES, IN, MACHINE, PLACE, RASTER, SCENE, TERRAIN, Command, output
 from .map_catalogue import MAPS
 

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 
+from ..core.rules import finite, positive
 from ..maps.choices import ALGORITHMS, CURVATURES, ENTRIES, QUADRATICS, RUGGEDNESS, SUNLIGHT, VARIANTS, WEIGHTINGS
-from .arguments import Option, choice, finite, flag, moment, number, option, positive, real_number, whole
+from .arguments import Option, choice, flag, moment, number, option, real_number, whole
 from .command import IN, MACHINE, NODATA, PART, PLACE, RASTER, Command, output
 
 

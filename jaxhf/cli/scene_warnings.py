@@ -56,8 +56,9 @@ def scene_warnings(scene: Scene) -> Iterator[str]:
             yield f"objects[{k}]: heights reach {far:.7g}; is that a value that means no height (nodata)?"
         elif isinstance(camera, Perspective) and item.world_from_object is None:
             eye = np.asarray(camera.world_from_camera, np.float64)[:3, 3]
-            ground = _height_at(item.shape, heights, eye[0], eye[1])
-            if eye[2] <= ground:
+            field = item.shape
+            ground = height_at(heights, (eye[0] - field.x0) / field.dx, (eye[1] - field.y0) / field.dy)
+            if eye[2] <= ground:  # nan beside the footprint and in holes
                 below = f"{ground - eye[2]:.4g} below the surface of objects[{k}], whose height there is {ground:.6g}"
                 yield f"camera: eye stands {below}: it is seen from below"
         corners.append(_box(item, item.shape, lowest, highest))
@@ -65,15 +66,6 @@ def scene_warnings(scene: Scene) -> Iterator[str]:
         low, high = np.concatenate(corners).min(axis=0), np.concatenate(corners).max(axis=0)
         spans = ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in zip("xyz", low, high, strict=True))
         yield f"camera: none of the terrain is in the picture, it spans {spans}"
-
-
-def _height_at(field: Heightfield, heights: np.ndarray, x: float, y: float) -> float:
-    """The height of the triangle over (x, y); -inf beside the footprint, nan in a hole."""
-    column, row = (x - field.x0) / field.dx, (y - field.y0) / field.dy
-    ny, nx = heights.shape
-    if not (0 <= column <= nx - 1 and 0 <= row <= ny - 1):
-        return -np.inf
-    return height_at(heights, column, row)
 
 
 def _box(item: Object, field: Heightfield, lowest: float, highest: float) -> Float[np.ndarray, "8 3"]:

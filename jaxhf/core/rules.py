@@ -37,6 +37,14 @@ class OneOf(NamedTuple):
         return None if value in names else f"must be one of {', '.join(names)}; it is {value!r}"
 
 
+def finite(value: float) -> str | None:
+    return None if math.isfinite(value) else f"must be finite, it is {value}"
+
+
+def positive(value: float) -> str | None:
+    return None if 0 < value < math.inf else f"must be positive and finite, it is {value}"
+
+
 def flag(value: Any) -> str | None:
     return None if isinstance(value, bool) else f"must be True or False, it is {value!r}"
 

@@ -1,6 +1,5 @@
 """What the functions of this folder are given: heights as an array or a `Terrain`, with their spacing."""
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from ..core.errors import ArgumentError
 from ..core.precision import numbers
+from ..core.rules import positive, require
 from ..io.terrain.terrain import Terrain
 
 Heights = ArrayLike | Terrain
@@ -77,7 +77,6 @@ def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:
 
 
 def require_positive(owner: str, name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise ArgumentError(owner, name, f"must be positive and finite, it is {value}")
+    require(owner, name, value, positive)
     if not 1e-30 <= value <= _MOST:
         raise ArgumentError(owner, name, f"must be from 1e-30 to {_MOST:g}, it is {value}")

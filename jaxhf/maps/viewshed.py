@@ -312,8 +312,8 @@ def height_at(z: Float[np.ndarray, "ny nx"], x: float, y: float) -> float:
 
 
 def _cells_at(at: float, n: int) -> list[tuple[int, float]]:
-    """The cells that touch a place along one side of n vertices, and the place in each; two where a vertex is."""
-    nearest = round(at)
+    """The cells that touch a place along one side of n vertices, and the place in each; two at a vertex, none outside."""
+    nearest, cells = round(at), [math.floor(at)]
     if abs(at - nearest) < _ROUNDING:
-        return [(k, float(nearest - k)) for k in (nearest, nearest - 1) if 0 <= k < n - 1]
-    return [(math.floor(at), at - math.floor(at))]
+        at, cells = float(nearest), [nearest, nearest - 1]
+    return [(k, at - k) for k in cells if 0 <= k < n - 1]

@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike
 
 from ...core.errors import ArgumentError
 from ...core.precision import WORTH_A_WARNING, fitted, numbers, rounding
+from ...core.rules import finite, positive, require
 from ..errors import FileError
 from .georeference import (
     WGS84,
@@ -60,10 +61,7 @@ class Terrain:
         if self.heights.ndim != 2 or min(self.heights.shape) < 2:
             raise ArgumentError("", "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {self.heights.shape}")
         for name in ("dx", "dy", "x0", "y0"):
-            value = getattr(self, name)
-            if not math.isfinite(value) or (name in ("dx", "dy") and value <= 0):
-                rule = "positive and finite" if name in ("dx", "dy") else "finite"
-                raise ArgumentError("", name, f"must be {rule}, it is {value}")
+            require("", name, getattr(self, name), positive if name in ("dx", "dy") else finite)
 
     @classmethod
     def from_xarray(cls, array: Any, nodata: float | None = None) -> "Terrain":
