@@ -170,13 +170,7 @@ _CACHE = 2**27  # bytes of GDAL's for blocks of a file, of which it else takes a
 
 def rows_of(terrain: Terrain) -> Rows:
     """The rows of a terrain in memory."""
-
-    def read(part: slice, step: int) -> Terrain:
-        return dataclasses.replace(
-            terrain, heights=terrain.heights[part][::step, ::step], y0=terrain.y0 + part.start * terrain.dy
-        )
-
-    return Rows(terrain, read)
+    return Rows(terrain, lambda part, step: terrain.cut(slice(part.start, part.stop, step), slice(0, None, step)))
 
 
 _UNDECLARED = (-999, -9999, -99999, -32767, -32768, 9999, 32767, 65535)  # what often means no height

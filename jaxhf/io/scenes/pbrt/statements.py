@@ -91,12 +91,10 @@ class Statement:
 
     def numbers(self, n: int) -> list[float]:
         """The n bare numbers that follow the directive, and nothing else."""
-        tokens = self._exactly(n, "number", f"{n} numbers")
-        values = [float(token.text) for token in tokens]
-        for token, value in zip(tokens, values, strict=True):
-            if not np.isfinite(value):
+        for token in self._exactly(n, "number", f"{n} numbers"):
+            if not np.isfinite(float(token.text)):
                 raise token.error(f"{self.word} takes finite numbers, found {token}")
-        return values
+        return [float(token.text) for token in self.rest]
 
     def matrix(self) -> Float[np.ndarray, "4 4"]:
         """The 16 numbers in brackets that follow the directive, column by column as pbrt writes them."""
