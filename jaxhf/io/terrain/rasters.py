@@ -162,28 +162,26 @@ def writing_strips(path: Path, like: Terrain, nodata: float | None) -> Iterator[
                 yield append
             return
         rasterio, sums = import_extra("rasterio", "writing .tif needs", "geo"), {}
-        with contextlib.ExitStack() as open_files:
-            name = open_files.enter_context(utf8_name(temporary))
+        with utf8_name(temporary) as name, contextlib.ExitStack() as open_files:
             datasets: list[Any] = []
 
+            @_disk_full(rasterio)
             def put(rows: slice, values: np.ndarray) -> None:
                 bands = np.ascontiguousarray(_bands(values))
                 if not datasets:
-                    with _disk_full(rasterio):
-                        dataset = _created(partial(rasterio.open, name, "w"), bands, like, nodata)
-                        datasets.append(open_files.enter_context(dataset))
+                    dataset = _created(partial(rasterio.open, name, "w"), bands, like, nodata)
+                    datasets.append(open_files.enter_context(dataset))
                 top = len(like.heights) - rows.stop
                 window = (top, top + len(values)), (0, values.shape[1])
-                with _disk_full(rasterio):
-                    datasets[0].write(bands, window=window)
+                datasets[0].write(bands, window=window)
                 sums[window] = zlib.crc32(bands.data)
 
             yield put
             with _disk_full(rasterio):
-                open_files.pop_all().close()
-        with _disk_full(rasterio), utf8_name(temporary) as name, rasterio.open(name) as dataset:
-            if any(zlib.crc32(dataset.read(window=window).data) != found for window, found in sums.items()):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                open_files.close()
+                with rasterio.open(name) as dataset:
+                    if any(zlib.crc32(dataset.read(window=window).data) != found for window, found in sums.items()):
+                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @contextlib.contextmanager
