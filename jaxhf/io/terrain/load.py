@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from ...core.extras import import_extra
-from ...core.rules import Whole, require
 from ..errors import FileError
 from ..files import PathLike, by_ending, read_npy, reading, require_file
 from ..gdal import DRIVERS
@@ -103,8 +102,6 @@ def read_terrain(
     with reading(path):
         if not math.isfinite(z_scale) or z_scale == 0:
             raise FileError(f"z_scale must be finite and not zero, it is {z_scale}")
-        if band is not None:
-            require("load_heights", "band", band, Whole(1))
         if reader is None:
             with raster_rows(path, chosen, band, bbox, window) as rows:
                 terrain = rows.whole()
@@ -146,17 +143,10 @@ def terrain_rows(
     with contextlib.ExitStack() as stack:
         if by_ending(_READERS, path, "read heights from") is None:
             with reading(path):
-                if band is not None:
-                    require("load_heights", "band", band, Whole(1))
                 stack.enter_context(import_extra("rasterio", f"reading {path.suffix} needs", "geo").Env(GDAL_CACHEMAX=_CACHE))
                 used = (lambda named: named) if nodata is None else lambda _: nodata
                 rows = stack.enter_context(raster_rows(path, used, band, bbox, window))
-            (ny, nx), stored = rows.place.heights.shape, rows.read
-
-            def read(part: slice, step: int) -> Terrain:
-                with reading(path):
-                    return stored(part, step)
-
+            (ny, nx), read = rows.place.heights.shape, reading(path)(rows.read)
             if ny * nx > STRIP:
                 step = math.ceil(math.sqrt(ny * nx / _SAMPLE))
                 _warn_of(path, read(slice(0, ny), step))

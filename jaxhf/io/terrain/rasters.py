@@ -16,6 +16,7 @@ import numpy as np
 
 from ...core.errors import ArgumentError
 from ...core.extras import import_extra
+from ...core.rules import Whole, require
 from ..errors import FileError
 from ..files import PathLike, reading, replacing, require_pixels, require_writable, utf8_name, write_npy
 from ..gdal import opened
@@ -46,6 +47,7 @@ def raster_rows(path: Path, nodata: Nodata, band: int | None, box: Box | None, w
         if band is None and dataset.count != 1:
             raise FileError(f"heights must be one band, it has {dataset.count}: band must say which")
         number = 1 if band is None else band
+        require("load_heights", "band", number, Whole(1))
         if number > dataset.count:
             raise FileError(f"it has no band {number}, it has {dataset.count}")
         scale, offset = dataset.scales[number - 1], dataset.offsets[number - 1]
