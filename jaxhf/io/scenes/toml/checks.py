@@ -40,6 +40,10 @@ class Part(NamedTuple):
         """An error on the line of this part, or of the nearest one around it."""
         return SceneError(self.path, line_of(self.text, self.where), message)
 
+    def must(self, rule: str) -> SceneError:
+        """The same by its name, and what it must be or have."""
+        return self.error(f"{self.name} must {rule}")
+
     def read(self, keys: Keys) -> dict[str, Any]:
         """The values of those `keys` that are there, by their kinds; SceneError on any other key, and where one is needed."""
         self.require_known(keys)
@@ -51,7 +55,7 @@ class Part(NamedTuple):
                 except (ValueError, OverflowError) as error:
                     shown = repr(self.table[name])
                     shown = shown if len(shown) <= 60 else f"{shown[:57]}..."
-                    raise self.at(name).error(f"{self.at(name).name} must be {error}, it is {shown}") from error
+                    raise self.at(name).must(f"be {error}, it is {shown}") from error
             elif key.needed:
                 raise self.error(f"{self.name or 'a scene'} must have {name!r}, it is missing")
         return values
@@ -68,11 +72,11 @@ class Part(NamedTuple):
         if value is None:
             for meant in difflib.get_close_matches(name, self.table, n=1):
                 self._replace(table={meant: None}).require_known((name,))
-            raise self.error(f"{self.name} must have {name!r}, one of {', '.join(options)}; it is missing")
+            raise self.must(f"have {name!r}, one of {', '.join(options)}; it is missing")
         if value not in tuple(options):
-            place, close = self.at(name), difflib.get_close_matches(str(value), tuple(options), n=1, cutoff=0.5)
+            close = difflib.get_close_matches(str(value), tuple(options), n=1, cutoff=0.5)
             tail = "".join(f"; did you mean {meant!r}?" for meant in close)
-            raise place.error(f"{place.name} must be one of {', '.join(options)}; it is {value!r}{tail}")
+            raise self.at(name).must(f"be one of {', '.join(options)}; it is {value!r}{tail}")
         return value
 
     def one_of(self, names: Iterable[str], others: Iterable[str]) -> str:

@@ -141,7 +141,7 @@ def load_case(path: PathLike, dtype: DTypeLike = np.float32) -> Case:
     known = [value for value in noises if value is not None]
     if known and len(known) < len(noises):
         place = part.at("pictures", noises.index(None))
-        raise place.error(f"{place.name} must have a noise, as another picture has one; or none, then it is estimated")
+        raise place.must("have a noise, as another picture has one; or none, then it is estimated")
     return Case(
         scenes, targets, weights, tuple(known) or None, settings, options, prior, unknown, names, base.field.like, part
     )  # fmt: skip
@@ -192,8 +192,7 @@ def _weights(picture: Part, target: np.ndarray) -> Float32[np.ndarray, "h w"] | 
         return None if there.all() else there.astype(np.float32)
     weights = picture.file(present, load_numbers).mean(axis=-1)
     if weights.shape != size:
-        place = picture.at(present)
-        raise place.error(f"{place.name} must have the size of the image, {_by(size)}; it is {_by(weights.shape)}")
+        raise picture.at(present).must(f"have the size of the image, {_by(size)}; it is {_by(weights.shape)}")
     weights = (weights > 0).astype(np.float32) if present == "mask" else weights
     return np.where(there, weights, np.zeros_like(weights))
 
@@ -202,15 +201,13 @@ def _camera(picture: Part, base: _Base, size: tuple[int, ...]) -> Camera:
     """The camera of a picture with so many rows and columns, which are its own where its table states none."""
     view, (height, width) = picture.at("camera") if "camera" in picture.table else base.view, size
     if view is None:
-        raise picture.error(f"{picture.name} must have a camera: there is none for all pictures")
+        raise picture.must("have a camera: there is none for all pictures")
     if isinstance(view, Part) and view.table.keys().isdisjoint(("width", "height")):
         view = view._replace(table={**view.table, "height": height, "width": width})
     camera = read_camera(view) if isinstance(view, Part) else view
     if height != round(width * camera.height / camera.width) and width != round(height * camera.width / camera.height):
         stated = _by((camera.height, camera.width))
-        raise picture.at("image").error(
-            f"{picture.name}.image must have the proportions of its camera, {stated}; it is {_by(size)}"
-        )
+        raise picture.at("image").must(f"have the proportions of its camera, {stated}; it is {_by(size)}")
     return dataclasses.replace(camera, width=width, height=height)
 
 

@@ -89,9 +89,7 @@ def read_lights(part: Part, terrain: Terrain | None) -> list[Light]:
 def _light(part: Part, terrain: Terrain | None) -> Light:
     if "time" in part.table and part.table.keys().isdisjoint(("latitude", "longitude")):
         if terrain is None:
-            raise part.error(
-                f"{part.name} must have latitude and longitude, there is no terrain file whose place they could be"
-            )
+            raise part.must("have latitude and longitude, there is no terrain file whose place they could be")
         latitude, longitude = part.made(lambda: terrain.place)
         part = part._replace(table={**part.table, "latitude": latitude, "longitude": longitude})
     return _variant(part, "type", LIGHTS)
@@ -142,23 +140,19 @@ def _nested(parts: list[Part], made: list[tuple[Object, Provenance | None]]) -> 
     """The objects, those that go `around` a heightfield before them fitted to that."""
     begins = [k for k, part in enumerate(parts) if not part.table.get("around")]
     if parts and begins[:1] != [0]:
-        raise parts[0].at("around").error(f"{parts[0].at('around').name} must stand below another heightfield, it is the first")
+        raise parts[0].at("around").must("stand below another heightfield, it is the first")
     for begin, end in zip(begins, [*begins[1:], len(parts)], strict=True):
         if end - begin == 1:
             continue
         place, objects, known = parts[begin + 1].at("around"), *zip(*made[begin:end], strict=True)
         if any(field is None for field in known):
-            raise place.error(f"{place.name} must stand below a heightfield, there it is below a cylinder")
+            raise place.must("stand below a heightfield, there it is below a cylinder")
         for part, field in zip(parts[begin:end], known, strict=True):
             crs = field.stored and field.stored.crs
             if crs and crs.degrees and not {"x0", "y0"} <= part.table.keys():
-                raise place.error(
-                    f"{place.name} must go with files in metres, {part.name} is in degrees (gdalwarp projects it)"
-                )
+                raise place.must(f"go with files in metres, {part.name} is in degrees (gdalwarp projects it)")
             if part is not parts[begin] and (given := part.at_most_one("transform", "matrix")):
-                raise part.at(given).error(
-                    f"{part.at(given).name} must stand without around: it has that of {parts[begin].name}"
-                )
+                raise part.at(given).must(f"stand without around: it has that of {parts[begin].name}")
         fields = place.made(nested, *(item.shape for item in objects))
         made[begin:end] = [
             (Object(field, item.material, objects[0].world_from_object), before.seen_by(field))
