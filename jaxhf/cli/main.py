@@ -49,20 +49,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # where Python flushes the rest at the end
         return 128 + 13
     except (UserError, OSError) as error:
-        print(f"jaxhf: error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        said = " ".join(str(error).split())
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):  # which is what JAX calls it
             raise
-        print(
-            "jaxhf: error: memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)",
-            file=sys.stderr,
-        )
-        return 2
+        said = "memory ran out; a smaller picture or terrain needs less (render: also a smaller --chunk)"
+    else:
+        return 0
     finally:
         if arguments is None:
             gc.freeze()  # nothing is looked through once more at the end
-    return 0
+    print(f"jaxhf: error: {said}", file=sys.stderr)
+    return 2
 
 
 def _show_any_name() -> None:

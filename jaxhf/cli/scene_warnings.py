@@ -73,9 +73,7 @@ def _box(item: Object, field: Heightfield, lowest: float, highest: float) -> Flo
     ny, nx = field.heights.shape
     xs, ys = (field.x0, field.x0 + (nx - 1) * field.dx), (field.y0, field.y0 + (ny - 1) * field.dy)
     points = np.array([(x, y, z) for x in xs for y in ys for z in (lowest, highest)], np.float64)
-    if item.world_from_object is None:
-        return points
-    matrix = np.asarray(item.world_from_object, np.float64)
+    matrix = np.eye(4) if item.world_from_object is None else np.asarray(item.world_from_object, np.float64)
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
