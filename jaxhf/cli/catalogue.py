@@ -8,8 +8,6 @@ from .arguments import choice, flag, knob, names, number, option, size, sun, who
 from .command import DEGREES, IN, MACHINE, PLACE, RASTER, SCENE, TERRAIN, Command, output
 from .map_catalogue import MAPS
 
-# Pictures.
-
 PRESETS = {"draft": 1, "balanced": 9, "exact": 64}  # samples a pixel of `jaxhf view`
 MATERIALS = "matte", "lommel-seeliger", "lunar-lambert", "minnaert", "oren-nayar", "hapke"  # of `scene.material.SCATTERING`
 _PRESET = "1, 9 or 64 samples a pixel; draft: also a sky that nothing hides [balanced]"
@@ -87,8 +85,6 @@ _RENDER = Command(
     placed=False,
 )
 
-# Recovery.
-
 _FIT = Command(
     "fit",
     "recover heights from pictures",
@@ -133,8 +129,6 @@ _TRADEOFF = Command(
     "the Pareto front of the settings, and keep a table and a plot. What was measured is kept: the same command goes on after "
     "Ctrl-C, and only prints when all is there. It says how long it will take.",
 )
-
-# Files.
 
 _WRITTEN = ".tif, .npz, .npy, .asc, .png (rounded) or .exr; a mesh: .glb, .obj, .ply or .stl"
 _CONVERT = Command(

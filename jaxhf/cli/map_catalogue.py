@@ -60,7 +60,6 @@ def _sky(written: str, *special: Option, azimuths: int = 32) -> dict[str, Sequen
 _SHARE = "share of the sky's solid angle, or of its light on horizontal ground or on the slope [solid-angle]"
 _END = "as --begin, ten years later at most; a day ends with the next date"
 _TIME = "2026-06-21 (midnight of mean solar time there), or a time with its offset from UTC, 2026-06-21T07:00-05:00"
-_OBSERVER = "x and y in the file's coordinates; may be said several times"
 _RADIUS = "of the sphere on which the terrain lies [it lies on a plane; for light over the Earth 7.44e6, as GDAL's 6/7]"
 _VIEWSHED = Command(
     "viewshed",
@@ -75,7 +74,7 @@ _VIEWSHED = Command(
             output("the map: .tif or .png (255 where it is seen, 0 elsewhere), or .npy"),
             option(
                 "--observer", dest="observers", nargs=2, type=real_number, action="append", required=True, metavar=("X", "Y"),
-                help=_OBSERVER,
+                help="x and y in the file's coordinates; may be said several times",
             ),
             flag("--line", "observers all along the line through these points, at most a cell apart"),
             flag("--area", "observers at every height within the polygon of these points"),

@@ -10,7 +10,7 @@ from ...study.pareto import advice, markdown
 from ...study.plan import plan
 from ...study.plots import save_plot
 from ...study.table import Sweep
-from .. import interruption
+from .. import arguments, interruption
 from ..limits import require_devices
 from ..progress import bar, is_quiet
 
@@ -33,10 +33,9 @@ def run(options: argparse.Namespace) -> None:
     if not measured:
         raise UserError(f"{sweep.path}: nothing could be measured")
     plot = save_plot(sweep, measured)
-    asks = options.error is not None or options.time is not None
     if options.markdown:
         print(markdown(measured), end="\n\n")
-    if asks or not options.markdown:
+    if not options.markdown or arguments.given(options, "error", "time"):
         print("\n".join(advice(measured, options.error, options.time)))
     print(f"{counted(len(measured), 'configuration')}: {sweep.table}, {plot}")
     if failures:

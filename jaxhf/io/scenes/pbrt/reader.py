@@ -138,8 +138,6 @@ class _Reader:
             case _:
                 self._concatenate(statement)
 
-    # Blocks, files, attributes.
-
     def _include(self, name: Token) -> None:
         with located(name):
             path = resolve_inside(self.root, self.files[-1].parent, name.name())
@@ -188,8 +186,6 @@ class _Reader:
                 matrix = self.matrix @ matrix
                 require("", "the current transformation", matrix, invertible)
             self.matrix = matrix
-
-    # The parts of the scene.
 
     def _sampler(self, args: Arguments) -> None:
         if args.kind == "bestcandidate":
