@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 
 from ..core.settings import Settings
-from .table import Row, changes, in_words
+from .table import Row, in_words
 
 _ERRORS = {
     "picture": {"rmse": "RMSE", "p999": "99.9 %", "wrong_hits": "wrong hits"},
@@ -30,24 +30,6 @@ def pareto_front(rows: Sequence[Row]) -> list[Row]:
         if not best or row["error"] < best[-1]["error"]:
             best.append(row)
     return best
-
-
-def one_at_a_time(rows: Sequence[Row]) -> dict[str, list[tuple[str, Row]]]:
-    """For each knob that was swept its values and what was measured there, all else as in the task's base."""
-    base, *others = rows
-    found: dict[str, list[tuple[str, Row]]] = {}
-    for row in others:
-        changed = changes(row, base)
-        if len(changed) == 1:
-            ((knob, value),) = changed.items()
-            found.setdefault(knob, [(str(base[knob]), base)]).append((str(value), row))
-
-    def place(pair: tuple[str, Row]) -> tuple[float, str]:
-        """On the knob's axis: numbers by size, the unlimited last, words after that by name."""
-        value = pair[0]
-        return float(value) if value.isdigit() else math.inf, value
-
-    return {knob: sorted(values, key=place) for knob, values in found.items()}
 
 
 def advice(measured: Sequence[Row], error: float | None, seconds: float | None) -> list[str]:

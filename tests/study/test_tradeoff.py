@@ -10,7 +10,7 @@ import pytest
 import jaxhf
 from jaxhf.scene.scene import shrunk
 from jaxhf.study.measure import DERIVATIVE_PIXELS, Picture, centre_hits
-from jaxhf.study.pareto import advice, by_task, markdown, one_at_a_time, pareto_front
+from jaxhf.study.pareto import advice, by_task, markdown, pareto_front
 from jaxhf.study.plan import plan
 from jaxhf.study.plots import plot
 from jaxhf.study.table import changes, in_words
@@ -124,15 +124,6 @@ def test_what_is_recommended_can_be_written_as_it_stands():
     (line,) = advice([row(samples=16, normals="four", shadows=False, max_steps=32)], 1.0, None)
     settings = eval(line[line.index("Settings(") : line.index("), float32") + 1], {"Settings": jaxhf.Settings})
     assert settings == jaxhf.Settings(samples=16, normals="four", shadows=False, max_steps=32)
-
-
-def test_one_knob_at_a_time():
-    rows = [*ROWS[:5], row(samples=4, shading="flat"), row(max_steps=8), row(max_steps=16)]
-    found = one_at_a_time(rows)
-    assert list(found) == ["samples", "shading", "max_steps"]
-    assert [value for value, _ in found["max_steps"]] == ["8", "16", "None"]
-    assert [value for value, _ in found["samples"]] == ["1", "16", "25", "None"]
-    assert [value for value, _ in found["shading"]] == ["flat", "smooth"]  # not with other samples as well
 
 
 def test_tables_and_plot_hold_every_row():
