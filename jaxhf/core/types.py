@@ -1,5 +1,6 @@
 """Array aliases with named axes, what becomes a leaf of a scene, and the rules that numbers keep."""
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,7 +21,7 @@ else:
 
 MOST = 1e30  # of a number in a scene: beyond, products overflow in single precision
 MOST_PLACES = 2**31 - 1  # of numbers in an array that several heightfields share: places in it are 32-bit integers
-_ALIGNED = 64  # bytes
+_ALIGNED = 64  # bytes, of XLA's arrays on CPUs
 
 Scalar = Float[jax.Array, ""]
 Flag = Bool[jax.Array, ""]
@@ -72,28 +73,29 @@ def height_leaf(owner: str, name: str, value: Any, dtype: Any = None) -> jax.Arr
 
 def array_leaf(value: Any, dtype: Any) -> jax.Array:
     """An array of JAX's, which what is done to NumPy's afterwards does not change. What is masked is nan; TypeError where
-    there are no numbers.
-
-    JAX on a CPU shares the memory of NumPy's arrays that lie aligned, as the copy made here does: so there is no second one.
-    """
+    there are no numbers."""
     if isinstance(value, jax.Array):
         return jnp.asarray(value, dtype)
     given, dtype = numbers(value), np.dtype(dtype)
     if given.dtype.kind not in "biuf":
         raise TypeError(f"{given.dtype} stands where numbers must")
-    room = np.empty(given.size * dtype.itemsize + _ALIGNED, np.uint8)
-    start = -room.ctypes.data % _ALIGNED
-    copy = room[start : start + given.size * dtype.itemsize].view(dtype).reshape(given.shape)
+    copy = room(given.shape, dtype)  # of which there is no second one on a CPU
     copy[...] = given
     return jnp.asarray(copy, dtype)
+
+
+def room(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """An array without values, whose memory JAX's CPU devices share, as it begins where XLA's own do."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + _ALIGNED, np.uint8)
+    begin = -memory.ctypes.data % _ALIGNED
+    return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
 def rgb_leaf(value: Any) -> Any:
     """A colour: three numbers, or one number that stands for a grey."""
     leaf = float_leaf(value)
-    if leaf.shape == ():
-        return leaf[None].repeat(3) if isinstance(leaf, jax.Array) else np.repeat(leaf, 3)
-    return leaf
+    return leaf[None].repeat(3) if leaf.shape == () else leaf
 
 
 class Number(NamedTuple):

@@ -15,11 +15,12 @@ from ..boundary.guiding import has_edges
 from ..boundary.term import Boundaries, draw_boundaries, moved_light
 from ..core.autodiff import with_tangent
 from ..core.settings import Settings
+from ..core.types import room
 from ..preparation.any_size import of_any_terrain
 from ..preparation.world import World
 from ..scene.camera import Camera, of_any_size
 from ..xla.compilation import compiled, is_part_of_more
-from ..xla.devices import by_device, everywhere, map_over, on_every_device, room
+from ..xla.devices import by_device, everywhere, map_over, on_every_device
 from ..xla.kernel import in_turn, one_kernel
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, tile_side, trace_tiles

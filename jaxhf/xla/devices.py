@@ -17,6 +17,7 @@ from jax.extend.core import jaxpr_as_fun
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 
 from ..core.errors import ArgumentError, UserError, require_kind
+from ..core.types import room
 from .compilation import is_traced
 from .machine import peak_mb
 
@@ -26,7 +27,6 @@ Result = TypeVar("Result")
 # A device more of a CPU costs 7 ms a run, and so many rays take 10 (one terrain) to 300 ms (mirrors) to trace.
 _RAYS_A_DEVICE = 2**16
 _LEAST_DIVIDED = 2**14  # numbers of an array
-_ALIGNMENT = 64  # bytes, of XLA's arrays on CPUs
 
 
 class Spread(eqx.Module):
@@ -200,14 +200,6 @@ def by_device(leaf: jax.Array, devices: int) -> list[np.ndarray]:
         return np.split(on_host(leaf), devices)
     shards = sorted(leaf.addressable_shards, key=lambda shard: shard.index[0].start)
     return [np.asarray(shard.data) for shard in shards]
-
-
-def room(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """An array without values that `everywhere` does not copy to CPU devices: it begins where XLA's own do."""
-    size = math.prod(shape) * dtype.itemsize
-    memory = np.empty(size + _ALIGNMENT, np.uint8)
-    begin = -memory.ctypes.data % _ALIGNMENT
-    return memory[begin : begin + size].view(dtype).reshape(shape)
 
 
 def where_called(owner: str, tree: Any) -> Any:
