@@ -83,22 +83,13 @@ class _Along(NamedTuple):
         return np.minimum(numbers, numbers[::-1])
 
 
-class _Spacing(NamedTuple):
-    """Where the posts of a terrain stand along an axis."""
-
-    step: float
-    start: float
-    posts: int
-
-
-def _spacings(field: Heightfield) -> tuple[_Spacing, _Spacing]:
-    """Along y and along x."""
-    ny, nx = field.heights.shape
-    return _Spacing(field.dy, field.y0, ny), _Spacing(field.dx, field.x0, nx)
+def _posts(field: Heightfield, axis: int) -> tuple[float, float, int]:
+    """How far apart a terrain's posts are along y (0) or x, where the first stands, and how many there are."""
+    return (*((field.dy, field.y0), (field.dx, field.x0))[axis], field.heights.shape[axis])
 
 
 def _along(inner: Heightfield, outer: Heightfield, axis: int) -> _Along:
-    (d, start, n), (coarse, first, count) = _spacings(inner)[axis], _spacings(outer)[axis]
+    (d, start, n), (coarse, first, count) = _posts(inner, axis), _posts(outer, axis)
     if coarse < d * (1 - _ROUNDING):
         found = f"along {'yx'[axis]} the cells of one have {d:.6g}, of the next {coarse:.6g}"
         raise ArgumentError("nested", "fields", f"must come from fine to coarse; {found}")
@@ -125,10 +116,10 @@ def _heights(field: Heightfield) -> Float[np.ndarray, "ny nx"]:
 def _aligned(inner: Heightfield, outer: Heightfield) -> Heightfield:
     """The coarser terrain with its posts moved onto the nearest of the finer one."""
     places, grid = [], []
-    for axis, (fine, coarse) in enumerate(zip(_spacings(inner), _spacings(outer), strict=True)):
-        way = _along(inner, outer, axis)
-        step, start = way.times * fine.step, fine.start + (way.begin - way.before * way.times) * fine.step
-        at = (start - coarse.start + np.arange(way.before + way.cells + way.after + 1) * step) / coarse.step
+    for axis in (0, 1):
+        way, (fine, begin, _), (coarse, first, _) = _along(inner, outer, axis), _posts(inner, axis), _posts(outer, axis)
+        step, start = way.times * fine, begin + (way.begin - way.before * way.times) * fine
+        at = (start - first + np.arange(way.before + way.cells + way.after + 1) * step) / coarse
         places.append(np.where(np.abs(at - np.round(at)) < _ROUNDING, np.round(at), at))
         grid.append((step, start))
     (dy, y0), (dx, x0) = grid
