@@ -20,7 +20,7 @@ from .framing import framing_pose
 from .heightfield import Heightfield
 from .mapped import geotransformed, resected_rpc
 from .pose import look_at_pose, require_pose
-from .projection import Projection, camera_from_world, film, projected, screen
+from .projection import Projection, film, projected, screen
 from .record import Record, known, numbers
 from .resection import resected, resected_in_parallel
 
@@ -204,8 +204,7 @@ class Perspective(Record):
 
     def film_from_world(self) -> Projection:
         """The projection of points in the world to pixels, the inverse of `ray`."""
-        camera = camera_from_world(self)
-        return film(self, camera, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), camera.linear[2], camera.offset[2])
+        return film(self, jnp.tan(jnp.deg2rad(jnp.asarray(self.fov)) / 2), parallel=False)
 
     def project(self, points: Any) -> Float[np.ndarray, "*n 2"]:
         """Where points (..., 3) of the world are seen: (..., 2), pixels right and down from the top left corner.
@@ -282,9 +281,7 @@ class Orthographic(Record):
 
     def film_from_world(self) -> Projection:
         """The projection of points in the world to pixels, the inverse of `ray`."""
-        camera = camera_from_world(self)
-        half = jnp.asarray(self.extent) / 2
-        return film(self, camera, half, jnp.zeros_like(camera.offset), jnp.ones_like(half))
+        return film(self, jnp.asarray(self.extent) / 2, parallel=True)
 
     def project(self, points: Any) -> Float[np.ndarray, "*n 2"]:
         """Where points of the world are seen, as `Perspective.project`."""

@@ -25,17 +25,14 @@ class Projection(eqx.Module):
     offset: Float[jax.Array, "4"]
 
     def __call__(self, p: Vector) -> Float[jax.Array, "4"]:
-        return self.linear[:, 0] * p[0] + self.linear[:, 1] * p[1] + self.linear[:, 2] * p[2] + self.offset
+        return self._vector(p) + self.offset
+
+    def _vector(self, v: Vector) -> Float[jax.Array, "4"]:
+        return self.linear[:, 0] * v[0] + self.linear[:, 1] * v[1] + self.linear[:, 2] * v[2]
 
     def of(self, world: Affine) -> "Projection":
         """The same projection for points in another frame; `world` maps that frame to the world's."""
-        columns = [
-            self.linear[:, 0] * world.linear[0, k]
-            + self.linear[:, 1] * world.linear[1, k]
-            + self.linear[:, 2] * world.linear[2, k]
-            for k in range(3)
-        ]
-        return Projection(jnp.stack(columns, axis=1), self(world.offset))
+        return Projection(jnp.stack([self._vector(world.linear[:, k]) for k in range(3)], axis=1), self(world.offset))
 
 
 def screen(camera: Any, x: Any, y: Any) -> tuple[Any, Any]:
@@ -48,19 +45,17 @@ def screen(camera: Any, x: Any, y: Any) -> tuple[Any, Any]:
     return (2 * x - width) * times, (height - 2 * y) * times
 
 
-def camera_from_world(camera: Any) -> Affine:
+def film(camera: Any, half: Scalar, parallel: bool) -> Projection:
+    """The inverse of `screen`: x = (short X / half + width W) / (2 W), W the depth or, of parallel rays, 1; y likewise."""
     inverse = affine(jnp.asarray(camera.world_from_camera)).inverse()
-    return inverse if camera._ahead is None else Affine(inverse.linear, inverse.offset.at[2].add(camera._ahead))
-
-
-def film(camera: Any, camera_from_world: Affine, half: Scalar, w: Vector, w_offset: Scalar) -> Projection:
-    """The inverse of `screen`: x = (short X / half + width W) / (2 W), with W = w . p + w_offset; y likewise."""
+    offset = inverse.offset if camera._ahead is None else inverse.offset.at[2].add(camera._ahead)
     scale = min(camera.width, camera.height) / (2 * half)
 
     def rows(p: Any, w: Any) -> jax.Array:
         return jnp.stack([p[0] * scale + w * (camera.width / 2), -p[1] * scale + w * (camera.height / 2), w, p[2]])
 
-    return Projection(rows(camera_from_world.linear, w), rows(camera_from_world.offset, w_offset))
+    w, one = (jnp.zeros_like(offset), jnp.ones_like(half)) if parallel else (inverse.linear[2], offset[2])
+    return Projection(rows(inverse.linear, w), rows(offset, one))
 
 
 def projected(camera: Any, points: Any, half: Callable[[Any], Any]) -> Float[np.ndarray, "*n 2"]:

@@ -170,7 +170,7 @@ def shrunk(scene: Scene, pixels: int) -> Scene:
 
 def _upright(world: MatrixLeaf | None) -> bool:
     """Whether the object's vertical and horizontal directions are the world's; taken for granted of a traced matrix."""
-    if world is None or not isinstance(world, np.ndarray):
+    if not isinstance(world, np.ndarray):
         return True
     size = 1e-6 * np.abs(world[:3, :3]).max()
     return bool(world[2, 2] > 0 and max(abs(world[0, 2]), abs(world[1, 2]), abs(world[2, 0]), abs(world[2, 1])) <= size)
