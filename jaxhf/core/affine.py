@@ -60,10 +60,14 @@ def affine(matrix: Float[AnyArray, "4 4"]) -> Affine:
     return Affine(matrix[:3, :3], matrix[:3, 3])
 
 
-def translate(x: float, y: float, z: float) -> Float[np.ndarray, "4 4"]:
+def matrix_of(linear: Float[np.ndarray, "3 3"], offset: Any) -> Float[np.ndarray, "4 4"]:
     matrix = np.eye(4)
-    matrix[:3, 3] = x, y, z
+    matrix[:3, :3], matrix[:3, 3] = linear, offset
     return matrix
+
+
+def translate(x: float, y: float, z: float) -> Float[np.ndarray, "4 4"]:
+    return matrix_of(np.eye(3), (x, y, z))
 
 
 def scale(x: float, y: float, z: float) -> Float[np.ndarray, "4 4"]:
@@ -79,9 +83,7 @@ def rotate(degrees: float, x: float, y: float, z: float) -> Float[np.ndarray, "4
     axis = axis / length
     cross = np.cross(np.eye(3), axis)  # rows: e_i x axis, so that v @ cross = v x axis
     angle = np.radians(degrees)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.cos(angle) * np.eye(3) + (1 - np.cos(angle)) * np.outer(axis, axis) + np.sin(angle) * cross
-    return matrix
+    return matrix_of(np.cos(angle) * np.eye(3) + (1 - np.cos(angle)) * np.outer(axis, axis) + np.sin(angle) * cross, 0)
 
 
 def invertible(matrix: Any) -> str | None:

@@ -6,6 +6,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from ..core.affine import matrix_of
 from ..core.errors import ArgumentError
 from .heightfield import Heightfield
 
@@ -52,9 +53,7 @@ def framing_pose(
         for across, tangent in zip((x, y), tangents, strict=True)
     )
     eye = middle + _central(x, z - along) * right + _central(y, z - along) * up + along * forward
-    pose = np.eye(4)
-    pose[:3] = np.stack([right, up, forward, eye], axis=1)
-    return pose
+    return matrix_of(np.stack([right, up, forward], axis=1), eye)
 
 
 def _cylinder(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:

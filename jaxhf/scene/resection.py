@@ -7,6 +7,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float
 
+from ..core.affine import matrix_of
 from ..core.errors import ArgumentError
 from ..core.rules import require
 from ..core.types import POSITIVE, float_leaf
@@ -46,7 +47,7 @@ def resected(
     # Of K [R | t], so that a calibrated camera's matrix and angle are those of `from_intrinsics`.
     f = np.linalg.norm(np.cross(linear[0 if width <= height else 1], linear[2]))
     camera = [(linear[0] - width / 2 * linear[2]) / f, (height / 2 * linear[2] - linear[1]) / f, linear[2]]
-    return _matrix(np.linalg.inv(np.stack(camera)), eye), math.degrees(2 * math.atan(min(width, height) / 2 / f))
+    return matrix_of(np.linalg.inv(np.stack(camera)), eye), math.degrees(2 * math.atan(min(width, height) / 2 / f))
 
 
 def resected_in_parallel(
@@ -65,13 +66,7 @@ def resected_in_parallel(
     linear = np.linalg.inv(np.stack([right / scale, -down / scale, ahead / np.linalg.norm(ahead)]))
     back = 4 * max(np.linalg.norm(p[:, :3] @ axes.T, axis=1).max(), max(width, height) / scale)
     aside = (np.array([width, height]) / 2 - projection[:, 3]) / scale
-    return _matrix(linear, middle + linear @ [aside[0], -aside[1], -back]), extent
-
-
-def _matrix(linear: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "4 4"]:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = linear, offset
-    return matrix
+    return matrix_of(linear, middle + linear @ [aside[0], -aside[1], -back]), extent
 
 
 def _matched(points: Any, pixels: Any, least: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -83,8 +83,8 @@ class FlatTexture(eqx.Module):
     @classmethod
     def of(cls, image: ImageTexture, texels: Float[AnyArray, "n 3"]) -> "FlatTexture":
         """The image, whose texels these are."""
-        size: Any = (np.array(n, np.int32) for n in image.texels.shape[:2])
-        return cls(texels, *size, image.at_vertices, image.wrap)
+        size: Any = [np.array(n, np.int32) for n in image.texels.shape[:2]]
+        return cls(texels, size[0], size[1], image.at_vertices, image.wrap)
 
     def __call__(self, uv: Point2) -> Vector:
         between = _between(uv, jnp.asarray(self.h), jnp.asarray(self.w), self.at_vertices, self.wrap)
