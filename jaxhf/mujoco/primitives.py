@@ -109,21 +109,6 @@ def normal(kind: str, size: Vector, p: Vector) -> Vector:
     return jnp.where(at_end, jnp.array([0, 0, 1], p.dtype) * jnp.sign(z), side)
 
 
-def met(kind: Index, size: Vector, ray: Ray, found: Scalar, kinds: list[str]) -> tuple[Scalar, Vector]:
-    """t, and the normal in its frame, where a ray meets the primitive whose place among KINDS is `kind`; differentiable.
-
-    Args:
-      found: t as a search has it. Where a ray just touches the primitive, rounding may say here that it passes: then it counts.
-      kinds: those that may be asked for.
-    """
-    numbers = [KINDS.index(name) for name in kinds]
-    sizes = [jnp.where(kind == number, size, 1) for number in numbers]  # of another kind they may be zero
-    t = select(kind, zip(numbers, map(first_crossing, kinds, sizes, [ray] * len(kinds)), strict=True))
-    found = lax.stop_gradient(found)
-    t = with_tangent(found, jnp.where(jnp.isfinite(t), t, found))
-    return t, select(kind, zip(numbers, map(normal, kinds, sizes, [ray(t)] * len(kinds)), strict=True))
-
-
 @functools.partial(compiled, static_argnames=("kinds",))
 def meet_primitives(
     size: Float[jax.Array, "n 3"],
@@ -182,8 +167,17 @@ def _search(
 def _meet(
     size: Vector, pos: Vector, quat: Quaternion, kind: Index, o: Vector, d: Vector, best: Scalar, known: list[str]
 ) -> Scan:
+    """What one ray meets of the primitive whose place among KINDS is `kind`, one of those `known`; differentiable.
+
+    `best` is t as the search has it. It counts where a ray just touches the primitive and rounding says here that it passes.
+    """
     frame, found = pose(pos, quat), jnp.isfinite(best)
     local, length = scaled(in_frame(frame, Ray(o, d)))
-    t, n = met(kind, size, local, jnp.where(found, best, 0) * length, known)
+    numbers = [KINDS.index(name) for name in known]
+    sizes = [jnp.where(kind == number, size, 1) for number in numbers]  # of another kind they may be zero
+    t = select(kind, zip(numbers, map(first_crossing, known, sizes, [local] * len(known)), strict=True))
+    searched = lax.stop_gradient(jnp.where(found, best, 0) * length)
+    t = with_tangent(searched, jnp.where(jnp.isfinite(t), t, searched))
+    n = select(kind, zip(numbers, map(normal, known, sizes, [local(t)] * len(known)), strict=True))
     p, n = jnp.where(found, frame.point(local(t)), o), jnp.where(found, frame.vector(n), 0)
     return Scan(p, n, jnp.where(found, quotient(t, length), -1), found)

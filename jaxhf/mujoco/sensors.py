@@ -70,8 +70,7 @@ def lidar(
     """What rays from a sensor meet, in directions that turn with it; `dist` is in units of a direction's length.
 
     Args:
-      geoms: a height field, or a batch of them; or several geoms.
-      pos, quat: the sensors' positions and orientations, as in `height_scan`.
+      geoms, pos, quat: as in `height_scan`, of the sensors.
       pattern: directions (n, 3) in the sensor's frame; None: `lidar_pattern()`.
       max_range: how far rays reach; None: without end.
       noise: the standard deviation of a measured range, in units of length, by which `dist` and `p` are off along the rays;
@@ -107,8 +106,7 @@ def depth_image(
     Cameras are MuJoCo's: they look along -z, with x to the right and y up. Differentiable in all numbers but the intrinsics.
 
     Args:
-      geoms: a height field, or a batch of them; or several geoms.
-      pos, quat: the cameras' positions and orientations, as in `height_scan`.
+      geoms, pos, quat: as in `height_scan`, of the cameras.
       width, height: pixels.
       fovy: vertical field of view, degrees.
       intrinsics: (fx, fy, cx, cy) in pixels, (cx, cy) from the upper left corner of the picture, or the matrix
