@@ -22,6 +22,7 @@ from ..xla.devices import takes_numbers
 from .choices import SUNLIGHT
 from .horizons import field_of, map_over_horizons, unit_normals
 from .sunlight import Suns, suns_of, through_air
+from .surface import require_heights
 
 _MOST_YEARS = 10
 
@@ -68,8 +69,8 @@ def insolation(
       ValueError: an argument has a value that it cannot have; a terrain does not say where it lies.
     """
     field = field_of("insolation", terrain, dx, dy)
-    if not is_traced() and not np.isfinite(field.heights).any():
-        raise ArgumentError("insolation", "heights", "must hold a finite one, all of them are nan or infinite")
+    if not is_traced():
+        require_heights("insolation", np.isfinite(field.heights))
     require("insolation", "wanted", wanted, OneOf(SUNLIGHT))
     require("insolation", "azimuths", azimuths, Whole(4))
     require("insolation", "turbidity", turbidity, _turbidity)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ArgumentError
 from ..io.terrain.rasters import Rows
 from ..io.terrain.terrain import Terrain
 from .ramp import as_ramp
+from .surface import require_heights
 
 
 def by_strips(
@@ -35,7 +35,7 @@ def by_strips(
     if "ramp" in takes:
         ends = [_ends(rows.read(_with_neighbours(part, ny), 1).heights) for part in parts]
         low, high = min(low for low, _ in ends), max(high for _, high in ends)
-        _require_heights(function, low <= high)
+        require_heights(function.__name__, low <= high)
         options = options | {"ramp": as_ramp(options.get("ramp"), low, high)}
     found = False
     for part in parts:
@@ -45,17 +45,12 @@ def by_strips(
         found |= bool(np.isfinite(terrain.heights[inside]).any())
         make = function if np.isfinite(terrain.heights).any() else _without_heights(function)
         yield part, make(terrain, **options)[inside]
-    _require_heights(function, found)
+    require_heights(function.__name__, found)
 
 
 def _with_neighbours(part: slice, ny: int) -> slice:
     """The rows with one more on either side, where there is one."""
     return slice(max(part.start - 1, 0), min(part.stop + 1, ny))
-
-
-def _require_heights(function: Callable[..., np.ndarray], found: bool) -> None:
-    if not found:
-        raise ArgumentError(function.__name__, "heights", "must hold a finite one, all of them are nan or infinite")
 
 
 def _ends(heights: np.ndarray) -> tuple[float, float]:

@@ -31,7 +31,21 @@ def surface(
     """Checks what a function of this folder, the `owner`, got; the other arguments are those of `hillshade`."""
     require_positive(owner, "scale", 1.0 if scale is None else scale)
     heights, dx, dy = with_spacing(owner, heights, dx, dy, in_metres=scale is None)
-    return Surface(_numbers(owner, heights), dx, dy, 1.0 if scale is None else scale)
+    values = numbers(heights)
+    if values.dtype.kind not in "fiu":
+        given = f"of {values.dtype}" if isinstance(heights, np.ndarray) else f"a {type(heights).__name__}"
+        raise ArgumentError(owner, "heights", f"must be an array of real numbers or a Terrain, they are {given}")
+    if values.ndim != 2 or min(values.shape) < 2:
+        raise ArgumentError(owner, "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {values.shape}")
+    if values.dtype not in (np.float32, np.float64):
+        values = values.astype(np.float32 if values.dtype.itemsize <= 2 else np.float64)
+    finite = np.isfinite(values)
+    require_heights(owner, finite)
+    values = values if finite.all() else np.where(finite, values, np.nan)
+    largest = max(-np.fmin.reduce(values, axis=None), np.fmax.reduce(values, axis=None))
+    if largest > _MOST:
+        raise ArgumentError(owner, "heights", f"must be within -{_MOST:g} and {_MOST:g}, one is {largest:.3g} from 0")
+    return Surface(values, dx, dy, 1.0 if scale is None else scale)
 
 
 def with_spacing(
@@ -57,23 +71,10 @@ def rotation_of(terrain: Any) -> float:
     return terrain.rotation if isinstance(terrain, Terrain) else 0.0
 
 
-def _numbers(owner: str, heights: Any) -> Float[np.ndarray, "ny nx"]:
-    values = numbers(heights)
-    if values.dtype.kind not in "fiu":
-        given = f"of {values.dtype}" if isinstance(heights, np.ndarray) else f"a {type(heights).__name__}"
-        raise ArgumentError(owner, "heights", f"must be an array of real numbers or a Terrain, they are {given}")
-    if values.ndim != 2 or min(values.shape) < 2:
-        raise ArgumentError(owner, "heights", f"must have shape (ny, nx) of at least 2x2, theirs is {values.shape}")
-    if values.dtype not in (np.float32, np.float64):
-        values = values.astype(np.float32 if values.dtype.itemsize <= 2 else np.float64)
-    finite = np.isfinite(values)
-    if not finite.any():
+def require_heights(owner: str, there: Any) -> None:
+    """ArgumentError where there are none; `there` says of each whether it is finite."""
+    if not np.any(there):
         raise ArgumentError(owner, "heights", "must hold a finite one, all of them are nan or infinite")
-    values = values if finite.all() else np.where(finite, values, np.nan)
-    largest = max(-np.fmin.reduce(values, axis=None), np.fmax.reduce(values, axis=None))
-    if largest > _MOST:
-        raise ArgumentError(owner, "heights", f"must be within -{_MOST:g} and {_MOST:g}, one is {largest:.3g} from 0")
-    return values
 
 
 def require_positive(owner: str, name: str, value: float) -> None:

@@ -56,8 +56,7 @@ def viewshed(
     pass it.
 
     Args:
-      terrain: a `Terrain` (degrees count as metres, see `load_heights`), a `Heightfield`, or heights, shape (ny, nx), row 0 in
-        the south, nan where there is none.
+      terrain, dx, dy, mesh: as for `horizon`.
       observers: x and y of one, shape (2,), or of several, (n, 2), on the terrain, in its coordinates; for an array from
         vertex (0, 0) on, in the unit of `dx`. Those along a line are points a cell apart.
       height: of the eyes above the ground, in the unit of the heights.
@@ -65,9 +64,7 @@ def viewshed(
       wanted: "visible", or "above-ground": the least height above the ground that is seen, 0 where the ground itself is.
       radius: of the sphere that the terrain lies on, in the unit of the heights: what is at a distance d stands lower by
         d² / (2 radius). None: the terrain lies on a plane. For light over the Earth, which air bends, 7.44e6 m (GDAL's 6/7).
-      dx, dy: cell size, in the unit of the heights. An array must have one, which counts for both; None: a terrain's own.
       progress: called with (observers done, observers in all).
-      mesh: the devices that share the work, see `render`.
 
     Returns:
       Shape (ny, nx): bool, False where there is no height; or float32 (float64 of such heights in JAX's x64 mode), nan there.
