@@ -47,8 +47,7 @@ def sun(time: Any, latitude: Any, longitude: Any, *, refraction: bool = False) -
     if refraction:
         lift = 1.02 / 60 / np.tan(np.deg2rad(altitude + 10.3 / (np.maximum(altitude, -1) + 5.11)))
         altitude = np.where(altitude > -1, altitude + lift, altitude)
-    whole = np.broadcast_shapes(azimuth.shape, altitude.shape) == ()
-    return (float(azimuth), float(altitude)) if whole else (azimuth, altitude)
+    return (azimuth, altitude) if azimuth.ndim else (float(azimuth), float(altitude))
 
 
 def require_place(owner: str, latitude: Any, longitude: Any) -> None:
