@@ -12,7 +12,6 @@ import numpy as np
 
 from ..core.errors import ArgumentError
 from ..core.settings import Settings
-from ..core.version import __version__
 from ..io.errors import FileError
 from ..io.files import PathLike
 from ..io.scenes.load import load_scene
@@ -108,6 +107,6 @@ def _identity(scene: Scene, devices: int, quick: bool) -> str:
     digest = hashlib.sha256()
     for leaf in map(np.asarray, jax.tree.leaves(scene)):
         digest.update(f"{leaf.shape} {leaf.dtype}".encode() + leaf.tobytes())
-    versions = [__version__, *(importlib.metadata.version(name) for name in ("jax", "jaxlib"))]
+    versions = [importlib.metadata.version(name) for name in ("jaxhf", "jax", "jaxlib")]
     digest.update(f"{jax.tree.structure(scene)} {devices} {quick} {versions} {jax.default_backend()}".encode())
     return digest.hexdigest()[:16]
