@@ -1,7 +1,7 @@
 """A heightfield made ready for tracing."""
 
+import functools
 import math
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -145,35 +145,18 @@ def joined(grids: Grid) -> tuple[Grid, Grid]:
       one of the second makes a grid, see `equinox.combine`.
     """
 
-    def arrays(grid: Grid) -> tuple[Any, ...]:
-        return grid.rows, grid.pyramid.bounds, grid.normals
-
-    def places(grid: Grid) -> tuple[Any, ...]:
-        return grid.first, grid.pyramid.first
-
-    def at(parts: Callable[[Grid], Any], grids: Grid, values: Any) -> Grid:
-        return eqx.tree_at(parts, grids, values, is_leaf=lambda leaf: leaf is None)
-
-    def sizes(grid: Grid) -> tuple[Any, ...]:
-        pyramid = grid.pyramid
-        return (
-            *grid.cells,
-            *grid.extent,
-            pyramid.width,
-            pyramid.height,
-            pyramid.log_width,
-            pyramid.largest,
-            pyramid.below,
-            grid.most_steps,
-        )
+    def in_common(grid: Grid) -> tuple[Any, ...]:
+        blocks = grid.pyramid
+        sizes = blocks.width, blocks.height, blocks.log_width, blocks.largest, blocks.below
+        return grid.rows, grid.normals, blocks.bounds, *sizes, *grid.cells, *grid.extent, grid.most_steps
 
     def of_all(leaf: jax.Array) -> jax.Array:
         return leaf[0] if leaf.ndim == 1 else leaf.reshape(-1, *leaf.shape[2:])
 
-    grids = at(places, grids, (first_places(grids.rows), first_places(grids.pyramid.bounds)))
-    common = at(arrays, jax.tree.map(lambda _: False, grids), (True, True, None if grids.normals is None else True))
-    common = at(sizes, common, (True,) * len(sizes(grids)))
-    shared, own = eqx.partition(grids, common)
+    at = functools.partial(eqx.tree_at, is_leaf=lambda leaf: leaf is None)
+    places = first_places(grids.rows), first_places(grids.pyramid.bounds)
+    grids = at(lambda grid: (grid.first, grid.pyramid.first), grids, places)
+    shared, own = eqx.partition(grids, at(in_common, jax.tree.map(lambda _: False, grids), replace_fn=lambda _: True))
     return jax.tree.map(of_all, shared), own
 
 
