@@ -11,12 +11,11 @@ from jaxtyping import Float
 
 from ..core.types import Vector
 from ..scene.camera import Camera
-from ..trace.edges import STEPS, EdgeFlags, compare_sides, present_edges, whole_cells
+from ..trace.edges import STEPS, EdgeFlags, at_second_vertices, compare_sides, present_edges, whole_cells
 from ..trace.grid import Grid
 from ..xla.materialise import materialise
 
 EdgeWeights = Float[jax.Array, "3 ny nx"]
-
 
 Viewpoint = tuple[Vector, bool]
 """An eye or a light: at this point (True), or infinitely far away in this direction (False); world frame."""
@@ -39,9 +38,7 @@ def all_edges(grid: Grid) -> EdgeFlags:
 def _without_seam(grid: Grid, flags: EdgeFlags) -> EdgeFlags:
     if grid.seam is None:
         return flags
-    present, (ny, nx) = whole_cells(grid.z), grid.shape
-    beyond = jnp.pad(grid.seam, ((0, 1), (0, 1)))
-    on_seam = jnp.stack([grid.seam & beyond[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS])
+    present, on_seam = whole_cells(grid.z), grid.seam[None] & at_second_vertices(grid.seam)
     return flags & ~(on_seam & compare_sides(present, present, lambda a, b: a != b))
 
 
@@ -81,9 +78,8 @@ def _steps(dtype: Any) -> tuple[jax.Array, jax.Array]:
 
 def _heights(grid: Grid) -> tuple[Float[jax.Array, "ny nx"], EdgeWeights]:
     """At the first vertices of edges, and at the second ones; zero in holes and beyond the grid."""
-    z, (ny, nx) = jnp.where(jnp.isfinite(grid.z), grid.z, 0), grid.shape
-    padded = jnp.pad(z, ((0, 1), (0, 1)))
-    return z, materialise(jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS]))
+    z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
+    return z, materialise(at_second_vertices(z))
 
 
 def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:

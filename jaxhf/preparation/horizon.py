@@ -19,7 +19,7 @@ from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
 from ..core.types import Index, Scalar
-from ..trace.edges import STEPS, present_edges, whole_cells
+from ..trace.edges import at_second_vertices, present_edges, whole_cells
 from ..xla.devices import map_over
 from .crossings import TOGETHER, Crossings, crossings_of
 
@@ -28,6 +28,8 @@ TILE = 32  # vertices along its side
 _STRETCH = 24  # cells, along the axis on which a direction moves faster; up to `TOGETHER` crossings longer
 _GRAIN = 8  # cells from one of the windows whose highest points are kept to the next
 _MARGIN = TILE + 1
+# Windows side by side that a tile moves over within a stretch, wherever between their beginnings it begins.
+_REACH = math.ceil((TILE + _STRETCH + TOGETHER + 4) / _GRAIN) + 1
 _STEEPEST = 1e18  # of slopes: a right angle, whose square is a number in single precision
 
 # Slopes in all directions, shape (k, *at), and what is given `Besides`, to what is wanted of them: arrays without an axis for
@@ -90,11 +92,7 @@ def _over_horizon_jvp(summary: Summary, mesh: Mesh, primals: tuple[Any, ...], ta
         return jnp.where(found >= 0, raised, 0)
 
     changes = lax.map(change, (directions, found)), tangents[3]
-    return jax.jvp(functools.partial(_summarised, summary), (slopes, besides), changes)
-
-
-def _summarised(summary: Summary, slopes: Float[jax.Array, "k *at"], besides: Besides | None) -> jax.Array:
-    return summary(slopes) if besides is None else summary(slopes, *besides)
+    return jax.jvp(lambda slopes, besides: summary(slopes, *(besides or ())), (slopes, besides), changes)
 
 
 def _searched(
@@ -138,10 +136,8 @@ def over_tiles(
 
         def searched() -> tuple[jax.Array, jax.Array | None]:
             slopes, found = lax.map(lambda way: _from_tile(view, way, x, y, lowest, numbered), ways)
-            at_tile = besides
-            if besides is not None:
-                at_tile = besides._replace(at_vertices=jax.tree.map(lambda values: _tile_of(values, x, y), besides.at_vertices))
-            return _summarised(summary, slopes, at_tile), found
+            given = besides and (besides.shared, jax.tree.map(lambda values: _tile_of(values, x, y), besides.at_vertices))
+            return summary(slopes, *(given or ())), found
 
         def nothing() -> tuple[jax.Array, jax.Array | None]:
             return jax.tree.map(lambda form: jnp.full(form.shape, -1, form.dtype), jax.eval_shape(searched))
@@ -175,7 +171,7 @@ class HorizonView(eqx.Module):
     Attributes:
       heights: with a margin, nan beyond the grid.
       edges: for each kind, heights at the first vertices of edges, with a margin; nan where no cell of the surface has it.
-      windows: the highest vertex of squares that begin at every multiple of `_GRAIN`, from `_reach()` of them before the grid.
+      windows: the highest vertex of squares that begin at every multiple of `_GRAIN`, from `_REACH` of them before the grid.
       holed: whether in one of these a vertex, or an edge from there, has heights but no cell: not along straight borders.
       crossings: of each direction.
       bounds: between stretches, the horizontal distances.
@@ -217,11 +213,10 @@ class HorizonView(eqx.Module):
         heights = jnp.pad(z, margin, constant_values=jnp.nan)
         of_kind = _edges(z)
         edges = jnp.pad(of_kind, ((0, 0), *margin), constant_values=jnp.nan)
-        lost = (jnp.isnan(of_kind) & ~jnp.isnan(z)[None] & ~jnp.isnan(_second_vertices(z))).any(0)
-        highest, holed = (
-            _windows(jnp.where(jnp.isnan(z), -jnp.inf, z)),
-            _windows(jnp.where(lost, 0, -jnp.inf).astype(dtype)) == 0,
-        )
+        second = jnp.concatenate([at_second_vertices(z, jnp.nan), z[None]])
+        lost = (jnp.isnan(of_kind) & ~jnp.isnan(z)[None] & ~jnp.isnan(second)).any(0)
+        highest = _windows(jnp.where(jnp.isnan(z), -jnp.inf, z))
+        holed = _windows(jnp.where(lost, 0, -jnp.inf).astype(dtype)) == 0
         return HorizonView(heights, edges, highest, holed, *lax.map(along, directions))
 
 
@@ -246,7 +241,7 @@ def _from_tile(
         return lax.dynamic_slice(view.edges, start, (1, TILE, TILE), allow_negative_indices=False)[0]
 
     z = moved(view.heights, jnp.zeros_like(x), jnp.zeros_like(y))
-    window = [(at + first[:, k]) // _GRAIN + _reach() for k, at in enumerate((x, y))]
+    window = [(at + first[:, k]) // _GRAIN + _REACH for k, at in enumerate((x, y))]
     column, row = (jnp.clip(at, 0, n - 1) for at, n in zip(window, view.windows.shape[::-1], strict=True))
     top, holed = view.windows[row, column], view.holed[row, column]
     top_from_here = lax.cummax(top, reverse=True)
@@ -297,24 +292,12 @@ def _edges(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
     return jnp.where(jnp.concatenate([present_edges(z), at_vertex[None]]), z[None], jnp.nan)
 
 
-def _second_vertices(z: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "4 ny nx"]:
-    """For each kind, heights at the second vertices of edges; nan beyond the grid."""
-    ny, nx = z.shape
-    further = jnp.pad(z, ((0, 1), (0, 1)), constant_values=jnp.nan)
-    return jnp.stack([further[y : y + ny, x : x + nx] for x, y in (*STEPS, (0, 0))])
-
-
-def _reach() -> int:
-    """Windows side by side that a tile moves over within a stretch, wherever between their beginnings it begins."""
-    return math.ceil((TILE + _STRETCH + TOGETHER + 4) / _GRAIN) + 1
-
-
 def _windows(values: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "window_rows window_columns"]:
     """The largest in each window, see `HorizonView`; -inf beyond the grid."""
-    (ny, nx), reach = values.shape, _reach()
+    ny, nx = values.shape
     known = jnp.pad(values, ((0, -ny % _GRAIN), (0, -nx % _GRAIN)), constant_values=-jnp.inf)
     blocks = known.reshape(known.shape[0] // _GRAIN, _GRAIN, -1, _GRAIN).max((1, 3))
-    blocks = jnp.pad(blocks, reach, constant_values=-jnp.inf)
-    rows, columns = (n - reach + 1 for n in blocks.shape)
-    high = functools.reduce(jnp.maximum, (blocks[k : k + rows] for k in range(reach)))
-    return functools.reduce(jnp.maximum, (high[:, k : k + columns] for k in range(reach)))
+    blocks = jnp.pad(blocks, _REACH, constant_values=-jnp.inf)
+    rows, columns = (n - _REACH + 1 for n in blocks.shape)
+    high = functools.reduce(jnp.maximum, (blocks[k : k + rows] for k in range(_REACH)))
+    return functools.reduce(jnp.maximum, (high[:, k : k + columns] for k in range(_REACH)))

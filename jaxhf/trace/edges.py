@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
 # From an edge's first vertex to its second, in x and in y.
 STEPS = ((1, 0), (0, 1), (1, 1))
@@ -24,6 +24,12 @@ def present_edges(z: Float[jax.Array, "ny nx"]) -> EdgeFlags:
     """The edges with at least one triangle."""
     present = whole_cells(z)
     return compare_sides(present, present, lambda a, b: a | b)
+
+
+def at_second_vertices(values: Shaped[jax.Array, "ny nx"], beyond: float = 0.0) -> Shaped[jax.Array, "3 ny nx"]:
+    """Of values at vertices, those at the second vertices of edges; `beyond` where an edge leaves the grid."""
+    (ny, nx), padded = values.shape, jnp.pad(values, ((0, 1), (0, 1)), constant_values=beyond)
+    return jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS])
 
 
 def compare_sides(lower: jax.Array, upper: jax.Array, compare: Callable[[jax.Array, jax.Array], jax.Array]) -> jax.Array:
