@@ -1,5 +1,7 @@
 """What the surface that was hit sends on of the light that reaches it."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,6 @@ from ..core.types import Flag, Scalar, Vector
 from ..core.vector import dot, greater, quotient, select
 from ..preparation.world import World
 from ..scene.material import Material, Matte, map_textures
-from ..scene.texture import FlatTexture, ImageTexture
 from ..trace.hit import Hit
 
 # Directions in which a sky is looked at: Gauss's nodes along the sine of the altitude, and even steps of the azimuth.
@@ -35,7 +36,7 @@ def depends_on_view(world: World) -> bool:
 def matte_albedo(world: World, hit: Hit) -> Vector:
     """That of the object which was hit, where all that scatters light is `Matte`."""
     mattes = ((number, m) for number, m in enumerate(world.materials) if isinstance(m, Matte))
-    return select(hit.object, [(number, _colour(m.albedo, hit)) for number, m in mattes])
+    return select(hit.object, [(number, _at(m, hit).albedo) for number, m in mattes])
 
 
 def brdf(world: World, wi: Vector, wo: Vector, hit: Hit) -> Vector:
@@ -73,10 +74,6 @@ def brdf_under_sky(world: World, wo: Vector, hit: Hit) -> Vector:
     return quotient(total, jnp.where(whole > 0, whole, 1))
 
 
-def _at(material: Material, hit: Hit) -> Material:
+def _at(material: Material, hit: Hit) -> Any:
     """A material as it is at the hit: without textures."""
     return jax.tree.map(jnp.asarray, map_textures(material, lambda image: image(hit.uv)))
-
-
-def _colour(leaf: jax.Array | ImageTexture | FlatTexture, hit: Hit) -> jax.Array:
-    return leaf(hit.uv) if isinstance(leaf, ImageTexture | FlatTexture) else jnp.asarray(leaf)
