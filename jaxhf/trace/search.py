@@ -1,5 +1,6 @@
 """Which triangle does a ray meet? A discrete search: integers come out, which carry no derivative."""
 
+import functools
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -33,9 +34,7 @@ def first_triangle(
     With one level of bounds this is the walk of Amanatides and Woo (A fast voxel traversal algorithm, Eurographics 1987), with
     the distance to each crossing recomputed from the integer cell, as a running sum drifts; with all levels, that of Tevs
     et al. (I3D 2008) over their maximum mipmaps. The loop has a fixed budget of steps, each of which skips up to two blocks and
-    visits one cell: the grid's `most_steps`. It ends early, when all rays of the batch have ended; without
-    `Settings.early_exit` it always takes all of them. The search is discrete and under
-    `stop_gradient`; derivatives begin at the hit, see `surface_hit` in `intersect.py`.
+    visits one cell: the grid's `most_steps`. Derivatives begin at the hit, see `surface_hit` in `intersect.py`.
 
     Args:
       grid: the surface.
@@ -117,6 +116,8 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
       rays: in each.
     """
 
+    at = functools.partial(eqx.tree_at, is_leaf=lambda leaf: leaf is None)
+
     def flattened(leaf: jax.Array, per_ray: Any, per_batch: Any) -> jax.Array:
         if not (per_ray or per_batch):
             return leaf
@@ -124,27 +125,14 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
         leaf = leaf if per_ray else leaf[:, None]
         return jnp.broadcast_to(leaf, (axis_size, rays, *leaf.shape[2:])).reshape(-1, *leaf.shape[2:])
 
-    def joined(values: jax.Array, per_ray: Any, per_batch: Any, first: jax.Array | None) -> tuple[Any, Any, Any]:
-        """The values of all batches, whether they differ from walk to walk, and where those of a walk begin."""
-        if per_ray or not per_batch:
-            return flattened(values, per_ray, per_batch), per_ray, first
-        begin = jnp.repeat(first_places(values), rays)
-        return values.reshape(-1), False, begin if first is None else begin + first
-
     flat, differs = jax.tree.map(flattened, walk, of_ray, of_batch), jax.tree.map(operator.or_, of_ray, of_batch)
-    rows, differ, first = joined(walk.rows, of_ray.rows, of_batch.rows, flat.first)
-    of_blocks = of_ray.pyramid.bounds, of_batch.pyramid.bounds
-    bounds, bounds_differ, first_bound = joined(walk.pyramid.bounds, of_blocks[0], of_blocks[1], flat.pyramid.first)
-
-    def with_places(walk: Walk, *values: Any) -> Walk:
-        def parts(walk: Walk) -> tuple[Any, ...]:
-            return walk.rows, walk.first, walk.pyramid.bounds, walk.pyramid.first
-
-        return eqx.tree_at(parts, walk, values, is_leaf=lambda leaf: leaf is None)
-
-    given = (None if place is None else True for place in (first, first_bound))
-    flat = with_places(flat, rows, first, bounds, first_bound)
-    return flat, with_places(differs, differ, next(given), bounds_differ, next(given))
+    for part in (lambda walk: (walk.rows, walk.first), lambda walk: (walk.pyramid.bounds, walk.pyramid.first)):
+        if part(of_batch)[0] and not part(of_ray)[0]:  # all grids in one array
+            values, first = part(walk)[0], part(flat)[1]
+            begin = jnp.repeat(first_places(values), rays)
+            joined = values.reshape(-1), begin if first is None else begin + first
+            flat, differs = at(part, flat, joined), at(part, differs, (False, True))
+    return flat, differs
 
 
 def until_ended(advance: Callable[[Any], Any], carry: Any, budget: Index, fixed_steps: int | None) -> Any:
