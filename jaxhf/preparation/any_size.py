@@ -54,7 +54,7 @@ Rooms = tuple[Room | None, ...]
 """Of each object; None for all but heightfields that have room, and their skirts."""
 
 
-def _room(shape: tuple[int, int]) -> Room | None:
+def _room(shape: tuple[int, int], squared: bool = False) -> Room | None:
     """Of two sizes for each power of four, so that room is at most five times what is needed; None where there is none."""
     ny, nx = shape
     width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)
@@ -64,7 +64,7 @@ def _room(shape: tuple[int, int]) -> Room | None:
     border = cells // 32 + 64
     if cells > _MOST_CELLS or not enough or 2 * (nx + ny) > border:  # a narrow one has more of it than others
         return None
-    return Room(enough[0], 4 * cells, border)
+    return Room(enough[0], 4 * cells, border, (height + 1, width + 1) if squared else None)
 
 
 def _rooms(shapes: Sequence[Shape | Surface], squared: bool) -> Rooms:
@@ -80,15 +80,11 @@ def _rooms(shapes: Sequence[Shape | Surface], squared: bool) -> Rooms:
             return shape.seam is None
         return isinstance(shape, Grid) and shape.seam is None and shape.fixed_steps is None
 
-    rooms = {known: _room(known) for known in map(_known_shape, filter(may_have_room, shapes)) if known is not None}
+    rooms = {known: _room(known, squared) for known in map(_known_shape, filter(may_have_room, shapes)) if known is not None}
 
     def room_of(shape: Shape | Surface) -> Room | None:
         known = _known_shape(shape) if may_have_room(shape) or isinstance(shape, Skirt | Walls) else None
-        room = None if known is None else rooms.get(known)
-        if room is None or known is None or not squared:
-            return room
-        ny, nx = (next_power_of_two(n - 1) + 1 for n in known)
-        return room._replace(square=(ny, nx))
+        return None if known is None else rooms.get(known)
 
     return tuple(map(room_of, shapes))
 
@@ -115,9 +111,8 @@ def in_room(scene: Scene, settings: Settings) -> tuple[Scene, tuple[Size | None,
         if room is None or not isinstance(shape, Heightfield | Skirt):
             continue
         if isinstance(shape, Heightfield):
-            materials[k] = map_textures(
-                materials[k], lambda image, shape=shape, room=room: _roomy_texture(image, shape.heights.shape, room)
-            )
+            roomy = functools.partial(_roomy_texture, shape=shape.heights.shape, room=room)
+            materials[k] = map_textures(materials[k], roomy)
         if room.square is not None:
             shapes[k], sizes[k] = _squared(shape, *room.square, precision(scene))
 

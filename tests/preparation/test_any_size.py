@@ -105,7 +105,7 @@ def test_pictures_are_those_of_a_program_for_their_terrain(make, shapes, monkeyp
         aovs = ("depth", "uv", "cell", "normal", "shadow", "steps", "status")
         found = jaxhf.render(make(shape), SETTINGS, aovs=aovs)
         with monkeypatch.context() as patched:
-            patched.setattr(any_size, "_room", lambda shape: None)
+            patched.setattr(any_size, "_room", lambda *_: None)
             jax.clear_caches()
             assert all(grid.rows.size == math.prod(grid.shape) for _, grid, _ in roomy(make(shape)).grids)
             expected = jaxhf.render(make(shape), SETTINGS, aovs=aovs)
