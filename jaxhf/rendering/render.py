@@ -16,14 +16,7 @@ from jaxtyping import Float
 
 from ..core.errors import ArgumentError, UserError, require_kind, require_progress
 from ..core.settings import Settings
-from ..preparation.any_size import (
-    Rooms,
-    in_room,
-    make_roomy_ceilings,
-    make_roomy_world,
-    surfaces_and_rooms,
-    with_shapes_of,
-)
+from ..preparation.any_size import Rooms, in_room, make_roomy_ceilings, make_roomy_world, surfaces_and_rooms, with_shapes_of
 from ..preparation.localise import anchor, localise, localise_camera, localise_lights, precision
 from ..preparation.world import World, make_world, resolve_settings
 from ..scene.camera import Camera
@@ -32,14 +25,7 @@ from ..scene.light import Light
 from ..scene.scene import Scene
 from ..trace.grid import Grid, make_grid
 from ..xla.compilation import compiled, is_traced
-from ..xla.devices import (
-    chosen_mesh,
-    held_everywhere,
-    on_every_device,
-    prepared_mesh,
-    takes_numbers,
-    where_called,
-)
+from ..xla.devices import chosen_mesh, held_everywhere, on_every_device, prepared_mesh, takes_numbers, where_called
 from ..xla.materialise import unfolded
 from .aovs import known_aovs
 from .picture import picture, trace_in_parts, trace_picture

@@ -12,9 +12,6 @@ from ..core.types import AnyArray
 from ..scene.camera import Camera
 from .tiles import Tiling, pixels_from, sample_offset
 
-Points = tuple[Float[jax.Array, "chunks n"], Float[jax.Array, "chunks n"]]
-"""Positions in the picture, x and y."""
-
 
 class PictureSamples:
     """The samples of a picture: those of each pixel, tile by tile, and then those of pixels that are sampled once more.
@@ -29,8 +26,8 @@ class PictureSamples:
         self.tiling, self.dtype = Tiling(camera.width, camera.height, settings), camera.world_from_camera.dtype
         self.resampled, self.resampled_side = resampled, resampled_side(settings)
 
-    def positions(self) -> Points:
-        """Where all samples lie."""
+    def positions(self) -> tuple[Float[jax.Array, "chunks n"], Float[jax.Array, "chunks n"]]:
+        """Where all samples lie in the picture, x and y."""
         tiling, dtype = self.tiling, self.dtype
         pixels = jax.vmap(lambda corner: pixels_from(corner, tiling.side))(tiling.corners())
         offsets = sample_offset(jnp.arange(tiling.samples, dtype=jnp.int32), math.isqrt(tiling.samples), dtype)
