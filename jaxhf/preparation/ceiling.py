@@ -133,10 +133,8 @@ def clears(ceiling: Ceiling, grid: Grid, number: int, hit: Hit) -> Flag:
     cells_x, cells_y = grid.cells
     strips, cells = jnp.where(ceiling.columns, cells_x, cells_y), jnp.where(ceiling.columns, cells_y, cells_x)
     strip, along = jnp.where(ceiling.columns, ix, iy), jnp.where(ceiling.columns, x, y)
-    strip, along = (
-        jnp.where(ceiling.back, strips - 1 - strip, strip),
-        jnp.where(ceiling.back, strips.astype(along.dtype) - along, along),
-    )
+    strip = jnp.where(ceiling.back, strips - 1 - strip, strip)
+    along = jnp.where(ceiling.back, strips.astype(along.dtype) - along, along)
     parallel = jnp.where(ceiling.columns, y, x) - ceiling.across * along
     column = jnp.clip(jnp.floor(parallel).astype(jnp.int32) + value_at(ceiling.first, strip), 0, cells + 2)
     height = c + a * u + b * v - ceiling.rise * jnp.where(ceiling.columns, u, v)

@@ -231,16 +231,16 @@ def _from_tile(
     crossings = view.crossings
     stretches = first.shape[0]
 
-    def moved(heights: jax.Array, by_x: Index, by_y: Index) -> jax.Array:
+    def moved(by_x: Index, by_y: Index) -> jax.Array:
         """Of the tile, moved by some cells. The start is clamped: a tile beyond the margin is one within it, all nan."""
         start = y + _MARGIN + by_y, x + _MARGIN + by_x
-        return lax.dynamic_slice(heights, start, (TILE, TILE), allow_negative_indices=False)
+        return lax.dynamic_slice(view.heights, start, (TILE, TILE), allow_negative_indices=False)
 
     def moved_edges(kind: Index, by_x: Index, by_y: Index) -> jax.Array:
         start = kind, y + _MARGIN + by_y, x + _MARGIN + by_x
         return lax.dynamic_slice(view.edges, start, (1, TILE, TILE), allow_negative_indices=False)[0]
 
-    z = moved(view.heights, jnp.zeros_like(x), jnp.zeros_like(y))
+    z = moved(jnp.zeros_like(x), jnp.zeros_like(y))
     window = [(at + first[:, k]) // _GRAIN + _REACH for k, at in enumerate((x, y))]
     column, row = (jnp.clip(at, 0, n - 1) for at, n in zip(window, view.windows.shape[::-1], strict=True))
     top, holed = view.windows[row, column], view.holed[row, column]
@@ -257,8 +257,8 @@ def _from_tile(
             at = way, n
             # Else from one array in place of five, whose memory pages are more than the processor keeps at hand.
             from_x, from_y = crossings.x[at], crossings.y[at]
-            low = moved_edges(crossings.kind[at], from_x, from_y) if holed else moved(view.heights, from_x, from_y)
-            high = moved(view.heights, crossings.x2[at], crossings.y2[at])
+            low = moved_edges(crossings.kind[at], from_x, from_y) if holed else moved(from_x, from_y)
+            high = moved(crossings.x2[at], crossings.y2[at])
             slope = ((low - z) + crossings.share[at] * (high - low)) * crossings.inverse[at]
             steeper = slope > slopes  # never where it is nan
             slopes = jnp.where(steeper, slope, slopes)

@@ -35,8 +35,7 @@ def light_from(number: int, world: World, hit: Hit, wo: Vector | None, active: F
     if isinstance(light, Sky):
         cosine = hit.ns[2] * hit.side.astype(hit.ns.dtype)
         share = (1 + cosine) / 2
-        visible = ((k, grid, world.sky[k]) for k, grid, _ in world.grids)
-        seen = [(k, _seen_share(grid, sky, hit)) for k, grid, sky in visible if sky is not None]
+        seen = [(k, _seen_share(grid, sky, hit)) for k, grid, _ in world.grids if (sky := world.sky[k]) is not None]
         share = select(jnp.where(hit.side > 0, hit.object, -1), seen, share)
         even = light.radiance * (jnp.pi * share)
         return even if wo is None else even * brdf_under_sky(world, wo, hit), jnp.zeros((), jnp.int32)
@@ -189,9 +188,8 @@ def _solid_ground(world: World) -> tuple[int, Grid] | None:
         return None
     number, grid, _ = grids[0]
     others = (surface for k, surface in enumerate(world.surfaces) if k != number)
-    return (
-        (number, grid) if all(isinstance(other, Walls) and other.known_shape == grid.known_shape for other in others) else None
-    )
+    alone = all(isinstance(other, Walls) and other.known_shape == grid.known_shape for other in others)
+    return (number, grid) if alone else None
 
 
 def _hidden(

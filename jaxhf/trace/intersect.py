@@ -64,15 +64,8 @@ def intersect(
         hit = dataclasses.replace(hit, status=status, object=jnp.where(met, hit.object, -1), t=jnp.where(met, t, jnp.inf))
         return materialise(dataclasses.replace(hit, steps=jnp.zeros((), jnp.int32)) if count_steps else hit)
     local, scale = ray_in_grid(surface, ray)
-    found = first_triangle(
-        surface,
-        local,
-        active=active,
-        leaving=leaving,
-        number=number,
-        t_max=None if t_max is None else t_max * scale,
-        count_steps=count_steps,
-    )
+    t_max = None if t_max is None else t_max * scale
+    found = first_triangle(surface, local, active=active, leaving=leaving, number=number, t_max=t_max, count_steps=count_steps)
     return surface_hit(surface, number, local, scale, stored(materialise(found)), tangents)
 
 

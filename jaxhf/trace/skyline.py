@@ -18,10 +18,10 @@ from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import greater, lesser, quotient
 from ..xla.materialise import materialise
 from .edges import STEPS
-from .grid import Grid
+from .grid import Grid, triangle_plane
 from .hit import Hit
 from .search import SKIPS, until_ended
-from .triangle import corners, plane_through, triangle_corners
+from .triangle import corners
 from .walk import MISS, Walk, walking
 from .walk_start import point_on_grid, walk_start
 
@@ -56,8 +56,7 @@ def _over_footprint(grid: Grid, o: Vector) -> tuple[Flag, Scalar]:
     covers = (o[0] >= -wide) & (o[0] <= cells_x + wide) & (o[1] >= -wide) & (o[1] <= cells_y + wide)
     ix, iy = (jnp.clip(jnp.floor(o[k]).astype(jnp.int32), 0, n - 1) for k, n in enumerate(grid.cells))
     u, v = o[0] - ix.astype(o.dtype), o[1] - iy.astype(o.dtype)
-    heights = triangle_corners(grid.rows, grid.nx, ix, iy, v > u, grid.first)
-    a, b, c = plane_through(heights, v > u)
+    a, b, c = triangle_plane(grid, ix, iy, v > u)
     whole = jnp.isfinite(sum(corners(grid.rows, grid.nx, ix, iy, grid.first)))  # of a hole's cells three may be there
     return covers & whole, lax.stop_gradient(o[2] - (c + a * u + b * v))
 
@@ -148,11 +147,9 @@ def _outermost_edge(
     state = state | 4 if above else state & ~jnp.uint32(4)
     own = leaving.object == number
     z = jnp.where(own, walk.z_ray, o[2])
-    ends = (
-        jnp.where(walk.back_x, grid.pyramid.width, grid.cells[0]),
-        jnp.where(walk.back_y, grid.pyramid.height, grid.cells[1]),
-    )
-    by_side = lesser(walk.distance_x(ends[0]), walk.distance_y(ends[1]))
+    end_x = jnp.where(walk.back_x, grid.pyramid.width, grid.cells[0])
+    end_y = jnp.where(walk.back_y, grid.pyramid.height, grid.cells[1])
+    by_side = lesser(walk.distance_x(end_x), walk.distance_y(end_y))
     by_side = by_side if t_max is None else lesser(by_side, t_max - walk.t_start)
     # A point on a wall along the border may be inside by rounding; the border does not stand before it then.
     touching = jnp.where(own, 0, _rounding(grid, o) / greater(walk.dx, walk.dy))

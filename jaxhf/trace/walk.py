@@ -30,11 +30,7 @@ from .triangle import corners
 # the block; y. The code of x is 2 x + size: the lowest bit that is set in it tells the size, as x is a multiple of it. After
 # a hit, when the size is known to be one cell, that bit says whether it was the upper triangle.
 MISS, HIT = int(Status.MISS), int(Status.HIT)
-
-
 WALKING = int(Status.EXHAUSTED)  # what a walk that still goes on ends with when its budget runs out
-
-
 LEAVING = 3  # still in the triangle that the ray starts from
 
 
@@ -218,7 +214,7 @@ class Walk(eqx.Module):
         hit = self.pack(HIT, above, 2 * ix + upper.astype(jnp.int32), iy)
         return jnp.where(walking(state) & (size == 1), jnp.where(met, hit, onwards), state)
 
-    def cell(self, state: jax.Array, ix: Index, iy: Index, size: Index) -> "Cell":
+    def cell(self, state: jax.Array, ix: Index, iy: Index, size: Index) -> Cell:
         near, out_x, out_y = self._passage(ix, iy, size)
         flip_x, flip_y = self.flip
         z00, z10, z01, z11 = corners(self.rows, self.nx, ix ^ flip_x, iy ^ flip_y, self.first)
