@@ -3,8 +3,15 @@ from .core.errors import ArgumentError as ArgumentError
 from .core.settings import Settings as Settings
 from .core.version import __version__ as __version__
 from .fitting.fit import fit as fit
-from .fitting.given import Checkpoint as Checkpoint, Noise as Noise, Prior as Prior, Unknown as Unknown
-from .fitting.history import Draws as Draws, Step as Step, Stop as Stop
+from .fitting.given import (
+    Checkpoint as Checkpoint,
+    Draws as Draws,
+    Noise as Noise,
+    Prior as Prior,
+    Step as Step,
+    Stop as Stop,
+    Unknown as Unknown,
+)
 from .fitting.trust.judge import Fit as Fit
 from .fitting.trust.words import Region as Region
 from .fitting.windows import Fitted as Fitted, Mosaic as Mosaic, fit_windows as fit_windows

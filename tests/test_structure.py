@@ -11,7 +11,7 @@ PACKAGE = ROOT / "jaxhf"
 ORDER = "core < xla scene < trace io < preparation < maps shade < boundary < rendering < fitting mujoco < study < cli"
 ROOMS = {  # and modules, in this order, too; what they share stands beside them
     "io": ["pictures", "terrain", "scenes"],
-    "fitting": ["model", "solve", "trust", "coarser", "cropped", "fit", "windows"],
+    "fitting": ["model", "solve", "trust", "cropped", "fit", "windows"],
 }
 READ_FILES = {"maps", "fitting", "study", "cli"}  # the only ones that import from io
 

@@ -1,10 +1,11 @@
-"""What a fit is given, as checked records."""
+"""What a fit is given, as checked records, and what it says of its steps."""
 
 import dataclasses
+import enum
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jax.sharding import Mesh
@@ -16,7 +17,6 @@ from ..core.settings import Settings
 from ..io.checkpoint import load_facts
 from ..io.errors import FileError
 from ..io.files import require_folder
-from .history import Draws, Step
 
 Albedo = Literal["constant", "map"]
 _MOST_ANGLE = 45  # degrees
@@ -180,6 +180,61 @@ class Checkpoint:
             load_facts(path)  # refuses what is damaged or no checkpoint
         elif path.exists():
             raise FileError(f"{path}: this checkpoint is there already; resume=True goes on from it, to begin anew remove it")
+
+
+class Stop(enum.Enum):
+    """Why a fit stopped; the values say it in words.
+
+    Attributes:
+      CONVERGED: what a step still changes is below the tolerance.
+      MAX_STEPS: it took as many steps as it was allowed.
+      STALLED: no step along the derivative lowers the loss any more.
+      NON_FINITE: the loss is not finite; the heights are the best before that.
+    """
+
+    CONVERGED = "converged: what a step still changes is below the tolerance"
+    MAX_STEPS = "stopped after max_steps"
+    STALLED = "stalled: no step along the derivative lowers the loss any more"
+    NON_FINITE = "stopped: the loss is not finite; the heights are the best before that"
+
+
+class Step(NamedTuple):
+    """One line of a fit's history.
+
+    Attributes:
+      step: counted over all levels, from 1.
+      level: how many DCT modes are varied along the longer side.
+      loss: half the sum of squared residuals after it.
+      accepted: whether the heights changed.
+      damping: Levenberg-Marquardt's λ; 0 of the last steps, see docs/concepts/recovery.md.
+      change: of the heights, root mean square, height units.
+      seconds: since the fit began; a resumed one goes on counting.
+      to_come: about how many steps will follow, by what fits take as a rule; None in `Fit.history`.
+    """
+
+    step: int
+    level: int
+    loss: float
+    accepted: bool
+    damping: float
+    change: float
+    seconds: float
+    to_come: int | None = None
+
+
+class Draws(NamedTuple):
+    """How far the samples of the standard deviations are.
+
+    Attributes:
+      drawn, wanted: samples so far, and in all.
+      seconds: that they took.
+      remaining: seconds that the others will take.
+    """
+
+    drawn: int
+    wanted: int
+    seconds: float
+    remaining: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)

@@ -19,8 +19,7 @@ from ..preparation.localise import localise
 from ..scene.scene import Scene
 from .cropped import Seen, cropped, sides_in_sight, surroundings
 from .fit import fit
-from .given import Checkpoint, Prior
-from .history import Draws, Step
+from .given import Checkpoint, Draws, Prior, Step
 from .model.pictures import EDGE_SAMPLES, checked_pictures, choose_edge_samples, choose_samples
 from .model.surface import Window, make_heights, with_seam
 from .solve.state import digest

@@ -187,7 +187,7 @@ def test_after_ctrl_c_it_says_how_to_go_on(folder, monkeypatch, run):
 
 SLOW = """
 import sys, time
-from jaxhf.fitting.history import Draws, Step
+from jaxhf.fitting.given import Draws, Step
 from jaxhf.cli import main, progress
 from jaxhf.cli.commands import fit
 

@@ -16,7 +16,7 @@ import pytest
 from small_fits import given, posed
 
 import jaxhf
-from jaxhf.fitting import coarser as _coarser, fit as _fit
+from jaxhf.fitting import fit as _fit
 from jaxhf.fitting.model.expansion import Expansion, found_scenes
 from jaxhf.fitting.solve import run as _run, steps as _steps
 from jaxhf.fitting.solve.state import fingerprint as state_fingerprint
@@ -233,8 +233,8 @@ def judged_as_it_is(ended, problems, scenes, targets, given, report) -> jaxhf.Fi
 def test_it_goes_on_with_coarse_and_with_fine_heights(tmp_path, monkeypatch):
     """A checkpoint holds as many numbers as its level has: of the heights with their padding, and of the albedo."""
     without_pictures(monkeypatch.setattr)
-    monkeypatch.setattr(_coarser, "_MOST_SAMPLES", 100)
-    monkeypatch.setattr(_coarser, "_FACTOR", 2)
+    monkeypatch.setattr(_fit, "_MOST_SAMPLES", 100)
+    monkeypatch.setattr(_fit, "_FACTOR", 2)
     scenes, targets = problem(33)
     unknown = jaxhf.Unknown(albedo="map", light_std=1.0)
     held = np.where(np.indices((33, 33)).sum(0) % 7 == 3, 0.15, np.nan)

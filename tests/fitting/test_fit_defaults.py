@@ -9,7 +9,7 @@ import pytest
 from small_fits import CAMERA, SETTINGS, TRUTH, expanded, given, off_in_shape, pictures, posed, scenes
 
 import jaxhf
-from jaxhf.fitting.history import Draws
+from jaxhf.fitting.given import Draws
 from jaxhf.fitting.model import pictures as _pictures
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
 from jaxhf.fitting.model.pictures import choose_edge_samples, choose_samples

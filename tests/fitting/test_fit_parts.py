@@ -15,7 +15,7 @@ from small_fits import SETTINGS, SIZE, TRUTH, given as given_with, pictures, pos
 import jaxhf
 from jaxhf.core.errors import ArgumentError
 from jaxhf.fitting import fit as _fit
-from jaxhf.fitting.coarser import coarser, factors
+from jaxhf.fitting.fit import coarser, factors
 from jaxhf.fitting.model.expansion import influence_function, prior_residuals, soften
 from jaxhf.fitting.model.pictures import with_albedo
 from jaxhf.fitting.model.problem import Problem

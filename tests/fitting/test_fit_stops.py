@@ -13,7 +13,7 @@ import pytest
 from small_fits import SETTINGS as SMALL, SIZE, given as given_with, posed, scenes
 
 import jaxhf
-from jaxhf.fitting.history import Pace, printed_progress
+from jaxhf.fitting.fit import Pace, printed_progress
 from jaxhf.fitting.model.surface import Unknowns
 from jaxhf.fitting.solve.stages import why_ended
 from jaxhf.fitting.solve.state import first_state

@@ -12,9 +12,8 @@ import numpy as np
 
 from ...core.errors import ArgumentError, UserError, counted
 from ...core.extras import import_extra
-from ...fitting.fit import fit
-from ...fitting.given import Checkpoint, Noise, Prior, Unknown
-from ...fitting.history import Draws, Pace, Step
+from ...fitting.fit import Pace, fit
+from ...fitting.given import Checkpoint, Draws, Noise, Prior, Step, Unknown
 from ...fitting.trust.judge import Fit
 from ...fitting.windows import Mosaic, fit_windows
 from ...io.errors import FileError

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ..given import Given
-from ..history import Step, Stop
+from ..given import Given, Step, Stop
 from ..model.expansion import Expansion, expand, surface_of
 from ..model.problem import LOSS_SCALE, Problem
 from ..model.rows import has_rows

@@ -10,8 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ..given import Given
-from ..history import Stop
+from ..given import Given, Stop
 from ..model.expansion import surface_of
 from ..model.problem import LOSS_SCALE, Problem
 from ..model.surface import pad, resample, slope_units

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ...io.checkpoint import load_arrays, load_facts_of, save_checkpoint
-from ..given import Given
-from ..history import Step
+from ..given import Given, Step
 from ..model.problem import Problem
 from ..model.surface import Unknowns, make_basis
 from ..model.terms import OCTAVES

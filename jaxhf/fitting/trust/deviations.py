@@ -10,7 +10,7 @@ import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float
 
-from ..history import Draws
+from ..given import Draws
 from ..model.expansion import Expansion, influence_function
 from ..model.normal_matrix import Residuals, in_row, robust_matrix
 

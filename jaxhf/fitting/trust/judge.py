@@ -12,8 +12,7 @@ from ...core.settings import Settings
 from ...core.types import AnyArray
 from ...scene.record import number, span
 from ...scene.scene import Scene
-from ..given import Given
-from ..history import Step, Stop
+from ..given import Given, Step, Stop
 from ..model.expansion import Expansion, found_scenes
 from ..model.problem import Problem
 from ..solve.noise import Freedom, Restricted, explains_noise

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float
 
-from ..history import Stop
+from ..given import Stop
 
 FAR_FROM_ONE = 1.5  # by which factor chi2 may differ from 1
 _STRAYED = 2.0  # standard deviations of the prior, root mean square
