@@ -31,7 +31,7 @@ from peers import common_work
 
 import jaxhf
 from jaxhf.core.affine import rotate
-from jaxhf.fitting.model.view import differences
+from jaxhf.fitting.model.unknowns import differences
 from jaxhf.scene.procedural import fractal
 from jaxhf.xla.machine import peak_mb
 

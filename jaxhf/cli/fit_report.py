@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..fitting.model.view import differences, sun
+from ..fitting.model.unknowns import differences, sun
 from ..fitting.trust.judge import Fit
 from ..io.scenes.toml.fit import Case
 from ..scene.heightfield import Heightfield

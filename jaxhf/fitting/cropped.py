@@ -20,7 +20,7 @@ from ..scene.light import Directional, Point, Sky, Sun
 from ..scene.material import Mirror, map_textures
 from ..scene.scene import Object, Scene
 from ..scene.texture import ImageTexture
-from .model.surface import Window
+from .model.unknowns import Window
 
 _MARGIN = 2  # cells from the rim, where normals lack their neighbours; and pixels that a moving rim may come to
 _STEP = 16  # pixels, of which the sides of a part of a picture are a multiple

@@ -24,10 +24,9 @@ from ..xla.devices import automatic_axes, on_every_device, takes_numbers
 from .given import Checkpoint, Draws, Given, Prior, Step, Unknown
 from .model.pictures import checked_pictures
 from .model.problem import Problem, make_problem
-from .model.surface import Unknowns, interpolation, resample
+from .model.unknowns import Unknowns, interpolation, resample
 from .solve.run import Ended, run
-from .solve.stages import steps_to_come
-from .solve.state import State, fingerprint, first_state, load_state, save_state
+from .solve.stages import State, fingerprint, first_state, load_state, save_state, steps_to_come
 from .trust.judge import Fit, judged
 
 _FACTOR = 4  # between levels: a sixteenth of the work

@@ -21,8 +21,8 @@ from .cropped import Seen, cropped, sides_in_sight, surroundings
 from .fit import fit
 from .given import Checkpoint, Draws, Prior, Step
 from .model.pictures import EDGE_SAMPLES, checked_pictures, choose_edge_samples, choose_samples
-from .model.surface import Window, make_heights, with_seam
-from .solve.state import digest
+from .model.unknowns import Window, make_heights, with_seam
+from .solve.stages import digest
 from .trust.judge import Fit, in_short
 
 _LEAST_WINDOW, _LEAST_OVERLAP = 32, 8  # heights: the outermost four or so of a window are hardly told by its pictures

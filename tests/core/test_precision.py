@@ -10,7 +10,7 @@ import pytest
 import jaxhf
 import jaxhf.mujoco
 from jaxhf.core.precision import rounding
-from jaxhf.fitting.model.surface import make_heights
+from jaxhf.fitting.model.unknowns import make_heights
 from jaxhf.io.terrain.terrain import Terrain, heights_of
 
 RELIEF = np.random.default_rng(0).uniform(size=(5, 6))  # of about 1 m

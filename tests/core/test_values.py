@@ -12,7 +12,7 @@ import jaxhf
 import jaxhf.mujoco
 from jaxhf.core.types import array_leaf
 from jaxhf.fitting.model.pictures import checked_pictures
-from jaxhf.fitting.model.surface import make_heights
+from jaxhf.fitting.model.unknowns import make_heights
 
 RNG = np.random.default_rng(0)
 HEIGHTS = RNG.uniform(0.1, 0.5, (5, 6)).astype(np.float32)

@@ -17,8 +17,8 @@ from jaxhf.fitting.model.linearise import LinearisedEdges
 from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.model.pictures import checked_pictures
 from jaxhf.fitting.model.problem import Problem, make_problem
-from jaxhf.fitting.model.surface import Unknowns
-from jaxhf.fitting.model.units import balanced
+from jaxhf.fitting.model.unknowns import Unknowns
+from jaxhf.fitting.solve.stages import balanced
 from jaxhf.scene.procedural import fractal
 
 # No shadows, and a frame that ends inside the terrain: so the interior derivative is that of the picture.

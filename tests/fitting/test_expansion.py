@@ -14,8 +14,7 @@ import jaxhf
 from jaxhf.fitting.model.expansion import Expansion, expand, found_scenes
 from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.model.rows import pictures_by_heights
-from jaxhf.fitting.model.surface import Unknowns
-from jaxhf.fitting.model.view import differences, moved
+from jaxhf.fitting.model.unknowns import Unknowns, differences, moved
 from jaxhf.fitting.trust.deviations import _on_boundaries
 
 PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])

@@ -14,7 +14,7 @@ from small_fits import HALF, LIGHTS, SETTINGS, SIZE, TRUTH, off_in_shape, pictur
 
 import jaxhf
 from jaxhf.core.affine import rotate
-from jaxhf.fitting.model.view import differences
+from jaxhf.fitting.model.unknowns import differences
 
 OPTIONS: dict[str, Any] = {"settings": SETTINGS, "noise": 0.01}
 

@@ -19,7 +19,7 @@ import jaxhf
 from jaxhf.fitting import fit as _fit
 from jaxhf.fitting.model.expansion import Expansion, found_scenes
 from jaxhf.fitting.solve import run as _run, steps as _steps
-from jaxhf.fitting.solve.state import fingerprint as state_fingerprint
+from jaxhf.fitting.solve.stages import fingerprint as state_fingerprint
 from jaxhf.fitting.solve.steps import Outcome
 from jaxhf.fitting.trust import judge as _judge
 

@@ -19,11 +19,9 @@ from jaxhf.fitting.fit import coarser, factors
 from jaxhf.fitting.model.expansion import influence_function, prior_residuals, soften
 from jaxhf.fitting.model.pictures import with_albedo
 from jaxhf.fitting.model.problem import Problem
-from jaxhf.fitting.model.surface import make_basis, resample, slope_units
 from jaxhf.fitting.model.terms import make_terms
-from jaxhf.fitting.model.units import _balanced_units
-from jaxhf.fitting.model.view import View
-from jaxhf.fitting.solve.stages import stages
+from jaxhf.fitting.model.unknowns import View, make_basis, resample, slope_units
+from jaxhf.fitting.solve.stages import _balanced_units, stages
 from jaxhf.preparation.localise import localise
 
 

@@ -14,9 +14,8 @@ from small_fits import SETTINGS as SMALL, SIZE, given as given_with, posed, scen
 
 import jaxhf
 from jaxhf.fitting.fit import Pace, printed_progress
-from jaxhf.fitting.model.surface import Unknowns
-from jaxhf.fitting.solve.stages import why_ended
-from jaxhf.fitting.solve.state import first_state
+from jaxhf.fitting.model.unknowns import Unknowns
+from jaxhf.fitting.solve.stages import first_state, why_ended
 from jaxhf.fitting.solve.steps import ConjugateGradients, LevenbergMarquardt
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)

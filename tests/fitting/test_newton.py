@@ -13,8 +13,7 @@ import jaxhf
 from jaxhf.fitting.model.expansion import prior_residuals
 from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.solve import run as _run
-from jaxhf.fitting.solve.stages import Stage
-from jaxhf.fitting.solve.state import first_state
+from jaxhf.fitting.solve.stages import Stage, first_state
 from jaxhf.fitting.solve.steps import WholeStep, relaxed, whole_step
 
 HELD = np.where(np.indices(TRUTH.shape).sum(0) % 5 == 0, 0.0, 0.05)

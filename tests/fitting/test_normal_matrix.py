@@ -16,7 +16,7 @@ from jaxhf.fitting.model import normal_matrix as _normal_matrix
 from jaxhf.fitting.model.expansion import Expansion, prior_residuals
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row, near_inverse
 from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
-from jaxhf.fitting.model.surface import Window
+from jaxhf.fitting.model.unknowns import Window
 from jaxhf.fitting.trust.deviations import Boundaries, standard_deviations
 
 sp: Any = scipy.sparse  # whose stubs miss much

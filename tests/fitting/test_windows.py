@@ -11,7 +11,7 @@ import pytest
 import jaxhf
 from jaxhf.fitting import windows as _windows
 from jaxhf.fitting.cropped import _fields, cropped, sides_in_sight, surroundings
-from jaxhf.fitting.model.surface import Window, with_seam
+from jaxhf.fitting.model.unknowns import Window, with_seam
 from jaxhf.fitting.windows import divided, fit_windows
 from jaxhf.scene.procedural import fractal
 

@@ -9,7 +9,7 @@ import oracle
 import pytest
 
 import jaxhf
-from jaxhf.fitting.model.view import View, moved
+from jaxhf.fitting.model.unknowns import View, moved
 from jaxhf.preparation.localise import localise
 from jaxhf.rendering.cast import cast_camera
 

@@ -24,8 +24,7 @@ from .linearise import Linearised, changing_pixels, linearise_each
 from .pictures import Group, can_be_linearised, with_albedo, with_material
 from .problem import Problem
 from .products import picture_each
-from .surface import Basis, Unknowns
-from .view import KNOWN, View, moved_each
+from .unknowns import KNOWN, Basis, Unknowns, View, moved_each
 
 Rows = list[Float[Array, "_ _ _ _"]]
 """A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""

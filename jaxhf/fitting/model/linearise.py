@@ -39,8 +39,7 @@ from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
 from .pictures import Group, albedo_of
 from .problem import Problem
-from .surface import Unknowns
-from .view import KNOWN, View, moved, with_numbers
+from .unknowns import KNOWN, Unknowns, View, moved, with_numbers
 
 # Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
 _POINTS_PER_PIXEL = 4

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from ...scene.heightfield import Heightfield
 from .expansion import Expansion, influence_function, surface_of
 from .rows import THREADS, Sparse, pictures_by_heights, scaled
-from .surface import Unknowns, Window, interpolation, slope_units
+from .unknowns import Unknowns, Window, interpolation, slope_units
 
 sp: Any = scipy.sparse  # whose stubs miss much
 fft: Any = scipy.fft

@@ -28,7 +28,7 @@ from ...scene.texture import ImageTexture
 from ...shade.radiance import has_mirrors
 from ...xla.compilation import compiled
 from ..given import Noise, has_detector, noise_of_each
-from .view import KNOWN, View, with_numbers
+from .unknowns import KNOWN, View, with_numbers
 
 _SAMPLES = 4  # a pixel, at least
 EDGE_SAMPLES = (2048, 32768)

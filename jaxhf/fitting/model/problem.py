@@ -21,9 +21,8 @@ from ...scene.texture import ImageTexture
 from ...xla.devices import chosen_mesh
 from ..given import NOISE_RULE, Given, Unknown
 from .pictures import Group, albedo_of, choose_edge_samples, choose_samples, make_groups
-from .surface import Basis, Unknowns, make_basis, make_heights, pad, padding, slope_units, with_seam
 from .terms import AlbedoField, Terms, by_mode, make_albedo_field, make_terms
-from .view import View, sun
+from .unknowns import Basis, Unknowns, View, make_basis, make_heights, pad, padding, slope_units, sun, with_seam
 
 LOSS_SCALE = 3.0  # standard deviations from which on the robust loss makes less of a residual, in the end
 _FIRST_NOISE = 0.01  # of a picture's brightness, where none is given

@@ -15,8 +15,7 @@ from ...xla.devices import on_every_device, over_spread
 from .linearise import Linearised, LinearisedEdges, SampleRows
 from .pictures import Group
 from .problem import Problem
-from .surface import Unknowns
-from .view import View
+from .unknowns import Unknowns, View
 
 # Chunks of samples that one lookup serves: in pieces of 64 a product took half as long again.
 _TOGETHER = 1024

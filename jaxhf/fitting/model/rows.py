@@ -24,7 +24,7 @@ from .expansion import Expansion
 from .pictures import Group
 from .problem import Problem
 from .products import vertex_values
-from .surface import Unknowns, Window
+from .unknowns import Unknowns, Window
 
 sp: Any = scipy.sparse  # whose stubs miss much
 Sparse = Any

@@ -14,8 +14,7 @@ from ...core.errors import ArgumentError
 from ...core.precision import numbers
 from ...scene.heightfield import Heightfield
 from ..given import Prior, Unknown
-from .surface import Basis, Unknowns, dct_matrix, laplacian, make_heights, pad, padding, slope_units
-from .view import View
+from .unknowns import Basis, Unknowns, View, dct_matrix, laplacian, make_heights, pad, padding, slope_units
 
 OCTAVES = 6
 """Into which the modes of the heights' prior are divided, at most."""

@@ -11,8 +11,8 @@ from ..model.expansion import Expansion
 from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row, near_inverse, normal_matrix
 from ..model.problem import Problem
 from ..model.rows import can_have_rows, first_vertices, part_by_heights
-from ..model.surface import Window
 from ..model.terms import OCTAVES, by_mode, octaves
+from ..model.unknowns import Window
 
 _FAR = 6.0  # times the median: four standard deviations of normal errors; what is farther off is not explained
 _FINE = 0.5  # of the noise: an error of samples that hardly counts beside it

@@ -13,11 +13,9 @@ from ..given import Given, Step, Stop
 from ..model.expansion import Expansion, expand, surface_of
 from ..model.problem import LOSS_SCALE, Problem
 from ..model.rows import has_rows
-from ..model.surface import Unknowns, make_basis
-from ..model.units import balanced
+from ..model.unknowns import Unknowns, make_basis
 from .noise import Estimate, Restricted, explains_noise, rms, spreads
-from .stages import Stage, on_finer, stages, varies_all, why_ended
-from .state import State
+from .stages import Stage, State, balanced, on_finer, stages, varies_all, why_ended
 from .steps import (
     FIRST_DAMPING,
     LAST,

@@ -1,20 +1,26 @@
-"""The stages of a fit: which heights and which modes are varied, one after the other, and when each has done its part."""
+"""Where a fit stands, and the stages that it goes through: which heights and which modes are varied, one after the other, in
+which units, and when each has done its part."""
 
 import dataclasses
+import hashlib
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from ..given import Given, Stop
-from ..model.expansion import surface_of
+from ...io.checkpoint import load_arrays, load_facts_of, save_checkpoint
+from ..given import Given, Step, Stop
+from ..model.expansion import Expansion, surface_of
 from ..model.problem import LOSS_SCALE, Problem
-from ..model.surface import pad, resample, slope_units
-from .state import State
+from ..model.terms import OCTAVES
+from ..model.unknowns import Unknowns, make_basis, pad, resample, slope_units
 
 _REJECTIONS = 2  # in a row, at a coarse stage: the next one may do better
 _FLAT_GAIN = 1e-3  # for each height: then heights change by 0.05 of the deviation that their noise leaves them with
@@ -26,6 +32,125 @@ _USUAL_STEPS, _USUAL_COARSE_STEPS, _USUAL_BY_FACTORS = 5, 4, 2  # of a stage, fo
 _LAST_STAGES = 3  # at most, over which the scale of the robust loss comes down to its own, and the noise is estimated
 _MOST_BY_FACTORS = 10  # steps; one to four are usual
 _COARSEST = 8  # modes a side
+# As a share of the median: along a mode of less curvature the loss counts as flat, and its unit stays as it is.
+_LEAST_CURVATURE = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class State:
+    """Immutable; a step makes another one.
+
+    Attributes:
+      unknowns: those that were accepted last, about `base`.
+      begin: those at which the present stage began, with coefficients 0.
+      base: the surface there, shape (my, mx).
+      units: of the modes, see `Basis.scale`, shape (my, mx).
+      others: the curvature along the other unknowns, see `balanced`.
+      noise, loss_scale: see `Problem`.
+      widths: how many times wider than their prior heights vary, see `Estimate`; 1 where that is not estimated.
+      step_size: 1 / λ of the next step.
+      stage: the number of the stage, from 0; -1: none has begun.
+      stage_start: steps taken before it.
+      edge_samples: points on edges.
+      loss: at `unknowns`.
+      predicted: by how much the next step is to lower it, see `Outcome`.
+      seconds: since the fit began, a resumed one goes on counting.
+      history: a `Step` for each step.
+    """
+
+    unknowns: Unknowns
+    begin: Unknowns
+    base: Float[Array, "my mx"]
+    units: Float[np.ndarray, "my mx"]
+    others: Any
+    noise: Float[np.ndarray, " pictures"]
+    widths: Float[np.ndarray, " octaves"]
+    loss_scale: Float[Array, ""]
+    step_size: Float[Array, ""]
+    stage: int = -1
+    stage_start: int = 0
+    edge_samples: int = 0
+    loss: float = float("inf")
+    predicted: float = 0.0
+    seconds: float = 0.0
+    history: tuple[Step, ...] = ()
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """Those of the present stage."""
+        return self.history[self.stage_start :]
+
+    @property
+    def rejections(self) -> int:
+        """How many of them were rejected since the last accepted one."""
+        return len(list(itertools.takewhile(lambda step: not step.accepted, reversed(self.steps))))
+
+    def posed(self, problem: Problem, share: float) -> Problem:
+        """The problem of this stage, which varies such a share of the modes, but for the noise."""
+        basis = make_basis(problem.field, np.asarray(self.base), self.units, share, problem.basis.free)
+        problem = dataclasses.replace(problem.widened(self.widths), basis=basis, loss_scale=self.loss_scale)
+        return problem.with_edge_samples(self.edge_samples)
+
+
+_ARRAYS = ("unknowns", "begin", "base", "units", "others", "noise", "widths", "loss_scale", "step_size")
+
+
+def first_state(problem: Problem, unknowns: Unknowns) -> State:
+    """Before the first stage."""
+    dtype = problem.field.heights.dtype
+    return State(
+        unknowns,
+        unknowns,
+        problem.basis.base,
+        np.asarray(problem.basis.scale, np.float64),
+        jax.tree.map(np.ones_like, unknowns.without_modes()),
+        problem.noise,
+        np.ones(OCTAVES),
+        problem.loss_scale,
+        jnp.ones((), dtype),
+        edge_samples=problem.settings.edge_samples or 0,
+    )
+
+
+def save_state(path: Path, state: State, fingerprint: str) -> None:
+    facts = {field.name: getattr(state, field.name) for field in dataclasses.fields(state) if field.name not in _ARRAYS}
+    arrays = [getattr(state, name) for name in _ARRAYS]
+    facts["history"] = [list(step) for step in state.history]
+    facts |= {"fingerprint": fingerprint, "shapes": [leaf.shape for leaf in jax.tree.leaves(arrays)]}
+    save_checkpoint(path, facts, arrays)
+
+
+def load_state(path: Path, like: State, fingerprint: str) -> State:
+    """The state of a checkpoint; FileError where it is another fit's. `like`: the state before the first stage."""
+    facts = load_facts_of(path, fingerprint)
+    leaves, structure = jax.tree.flatten([getattr(like, name) for name in _ARRAYS])
+    shapes = zip(facts.pop("shapes"), leaves, strict=True)  # those of a finer level may be others
+    blank = [(jnp if isinstance(leaf, jax.Array) else np).zeros(shape, leaf.dtype) for shape, leaf in shapes]
+    arrays = dict(zip(_ARRAYS, load_arrays(path, jax.tree.unflatten(structure, blank)), strict=True))
+    facts["history"] = tuple(Step(*line) for line in facts["history"])
+    return State(**arrays, **facts)
+
+
+def fingerprint(problem: Problem, unknowns: Unknowns, given: Given) -> str:
+    """A hash of all that decides on the steps: fits of the same fingerprint take the same ones, in whatever process.
+
+    The structure of the problem and the unknowns at the start says of what classes and sizes all parts are, and how many
+    samples a scene asks for. The mesh does not count: another machine may go on.
+    """
+    parts = {field.name: getattr(problem, field.name) for field in dataclasses.fields(problem) if field.name != "mesh"}
+    settings = parts.pop("settings")
+    leaves, structure = jax.tree.flatten((parts, unknowns))
+    # What is left open is chosen anew on the way, also where it begins with what another fit is given.
+    choices = (settings, structure, given.noise is None, given.settings.edge_samples is None)
+    return digest(choices, leaves)
+
+
+def digest(choices: Any, values: Any) -> str:
+    """A hash of what `repr` tells of choices, and of the bits of a pytree's leaves."""
+    found = hashlib.sha256(repr(choices).encode())
+    for leaf in map(np.asarray, jax.tree.leaves(values)):
+        found.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
+    return found.hexdigest()
 
 
 class Stage(NamedTuple):
@@ -134,3 +259,62 @@ def _is_flat(state: State, enough: float) -> bool:
         return False
     gains = [a.loss - b.loss for a, b in itertools.pairwise(state.steps) if b.accepted]
     return not state.predicted >= enough or bool(gains and abs(gains[-1]) < enough)
+
+
+def balanced(expansion: Expansion) -> tuple[Float[np.ndarray, "my mx"], float, Any]:
+    """The units of the modes, see `Basis.scale`, in which the loss has the same curvature along each of them, that curvature,
+    and by how much more it is curved along each number of the other unknowns: a tree as these."""
+    problem, unknowns = expansion.problem, expansion.unknowns
+    slopes, _ = slope_units(problem.basis.base.shape, problem.field.dx, problem.field.dy)
+    gradients, of_others = expansion.random_gradients()
+    modes, curvature = _balanced_units(slopes, mode_curvature(problem, gradients))
+    others = []
+    for (term, values), *draws in zip(problem.terms.others(unknowns), *map(jax.tree.leaves, of_others), strict=True):
+        # Of one kind and one place in each picture, as its light's first angle, or of all texels: few draws tell little more.
+        squares = np.mean(np.square(draws, dtype=np.float64), axis=0)
+        along = tuple(range(squares.ndim)) if squares.ndim != 2 else 0
+        total = np.broadcast_to(squares.mean(axis=along, keepdims=True), squares.shape)
+        total = total + np.asarray(term.weight, np.float64) ** 2
+        others.append(np.asarray(np.maximum(total / curvature, _LEAST_CURVATURE), values.dtype))
+    return modes, curvature, jax.tree.unflatten(jax.tree.structure(unknowns.without_modes()), others)
+
+
+def _balanced_units(
+    units: Float[np.ndarray, "my mx"], curvature: Float[np.ndarray, "my mx"]
+) -> tuple[Float[np.ndarray, "my mx"], float]:
+    """Units of the modes in which the loss has the same curvature along each of them, and that curvature.
+
+    It is the median of those in units of one slope. Along the mean of all heights, which pictures hardly show, the curvature in
+    units of one slope is ten thousand times less than along other modes. `units`: `slope_units`; `curvature`: of the loss, for
+    modes of unit height, 0 where it is unknown.
+    """
+    per_slope = curvature * units**2
+    if not (per_slope > 0).any():
+        return units, 1.0
+    typical = float(np.median(per_slope[per_slope > 0]))
+    relative = per_slope / typical
+    return units / np.sqrt(np.where(relative > _LEAST_CURVATURE, relative, 1)), typical
+
+
+def mode_curvature(problem: Problem, gradients: Float[np.ndarray, "k ny nx"]) -> Float[np.ndarray, "my mx"]:
+    """The curvature of the loss along each DCT mode of unit height.
+
+    That of the pictures, the diagonal of JᵀJ, is the mean square of the `random_gradients` Jᵀz over draws of z, and over
+    neighbouring modes; in that of the prior, weights count by their mean square.
+    """
+    basis, term = problem.basis, problem.terms.surface
+    rows, columns = np.asarray(basis.rows, np.float64), np.asarray(basis.columns, np.float64)
+    padding = [(n, n) for n in basis.padding]
+    squares = np.mean([(rows @ np.pad(gradient, padding) @ columns.T) ** 2 for gradient in gradients], axis=0)
+    curvature = _over_neighbours(squares)
+    curvature[0, 0] = squares[0, 0]  # unlike any other
+    weight = float(np.mean(np.square(np.asarray(term.weight, np.float64))))
+    return curvature + weight * np.asarray(term.spectrum, np.float64) ** 2
+
+
+def _over_neighbours(values: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "my mx"]:
+    """The mean over 3 x 3 values, without [0, 0] but in its own."""
+    padded = np.pad(values, 1, mode="reflect")
+    padded[1, 1] = np.mean([values[0, 1], values[1, 0]])
+    ny, nx = values.shape
+    return np.mean([padded[y : y + ny, x : x + nx] for y in range(3) for x in range(3)], axis=0)

@@ -23,7 +23,7 @@ from ...xla.devices import divided, on_every_device
 from ...xla.plain import insides
 from ..model.expansion import Expansion, residuals
 from ..model.normal_matrix import in_row, robust_matrix
-from ..model.surface import Unknowns
+from ..model.unknowns import Unknowns
 
 FIRST_DAMPING = 1e-2  # as a share of the loss's curvature along a mode
 _REJECTED = 0.25  # by which 1 / λ is multiplied at a rejected step, the first in a row
