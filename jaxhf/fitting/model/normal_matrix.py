@@ -50,7 +50,8 @@ class NormalMatrix:
     Vectors are flat: the heights of the padded surface, and then the other unknowns' numbers.
 
     Attributes:
-      inverse: times which vectors are about H⁻¹ times them; at first by the modes' units, in which H is about the unit matrix.
+      inverse: times which vectors are about H⁻¹ times them: `_near_inverse` or, without rows, by the modes' units, in which H
+        is about the unit matrix.
 
     Args:
       expansion: all of whose modes are varied.
@@ -61,7 +62,6 @@ class NormalMatrix:
 
     def __init__(self, expansion: Expansion, roots: Float[np.ndarray, " rows"], rows: Any = None, window: Window | None = None):
         self.expansion, self.roots, self.rows = expansion, roots, rows
-        self.inverse: Callable[[Flat], Flat] = self._by_modes
         unknowns, basis, terms = expansion.unknowns, expansion.problem.basis, expansion.problem.terms
 
         def here(values: Any) -> Float[np.ndarray, "..."]:
@@ -87,6 +87,7 @@ class NormalMatrix:
         if rows is not None and others.size <= MOST_OTHERS:
             each = [self._by_jax(np.zeros(self.shape), one) for one in np.eye(others.size)]
             self.columns = np.reshape(each, (others.size, roots.size)).T
+        self.inverse: Callable[[Flat], Flat] = self._by_modes if rows is None else _near_inverse(self)
 
     def weighted(self, roots: Float[np.ndarray, " rows"], widths: Float[np.ndarray, "my mx"]) -> "NormalMatrix":
         """The matrix with other roots, and a prior of the surface whose modes have deviations that are so many times as
@@ -168,8 +169,7 @@ class NormalMatrix:
         return self.unflat(jnp.asarray(others, self.dtype)).with_modes(jnp.asarray(modes, self.dtype))
 
     def split(self, x: Flat) -> tuple[Float[np.ndarray, "my mx"], Float[np.ndarray, " k"]]:
-        count = int(np.prod(self.shape))
-        return x[:count].reshape(self.shape), x[count:]
+        return x[: self.off.size].reshape(self.shape), x[self.off.size :]
 
     def _prior_push(self, surface: Float[np.ndarray, "my mx"]) -> Float[np.ndarray, "my mx"]:
         return self.spectrum * fft.dctn(self.weight * surface, norm="ortho")
@@ -196,27 +196,19 @@ def in_groups(row: np.ndarray, expansion: Expansion) -> list[Any]:
 
 
 def robust_matrix(expansion: Expansion) -> NormalMatrix:
-    """`normal_matrix` with the weights of the robust loss."""
+    """With the weights of the robust loss."""
     _, _, weights = influence_function(in_row(expansion.left()), expansion.problem.loss_scale)
-    return normal_matrix(expansion, np.sqrt(weights))
+    return NormalMatrix(expansion, np.sqrt(weights), pictures_by_heights(expansion))
 
 
-def normal_matrix(expansion: Expansion, roots: Float[np.ndarray, " rows"]) -> NormalMatrix:
-    """The normal matrix with these roots of its residuals' weights, and with its near inverse where it `has_rows`."""
-    rows = pictures_by_heights(expansion)
-    matrix = NormalMatrix(expansion, roots, rows)
-    if rows is not None:
-        matrix.inverse = near_inverse(matrix)
-    return matrix
-
-
-def near_inverse(matrix: NormalMatrix) -> Callable[[Flat], Flat]:
+def _near_inverse(matrix: NormalMatrix) -> Callable[[Flat], Flat]:
     """What about inverts a normal matrix: `_inverse` of that of the heights, in which a polynomial in the Laplacian stands for
     their prior, and the Schur complement of the other unknowns; where these are many, their diagonal.
 
     With it conjugate gradients take 5 to 15 iterations, where LSMR on J took 300. `matrix`: one that has rows.
     """
-    shape, count = matrix.shape, int(np.prod(matrix.shape))
+    shape, count = matrix.shape, matrix.off.size
+    others = matrix.size - count
     weighted = scaled(matrix.rows, matrix.roots)
     weighted = sp.csr_array((weighted.data, matrix.inside[weighted.indices], weighted.indptr), shape=(weighted.shape[0], count))
     weight = sp.diags_array(np.broadcast_to(matrix.weight, shape).ravel())
@@ -225,26 +217,24 @@ def near_inverse(matrix: NormalMatrix) -> Callable[[Flat], Flat]:
     free = np.broadcast_to(matrix.free, shape).ravel()
     near = sp.diags_array(free) @ near @ sp.diags_array(free) + sp.diags_array(1 - free)
     solve = _inverse(near.tocsr(), shape)
-    many = matrix.size - count > MOST_OTHERS
 
     def by_heights(x: Flat) -> Flat:
         return free * solve(free * x)
 
-    if many:
+    if others > MOST_OTHERS:
         draws = [matrix.gathered(matrix.drawn(seed))[count:] for seed in range(_PROBES)]
         diagonal = np.maximum(np.mean(np.square(draws), axis=0), matrix.others_weight**2)
         return lambda x: np.concatenate([by_heights(x[:count]), x[count:] / diagonal])
-    columns = [
-        matrix.product(row.astype(np.float64)) for row in (np.arange(matrix.size) == k for k in range(count, matrix.size))
-    ]
-    beside = np.stack([column[:count] for column in columns], axis=1) if columns else np.zeros((count, 0))
-    moved = np.stack([by_heights(column) for column in beside.T], axis=1) if columns else beside
-    schur = np.reshape([column[count:] for column in columns], (len(columns), len(columns))) - beside.T @ moved
+    columns = [matrix.product(np.eye(1, matrix.size, k)[0]) for k in range(count, matrix.size)]
+    columns = np.reshape(columns, (others, matrix.size))
+    beside = columns[:, :count].T.copy()
+    moved = np.reshape([by_heights(column) for column in beside.T], (others, count)).T.copy()
+    schur = columns[:, count:] - beside.T @ moved
 
     def inverse(x: Flat) -> Flat:
         heights = by_heights(x[:count])
-        others = np.linalg.solve(schur, x[count:] - beside.T @ heights)
-        return np.concatenate([heights - moved @ others, others])
+        rest = np.linalg.solve(schur, x[count:] - beside.T @ heights)
+        return np.concatenate([heights - moved @ rest, rest])
 
     return inverse
 

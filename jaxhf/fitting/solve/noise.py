@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..model.expansion import Expansion
-from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row, near_inverse, normal_matrix
+from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row
 from ..model.problem import Problem
-from ..model.rows import can_have_rows, first_vertices, part_by_heights
+from ..model.rows import can_have_rows, first_vertices, has_rows, part_by_heights
 from ..model.terms import OCTAVES, by_mode, octaves
 from ..model.unknowns import Window
 
@@ -158,12 +158,10 @@ def _told(expansion: Expansion, labels: Labels) -> tuple[Int[np.ndarray, " value
     few_others = expansion.unknowns.count - math.prod(shape) <= MOST_OTHERS
     if can_have_rows(expansion) and max(shape) > _MOST_SIDE and few_others:
         block = _block(expansion, labels)
-    if block is None:
-        return np.arange(labels.size), normal_matrix(expansion, np.ones(labels.size))
-    rows, values = part_by_heights(expansion, block)
-    matrix = NormalMatrix(expansion, np.ones(values.size), rows, block)
-    matrix.inverse = near_inverse(matrix)
-    return values, matrix
+    rows, values = None, np.arange(labels.size)
+    if block is not None or has_rows(expansion):
+        rows, values = part_by_heights(expansion, block)
+    return values, NormalMatrix(expansion, np.ones(values.size), rows, block)
 
 
 def _block(expansion: Expansion, labels: Labels) -> Window | None:
