@@ -105,9 +105,8 @@ def sides_in_sight(
     """
     found: list[tuple[int, int]] = []
     for scene in scenes:
-        sight = _Sight.of(scene)
-        places = [sight.of_window(window, terrain[window.place], off) for window in windows]
-        found += [(last[0] - first[0], last[1] - first[1]) for first, last in (place for place in places if place)]
+        places = filter(None, _in_sight(scene, terrain, off, windows))
+        found += [(last[0] - first[0], last[1] - first[1]) for first, last in places]
     rows, columns = ([_rounded(count) for count in counts] for counts in zip(*found, strict=True)) if found else ([], [])
     return _few(rows), _few(columns)
 
@@ -149,7 +148,7 @@ def cropped(
         return [_with_surroundings(scene, *fields, window, place) for scene in scenes]
 
     parts, everything = within(around), within(whole)
-    places = [_Sight.of(scene).of_window(window, terrain[window.place], off) for scene in scenes]
+    places = [_in_sight(scene, terrain, off, [window])[0] for scene in scenes]
     # Pictures of one size share a program, those of this window and of the next ones.
     height, width = (
         _side(max((place[1][axis] - place[0][axis] for place in places if place is not None), default=1), sides[axis])
@@ -220,35 +219,29 @@ def _cropped_texture(image: ImageTexture, shape: tuple[int, ...], window: Window
 Corners = tuple[tuple[int, int], tuple[int, int]]
 
 
-class _Sight(NamedTuple):
-    """Where a picture shows a terrain: its first heightfield, where that stands in the world, and a projection from there."""
-
-    scene: Scene
-    world: np.ndarray
-    linear: np.ndarray
-    offset: np.ndarray
-
-    @classmethod
-    def of(cls, scene: Scene) -> "_Sight":
-        local = localise(scene)
-        world, film = local.objects[scene.first_heightfield].world_from_object, local.camera.film_from_world()
-        matrices = np.eye(4) if world is None else world, film.linear, film.offset
-        return cls(scene, *(np.asarray(matrix, np.float64) for matrix in matrices))
-
-    def of_window(self, window: Window, heights: Float[np.ndarray, "ny nx"], reach: float) -> Corners | None:
-        """First and last row and column of the picture between which a window may be seen; None: it is not."""
-        field, camera = self.scene.heightfields[0], self.scene.camera
+def _in_sight(scene: Scene, terrain: Float[np.ndarray, "my mx"], off: float, windows: Sequence[Window]) -> list[Corners | None]:
+    """First and last row and column of a picture between which each of these windows may be seen; None: it is not. The other
+    arguments are those of `cropped`."""
+    local = localise(scene)
+    place, film = local.objects[scene.first_heightfield].world_from_object, local.camera.film_from_world()
+    matrices = np.eye(4) if place is None else place, film.linear, film.offset
+    world, linear, offset = (np.asarray(matrix, np.float64) for matrix in matrices)
+    field, camera, found = scene.heightfields[0], scene.camera, []
+    for window in windows:
+        heights = terrain[window.place]
         xs, ys = ((first * d, (first + n - 1) * d) for first, n, d in
                   ((window.x, window.nx, field.dx), (window.y, window.ny, field.dy)))  # fmt: skip
-        box = np.meshgrid(xs, ys, (heights.min() - reach, heights.max() + reach))
-        p = (self.world @ np.stack([part.ravel() for part in box] + [np.ones(8)]))[:3]
-        x, y, w, depth = self.linear @ p + self.offset[:, None]
+        box = np.meshgrid(xs, ys, (heights.min() - off, heights.max() + off))
+        p = (world @ np.stack([part.ravel() for part in box] + [np.ones(8)]))[:3]
+        x, y, w, depth = linear @ p + offset[:, None]
         low, high = [0, 0], [camera.height, camera.width]
         if (depth > 0).all():
             for axis, along in enumerate((y / w, x / w)):
                 low[axis] = max(low[axis], math.floor(along.min()) - _MARGIN)
                 high[axis] = min(high[axis], math.ceil(along.max()) + _MARGIN)
-        return None if low[0] >= high[0] or low[1] >= high[1] else ((low[0], low[1]), (high[0], high[1]))
+        seen = low[0] < high[0] and low[1] < high[1]
+        found.append(((low[0], low[1]), (high[0], high[1])) if seen else None)
+    return found
 
 
 def _sight_of(scene: Scene, window: Window, shape: tuple[int, ...]) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
