@@ -158,7 +158,7 @@ def fit_windows(
             done = done._replace(result=found.result.value, seam=seam, warnings=found.warnings, **stats)
         terrain = dataclasses.replace(terrain, windows=(*terrain.windows, done))
         if path is not None:
-            facts = {"fingerprint": name, "windows": [list(done) for done in terrain.windows]}
+            facts = {"fingerprint": name, "windows": terrain.windows}  # of which JSON makes lists
             save_checkpoint(path, facts, [getattr(terrain, part) for part in _ARRAYS])
     deviations = terrain.std if options.get("draws") else None
     return dataclasses.replace(terrain, heights=terrain.heights.astype(field.heights.dtype), std=deviations)

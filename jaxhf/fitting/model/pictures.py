@@ -19,7 +19,7 @@ from ...core.precision import numbers
 from ...core.settings import Settings
 from ...core.types import AnyArray, Scalar
 from ...preparation.localise import localise
-from ...preparation.world import make_world, resolve_settings
+from ...preparation.world import World, make_world, resolve_settings
 from ...scene.light import Sun
 from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
@@ -84,8 +84,14 @@ def can_be_linearised(scene: Scene, settings: Settings) -> bool:
     return not has_mirrors((obj.material for obj in scene.objects), settings)
 
 
-def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None) -> None:
-    """Checks that there is a scene for each picture, and that all have the same first heightfield but for its heights."""
+def checked_pictures(
+    scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None, noise: Any
+) -> tuple[tuple[np.ndarray, ...], list[Float[np.ndarray, "h w c"]], Any]:
+    """Checks scenes, targets and weights; returns the targets with nan where they have no weight, as no statistic counts these,
+    the weight of each of their values, and the noise at weight 1 in numbers.
+
+    That of a `Noise` is the root mean square of its values' deviations; weights say by how much each differs from that.
+    """
     count = len(scenes)
     if count == 0:
         raise ArgumentError("fit", "scenes", "must hold at least one Scene, it is empty")
@@ -95,18 +101,7 @@ def require_scenes(scenes: Sequence[Scene], targets: Sequence[Any], weights: Seq
         raise ArgumentError("fit", "weights", f"must hold one for each of the {count} scenes, they are {len(weights)}")
     for k, scene in enumerate(scenes):
         _require_alike(k, scene, scenes[0])
-
-
-def checked_pictures(
-    scenes: Sequence[Scene], targets: Sequence[Any], weights: Sequence[Any] | None, noise: Any
-) -> tuple[tuple[np.ndarray, ...], list[Float[np.ndarray, "h w c"]], Any]:
-    """Checks scenes, targets and weights; returns the targets with nan where they have no weight, as no statistic counts these,
-    the weight of each of their values, and the noise at weight 1 in numbers.
-
-    That of a `Noise` is the root mean square of its values' deviations; weights say by how much each differs from that.
-    """
-    require_scenes(scenes, targets, weights)
-    detectors = noise_of_each(noise, len(scenes)) if has_detector(noise) else [None] * len(scenes)
+    detectors = noise_of_each(noise, count) if has_detector(noise) else [None] * count
     kept, given, in_numbers = [], [], []
     for k, (scene, target, detector) in enumerate(zip(scenes, targets, detectors, strict=True)):
         values, weight = _checked_picture(k, scene, target, weights, detector)
@@ -201,14 +196,13 @@ def _require_alike(k: int, scene: Scene, first: Scene) -> None:
         mine, theirs = getattr(field, name), getattr(other, name)
         if mine != theirs:
             raise wrong(f": {name} must be that of the first scene's heightfield, {theirs}; it is {mine}")
-    if field.seam is not other.seam and not (
-        field.seam is not None and other.seam is not None and np.array_equal(field.seam, other.seam, equal_nan=True)
-    ):
+    seams: Any = field.seam, other.seam
+    if seams[0] is not seams[1] and not np.array_equal(*seams, equal_nan=True):
         raise wrong(": the seam must be that of the first scene's heightfield, it is another")
 
 
 def _checked_picture(
-    k: int, scene: Scene, target: Any, weights: Sequence[Any] | None, noise: Any = None
+    k: int, scene: Scene, target: Any, weights: Sequence[Any] | None, noise: Any
 ) -> tuple[Float[np.ndarray, "h w c"], Float[np.ndarray, "h w c"]]:
     """Target and weight of one picture; 0 where a `Noise` says that it is no measurement."""
     size = (scene.camera.height, scene.camera.width)
@@ -270,16 +264,18 @@ def _by_detector(
 def _picture(
     target: Float[np.ndarray, "h w c"], weight: Float[np.ndarray, "h w c"]
 ) -> tuple[Float[np.ndarray, "h w k"], Float[np.ndarray, "h w k"]]:
-    """What is measured, and its weight; 0 where it has none. Equal channels are one."""
-    if target.shape[-1] == 3 and _is_grey(target, weight):
+    """What is measured, and its weight; 0 where it has none. Equal channels are one measurement, stored three times."""
+    told = target[(weight > 0).all(axis=-1)]
+    if target.shape[-1] == 3 and np.all(told == told[:, :1]) and np.all(weight == weight[..., :1]):
         target, weight = target[..., :1], weight[..., :1]
     return np.where(weight > 0, target, 0), weight
 
 
-def _is_grey(target: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w 3"]) -> bool:
-    """Whether its channels are one measurement, stored three times."""
-    counts = (weight > 0).all(axis=-1)
-    return bool(np.all(target[counts] == target[counts][:, :1]) and np.all(weight == weight[..., :1]))
+def vertex_values(world: World) -> Float[jax.Array, "vertices n"]:
+    """Heights and, with smooth shading, the normals' components, of the first heightfield."""
+    _, grid, _ = world.grids[0]
+    heights = grid.rows[:, None]
+    return heights if grid.normals is None else jnp.concatenate([heights, grid.normals], axis=1)
 
 
 def choose_samples(scenes: Sequence[Scene], settings: Settings) -> Settings:

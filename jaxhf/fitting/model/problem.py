@@ -146,24 +146,26 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: 
     ArgumentError where scenes, targets and arguments do not belong together."""
     first = scenes[0]
     field, dtype = first.heightfields[0], first.heights.dtype
-    length = None if given.prior is None else given.prior.length
+    prior, held = given.prior, np.zeros(field.heights.shape, bool)
+    border = padding(field, None if prior is None else prior.length)
+
+    def where_free() -> Float[np.ndarray, "my mx"] | None:
+        """0 where heights are held so far, else 1; None: none are."""
+        return pad((~held).astype(np.float64), border) if held.any() else None
+
     start = _without_holes(np.asarray(first.heights)) if given.start is None else given.start
     heights = make_heights("fit", "start", start, field)
-    free, counts, held = None, None, np.zeros(heights.shape, bool)
-    if given.prior is not None and not np.asarray(numbers(given.prior.std)).all():
-        held = np.broadcast_to(np.asarray(numbers(given.prior.std)) == 0, heights.shape)
-        heights = np.where(held, make_heights("Prior", "heights", given.prior.heights, field), heights)
+    if prior is not None and not (std := numbers(prior.std)).all():
+        held = np.broadcast_to(std == 0, heights.shape)
+        heights = np.where(held, make_heights("Prior", "heights", prior.heights, field), heights)
     if field.seam is not None:
         held, heights = held | np.isfinite(np.asarray(field.seam)).all(-1), with_seam(field, heights)
-    if held.any():
-        counts = pad((~held).astype(np.float64), padding(field, length))
-    if given.prior is not None and given.prior.held is not None:
-        known = _held_heights(given.prior.held, field)
+    counts = where_free()
+    if prior is not None and prior.held is not None:
+        known = _held_heights(prior.held, field)
         held, heights = held | np.isfinite(known), np.where(held | np.isnan(known), heights, known)
-    if held.any():
-        free = pad((~held).astype(np.float64), padding(field, length))
-    base = pad(heights, padding(field, length))
-    basis = make_basis(field, base, slope_units(base.shape, field.dx, field.dy)[0], free=free)
+    base = pad(heights, border)
+    basis = make_basis(field, base, slope_units(base.shape, field.dx, field.dy)[0], free=where_free())
     settings = choose_samples(scenes, given.settings)
     _require_shown(scenes, given.unknown)
     brightness, view_unit = _brightness(targets), _view_unit(scenes, given.unknown)
@@ -174,7 +176,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: 
     problem = Problem(
         groups=groups,
         basis=basis,
-        terms=make_terms(field, given.prior, given.unknown, base, counts, view_unit, albedo),
+        terms=make_terms(field, prior, given.unknown, base, counts, view_unit, albedo),
         loss_scale=jnp.asarray(LOSS_SCALE, dtype),
         noise=np.ones(len(scenes)),
         brightness=brightness,
@@ -185,7 +187,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: 
         albedo_shape=None if unknowns.albedo is None else unknowns.albedo.shape,
         settings=settings,
         mesh=chosen_mesh("fit", given.mesh),
-        known=given.prior is not None,
+        known=prior is not None,
     ).with_noise(_noise(given.noise, brightness))
     return problem.with_edge_samples(problem.edge_samples_for(jnp.asarray(heights, dtype), given.settings)), unknowns
 
@@ -291,13 +293,6 @@ def _brightness(targets: Sequence[np.ndarray]) -> Float[np.ndarray, " pictures"]
     return np.where(np.asarray(bright) > 0, bright, 1.0)
 
 
-def _at_rest(unit: View, count: int) -> View:
-    """Numbers that are 0: of each picture, and of the material that all of them show."""
-    found = jax.tree.map(lambda unit: jnp.zeros((count, unit.size), unit.dtype), unit)
-    common = None if unit.material is None else jnp.zeros_like(unit.material)[None]
-    return dataclasses.replace(found, material=common)
-
-
 def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknown: Unknown, view_unit: View) -> Unknowns:
     """Those from which a fit starts: coefficients 0, the albedo, lights and cameras of the scenes, exposure 1 and offset 0."""
     scene, count = scenes[0], len(scenes)
@@ -311,10 +306,13 @@ def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknow
         image = known.texels.shape[:2] if isinstance(known, ImageTexture) else shape
         shape = (*(image if unknown.albedo == "map" else (1, 1)), 1 if unknown.albedo_shared else channels)
         albedo = jax.device_put(np.full(shape, 1 if unknown.albedo_length is None else 0, dtype))
+    view = jax.tree.map(lambda unit: jax.device_put(np.zeros((count, unit.size), unit.dtype)), view_unit)
+    if view.material is not None:  # which all pictures show
+        view = dataclasses.replace(view, material=view.material[:1])
     return Unknowns(
         jax.device_put(np.zeros(basis.base.shape, dtype)),
         albedo,
         jax.device_put(np.ones(count, dtype)) if unknown.exposures else None,
         jax.device_put(np.zeros(count, dtype)) if unknown.offsets else None,
-        _at_rest(view_unit, count),
+        view,
     )

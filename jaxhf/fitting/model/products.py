@@ -8,12 +8,12 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from ...core.autodiff import with_tangent
-from ...preparation.world import World, make_world, resolve_settings
+from ...preparation.world import make_world, resolve_settings
 from ...rendering.samples import PictureSamples
 from ...scene.scene import Scene
 from ...xla.devices import on_every_device, over_spread
 from .linearise import Linearised, LinearisedEdges, SampleRows
-from .pictures import Group
+from .pictures import Group, vertex_values
 from .problem import Problem
 from .unknowns import Unknowns, View
 
@@ -66,13 +66,6 @@ def picture_each(
 
     camera, settings = scenes.camera, resolve_settings(settings, scenes)
     return jax.vmap(one)(known.image, known.edges, of_samples, light, view)
-
-
-def vertex_values(world: World) -> Float[jax.Array, "vertices n"]:
-    """Heights and, with smooth shading, the normals' components, of the first heightfield."""
-    _, grid, _ = world.grids[0]
-    heights = grid.rows[:, None]
-    return heights if grid.normals is None else jnp.concatenate([heights, grid.normals], axis=1)
 
 
 def _of_samples(

@@ -21,9 +21,8 @@ from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, on_host
 from .expansion import Expansion
-from .pictures import Group
+from .pictures import Group, vertex_values
 from .problem import Problem
-from .products import vertex_values
 from .unknowns import Unknowns, Window
 
 sp: Any = scipy.sparse  # whose stubs miss much

@@ -115,7 +115,6 @@ def first_state(problem: Problem, unknowns: Unknowns) -> State:
 def save_state(path: Path, state: State, fingerprint: str) -> None:
     facts = {field.name: getattr(state, field.name) for field in dataclasses.fields(state) if field.name not in _ARRAYS}
     arrays = [getattr(state, name) for name in _ARRAYS]
-    facts["history"] = [list(step) for step in state.history]
     facts |= {"fingerprint": fingerprint, "shapes": [leaf.shape for leaf in jax.tree.leaves(arrays)]}
     save_checkpoint(path, facts, arrays)
 
