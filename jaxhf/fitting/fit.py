@@ -121,7 +121,7 @@ def _found(scenes: tuple[Scene, ...], targets: tuple[Any, ...], given: Given) ->
         raise ArgumentError("fit", "scenes", "must have float64 heights where JAX's x64 mode is on, theirs are float32")
     report = printed_progress() if given.progress is True else given.progress or None
     ended = _run(problems, unknowns, given, report)
-    return judged(ended, problems, scenes, targets, given, report)
+    return judged(ended, scenes, targets, given, report)
 
 
 def _run(problems: Sequence[Problem], unknowns: Unknowns, given: Given, report: Callable[[Step | Draws], None] | None) -> Ended:

@@ -219,7 +219,7 @@ def units_of_one(expansion: Expansion) -> tuple[np.ndarray, float, Any]:
     return np.ones(expansion.problem.basis.base.shape), 1.0, others
 
 
-def judged_as_it_is(ended, problems, scenes, targets, given, report) -> jaxhf.Fit:
+def judged_as_it_is(ended, scenes, targets, given, report) -> jaxhf.Fit:
     """Without a look at its pictures."""
     problem, unknowns, none = ended.expansion.problem, ended.expansion.unknowns, np.zeros((12, 12, 1))
     return jaxhf.Fit(

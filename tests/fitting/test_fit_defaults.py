@@ -26,7 +26,7 @@ from jaxhf.fitting.trust.facts import (
     unlike_noise,
     what_may_help,
 )
-from jaxhf.fitting.trust.words import Findings, Places, warnings, where_residuals_are, worst_regions
+from jaxhf.fitting.trust.words import Findings, warnings, where_residuals_are, worst_regions
 from jaxhf.preparation.localise import localise
 
 STEPS = np.where(np.indices((12, 12)).sum(0) % 3 == 0, 1 / 11, 0.0)
@@ -190,9 +190,9 @@ def test_it_says_where_residuals_are():
     residual[1, 1], residual[5, 5], residual[1, 6] = 3.0, 4.0, 5.0
     silhouettes, shadows = np.zeros((2, 8, 8), bool)
     silhouettes[2, 2] = shadows[5, 4] = True
-    said = where_residuals_are([residual], [Places(silhouettes, shadows)])
+    said = where_residuals_are([residual], [(silhouettes, shadows)])
     assert said.startswith("18% of their squares lie at the terrain's border and silhouettes, 32% at the edges of shadows, 50%")
-    assert where_residuals_are([residual], [Places(silhouettes, None)]).startswith("18% of their squares lie beside")
+    assert where_residuals_are([residual], [(silhouettes, None)]).startswith("18% of their squares lie beside")
 
 
 def left(residual: np.ndarray, **values) -> Left:

@@ -35,11 +35,13 @@ _FEW_HEIGHTS = 2**17  # of 512² steps by factors took as long again as all befo
 
 
 class Ended(NamedTuple):
-    """How a fit ended: where, why, and the pictures there, about which all modes of the finest heights are varied."""
+    """How a fit ended: where, why, and the pictures there, about which all modes of the finest heights are varied; `whole`:
+    whether they were so far."""
 
     state: State
     stop: Stop
     expansion: Expansion
+    whole: bool
 
 
 class _Place(NamedTuple):
@@ -65,7 +67,8 @@ def run(problems: Sequence[Problem], state: State, given: Given, watch: Callable
             if following is None:
                 assert stop is not None
                 assert place is not None
-                return Ended(state, stop, _with_all_modes(state, place.expansion, problems, given))
+                last = _with_all_modes(state, place.expansion, problems, given)
+                return Ended(state, stop, last, varies_all(state, problems))
             state, place = following
         watch(state)
 

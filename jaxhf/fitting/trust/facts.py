@@ -18,7 +18,6 @@ from ..model.expansion import Expansion, influence_function
 from ..model.problem import Problem
 from ..model.terms import octaves
 from ..solve.noise import Freedom
-from .words import Places
 
 _ALIKE = 0.3  # correlation of neighbouring residuals above which they are no noise
 _LIKE_NOISE = 0.2  # below which they may be
@@ -51,6 +50,17 @@ class Left(NamedTuple):
     informing: Bool[np.ndarray, "h w c"]
     noise: float
     brightness: float
+
+
+def left_of(expansion: Expansion) -> list[Left]:
+    """What is left of each picture."""
+    problem, groups = expansion.problem, expansion.problem.groups
+    rows = expansion.pictures(), [group.targets for group in groups], [group.weights for group in groups], expansion.informing()
+    images, targets, weights, informing = (problem.by_picture([np.asarray(part) for part in parts]) for parts in rows)
+    pairs = zip(images, targets, weights, strict=True)
+    off = [np.where(weight > 0, image - target, 0) * weight for image, target, weight in pairs]
+    numbers = problem.noise.tolist(), problem.brightness.tolist()
+    return list(map(Left, images, targets, off, informing, *numbers))
 
 
 def neighbour_correlation(residual: Float[np.ndarray, "h w c"], counts: Bool[np.ndarray, "h w c"]) -> tuple[float, float]:
@@ -127,19 +137,23 @@ def _cause(left: Left, given: Given) -> str:
     return f"{prior}{off}; {_REFLECTANCE}"
 
 
-def boundary_places(expansion: Expansion) -> list[Places]:
-    """Where boundaries are in each picture."""
+def boundary_places(expansion: Expansion) -> list[tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"] | None]]:
+    """The pixels of each picture at the terrain's border and at silhouettes, and those at the edges of shadows.
+
+    Where a fit takes no points on edges the latter are None, and the others are what does not depend on the heights, be it
+    background or in shadow.
+    """
     found = []
     for group, known in zip(expansion.problem.groups, expansion.linearised, strict=True):
         n, h, w, _ = group.targets.shape
         if known is None:
-            found.append([Places(np.zeros((h, w), bool), None)] * n)
+            found.append([(np.zeros((h, w), bool), None)] * n)
         elif known.edges is None:
-            found.append([Places(shaded, None) for shaded in ~np.asarray(known.depends)])
+            found.append([(shaded, None) for shaded in ~np.asarray(known.depends)])
         else:
             edges = zip(np.asarray(known.edges.pixel), np.asarray(known.edges.kind), strict=True)
             counts = [[np.bincount(pixel[kind == which], minlength=h * w) for which in (1, 2)] for pixel, kind in edges]
-            found.append([Places(*(count.reshape(h, w) > 0 for count in both)) for both in counts])
+            found.append([tuple(count.reshape(h, w) > 0 for count in both) for both in counts])
     return expansion.problem.by_picture(found)
 
 

@@ -14,10 +14,8 @@ from ...scene.record import number, span
 from ...scene.scene import Scene
 from ..given import Given, Step, Stop
 from ..model.expansion import Expansion, found_scenes
-from ..model.problem import Problem
 from ..solve.noise import Freedom, Restricted, explains_noise
 from ..solve.run import Ended
-from ..solve.stages import varies_all
 from . import facts
 from .deviations import standard_deviations, with_unexplained
 from .words import FAR_FROM_ONE, Findings, Region, warnings, where_residuals_are, worst_regions
@@ -90,17 +88,14 @@ def in_short(heights: Float[np.ndarray, "ny nx"], std: Float[np.ndarray, "ny nx"
 @np.errstate(over="ignore")  # of a fit that ended as not finite
 def judged(
     ended: Ended,
-    problems: Sequence[Problem],
     scenes: tuple[Scene, ...],
     targets: Sequence[np.ndarray],
     given: Given,
     report: Callable[..., None] | None,
 ) -> Fit:
-    """What was found; `problems` are those of `run`. `report` is called after each draw."""
-    fitted = varies_all(ended.state, problems) and bool(np.isfinite(ended.state.loss))
-    expansion, free = _restricted(ended, fitted, given)
-    problem = expansion.problem
-    left = _left(expansion)
+    """What was found; `report` is called after each draw."""
+    expansion, free = _restricted(ended, given)
+    problem, left = expansion.problem, facts.left_of(expansion)
     in_noise = [picture.residual for picture in left]
     counts = [picture.informing | (np.abs(picture.residual) > _OFF) for picture in left]
     counted = np.concatenate([values[which] for values, which in zip(in_noise, counts, strict=True)]).astype(np.float64)
@@ -169,28 +164,17 @@ def judged(
     )
 
 
-def _restricted(ended: Ended, fitted: bool, given: Given) -> tuple[Expansion, Freedom | None]:
+def _restricted(ended: Ended, given: Given) -> tuple[Expansion, Freedom | None]:
     """The expansion with the noise of restricted maximum likelihood, and what of it the heights explain; None where they are
-    few, or were not all `fitted`."""
+    few, or were not all fitted."""
     expansion = ended.expansion
-    if not (fitted and explains_noise(expansion.problem)):
+    if not (ended.whole and np.isfinite(ended.state.loss) and explains_noise(expansion.problem)):
         return expansion, None
     restricted = Restricted(expansion)
     estimate = restricted.noise(given.noise is None, ended.state.widths)
     if given.noise is None:
         expansion = expansion.with_noise(estimate.noise)
     return expansion, restricted.freedom(estimate)
-
-
-def _left(expansion: Expansion) -> list[facts.Left]:
-    """What is left of each picture."""
-    problem, groups = expansion.problem, expansion.problem.groups
-    rows = expansion.pictures(), [group.targets for group in groups], [group.weights for group in groups], expansion.informing()
-    images, targets, weights, informing = (problem.by_picture([np.asarray(part) for part in parts]) for parts in rows)
-    pairs = zip(images, targets, weights, strict=True)
-    off = [np.where(weight > 0, image - target, 0) * weight for image, target, weight in pairs]
-    numbers = problem.noise.tolist(), problem.brightness.tolist()
-    return list(map(facts.Left, images, targets, off, informing, *numbers))
 
 
 def _in_shape(image: Float[np.ndarray, "h w c"], shape: tuple[int, ...]) -> np.ndarray:

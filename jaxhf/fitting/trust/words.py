@@ -58,31 +58,23 @@ def worst_regions(residuals: Sequence[Float[np.ndarray, "h w c"]]) -> tuple[Regi
     return tuple(sorted(found, key=lambda region: -region.rms)[:_REGIONS])
 
 
-class Places(NamedTuple):
-    """The pixels of a picture at the terrain's border and at silhouettes, and those at the edges of shadows.
-
-    Where a fit takes no points on edges `shadows` is None, and the others are what does not depend on the heights, be it
-    background or in shadow.
-    """
-
-    silhouettes: Bool[np.ndarray, "h w"]
-    shadows: Bool[np.ndarray, "h w"] | None
-
-
-def where_residuals_are(residuals: Sequence[Float[np.ndarray, "h w c"]], places: Sequence[Places]) -> str:
-    """The shares of the squared residuals at silhouettes, at shadows and elsewhere, in words."""
+def where_residuals_are(
+    residuals: Sequence[Float[np.ndarray, "h w c"]],
+    places: Sequence[tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"] | None]],
+) -> str:
+    """The shares of the squared residuals at silhouettes, at shadows and elsewhere, in words; `places`: `boundary_places`."""
     total = at_silhouettes = at_shadows = 0.0
-    for residual, place in zip(residuals, places, strict=True):
+    for residual, (silhouettes, shadows) in zip(residuals, places, strict=True):
         squares = np.sum(np.square(residual, dtype=np.float64), axis=-1)
-        near = ndimage.binary_dilation(place.silhouettes, _AROUND)
+        near = ndimage.binary_dilation(silhouettes, _AROUND)
         total += float(squares.sum())
         at_silhouettes += float(squares[near].sum())
-        if place.shadows is not None:
-            at_shadows += float(squares[ndimage.binary_dilation(place.shadows, _AROUND) & ~near].sum())
+        if shadows is not None:
+            at_shadows += float(squares[ndimage.binary_dilation(shadows, _AROUND) & ~near].sum())
     if total == 0:
         return "they are all 0"
     rest = f"{(total - at_silhouettes - at_shadows) / total:.0%} elsewhere"
-    if all(place.shadows is None for place in places):
+    if all(shadows is None for _, shadows in places):
         return f"{at_silhouettes / total:.0%} of their squares lie beside the background or shadows, {rest}"
     return (
         f"{at_silhouettes / total:.0%} of their squares lie at the terrain's border and silhouettes, "
