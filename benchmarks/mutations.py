@@ -66,7 +66,7 @@ io: io/terrain/[lrst]*.py -> io/test_terrain.py io/test_grids.py io/test_rasters
 boundary: boundary/*.py -> boundary
 fitting: fitting/model/linearise.py fitting/solve/sta*.py -> fitting/test_linearise.py fitting/test_fit_stops.py
 fitting: fitting/model/n*.py fitting/solve/noise.py -> fitting/test_normal_matrix.py fitting/test_noise.py
-fitting: fitting/trust/d*.py fitting/model/rows.py -> fitting/test_normal_matrix.py fitting/test_noise.py
+fitting: fitting/model/rows.py -> fitting/test_normal_matrix.py fitting/test_noise.py
 fitting: fitting/*.py fitting/model/[prtu]*.py -> fitting/test_fit_parts.py fitting/test_fit.py
 fitting: fitting/model/e*.py fitting/solve/run.py -> fitting/test_fit.py fitting/test_fit_defaults.py
 fitting: fitting/trust/[jw]*.py fitting/trust/facts.py -> fitting/test_fit.py fitting/test_fit_defaults.py

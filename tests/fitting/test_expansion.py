@@ -15,7 +15,7 @@ from jaxhf.fitting.model.expansion import Expansion, expand, found_scenes
 from jaxhf.fitting.model.normal_matrix import in_row
 from jaxhf.fitting.model.rows import pictures_by_heights
 from jaxhf.fitting.model.unknowns import Unknowns, differences, moved
-from jaxhf.fitting.trust.deviations import _on_boundaries
+from jaxhf.fitting.trust.facts import on_boundaries
 
 PLACE = np.array([[0.9, 0.1, 0.05, 0.1], [-0.1, 0.9, 0.1, 0.2], [0.05, 0.1, 0.8, 0.25], [0, 0, 0, 1]])
 SUN, SKY = jaxhf.Directional((0.3, -0.4, 0.5)), jaxhf.Sky(0.1)
@@ -131,7 +131,7 @@ def test_products_are_those_of_the_derivative_of_render(settings, channels, prec
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=rounding * np.abs(theirs).max())
     left = [image - group.weights * group.targets for image, group in zip(images, here.problem.groups, strict=True)]
-    off, resampled = in_row(here.left()) - in_row(left), _on_boundaries(here)
+    off, resampled = in_row(here.left()) - in_row(left), in_row(on_boundaries(here)) > 0
     np.testing.assert_allclose(off[~resampled], 0, atol=rounding * np.abs(in_row(images)).max())
     assert (np.abs(off[resampled]) > 0.01).any() == (settings.edge_samples > 0)  # of the noise
     there = sum(np.vdot(a, b) for a, b in zip(rows, found, strict=True))

@@ -14,7 +14,6 @@ from jaxhf.fitting.model import pictures as _pictures
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
 from jaxhf.fitting.model.pictures import choose_edge_samples, choose_samples
 from jaxhf.fitting.solve.noise import spreads
-from jaxhf.fitting.trust.deviations import standard_deviations, with_unexplained
 from jaxhf.fitting.trust.facts import (
     Left,
     _share_of_normals,
@@ -26,6 +25,7 @@ from jaxhf.fitting.trust.facts import (
     unlike_noise,
     what_may_help,
 )
+from jaxhf.fitting.trust.judge import standard_deviations, with_unexplained
 from jaxhf.fitting.trust.words import Findings, warnings, where_residuals_are, worst_regions
 from jaxhf.preparation.localise import localise
 

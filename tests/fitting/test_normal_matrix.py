@@ -17,7 +17,7 @@ from jaxhf.fitting.model.expansion import Expansion, prior_residuals
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
 from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
 from jaxhf.fitting.model.unknowns import Window
-from jaxhf.fitting.trust.deviations import Boundaries, standard_deviations
+from jaxhf.fitting.trust.judge import Boundaries, standard_deviations
 
 sp: Any = scipy.sparse  # whose stubs miss much
 OPTIONS = {"settings": SETTINGS, "noise": 0.01}

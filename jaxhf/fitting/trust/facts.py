@@ -157,6 +157,18 @@ def boundary_places(expansion: Expansion) -> list[tuple[Bool[np.ndarray, "h w"],
     return expansion.problem.by_picture(found)
 
 
+def on_boundaries(expansion: Expansion) -> list[Bool[np.ndarray, "n h w c"]]:
+    """Which values of the pictures are of pixels that a boundary crosses."""
+    masks = []
+    for group, known in zip(expansion.problem.groups, expansion.linearised, strict=True):
+        mask = np.zeros(group.targets.shape, bool)
+        if known is not None and known.edges is not None:
+            for picture, pixels in zip(mask, np.asarray(known.edges.resampled), strict=True):
+                picture.reshape(-1, picture.shape[-1])[pixels] = True
+        masks.append(mask)
+    return masks
+
+
 def what_may_help(expansion: Expansion, pictures: Sequence[Left], given: Given) -> str:
     """The one option to try where pictures are left unexplained."""
     problem = expansion.problem
