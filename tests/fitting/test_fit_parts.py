@@ -266,7 +266,7 @@ REFUSED: dict[str, list[dict[str, Any]]] = {  # the argument that is to be named
     "noise": [*({"noise": noise} for noise in (0, "low", np.ones((24, 24)))), unknown(albedo="map", albedo_length=0.1)],
     "prior": [{"prior": TRUTH}],
     "heights": [prior(heights="map.tif"), prior(heights=lambda: 3), prior(heights=np.array([[0.0, np.nan], [0.0, 0.0]]))],
-    "std": [prior(std=std) for std in (np.ones((5, 5)), -21, 0, "low", np.inf)],
+    "std": [prior(std=std) for std in (np.ones((5, 5)), np.eye(5), -21, 0, "low", np.inf)],
     "length": [prior(length=length) for length in (0, 8.0, "3")],
     "start": [{"start": [[0.0, np.inf], [0.0, 0.0]]}],
     "draws": [{"draws": "some"}, {"draws": 1}, {"draws": -3}],

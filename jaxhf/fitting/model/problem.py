@@ -21,7 +21,7 @@ from ...scene.texture import ImageTexture
 from ...xla.devices import chosen_mesh
 from ..given import NOISE_RULE, Given, Unknown
 from .pictures import Group, albedo_of, choose_edge_samples, choose_samples, make_groups
-from .terms import AlbedoField, Terms, by_mode, make_albedo_field, make_terms
+from .terms import AlbedoField, Terms, by_mode, make_albedo_field, make_terms, prior_std
 from .unknowns import Basis, Unknowns, View, make_basis, make_heights, pad, padding, slope_units, sun, with_seam
 
 LOSS_SCALE = 3.0  # standard deviations from which on the robust loss makes less of a residual, in the end
@@ -155,7 +155,7 @@ def make_problem(scenes: Sequence[Scene], targets: Sequence[np.ndarray], given: 
 
     start = _without_holes(np.asarray(first.heights)) if given.start is None else given.start
     heights = make_heights("fit", "start", start, field)
-    if prior is not None and not (std := numbers(prior.std)).all():
+    if prior is not None and not (std := prior_std(field, prior)).all():
         held = np.broadcast_to(std == 0, heights.shape)
         heights = np.where(held, make_heights("Prior", "heights", prior.heights, field), heights)
     if field.seam is not None:

@@ -150,11 +150,16 @@ def _shape_term(field: Heightfield, start: Float[np.ndarray, "my mx"]) -> Term:
     return Term(jnp.asarray(start, dtype), jnp.ones((), dtype), jnp.asarray((1 + frequency) / units, dtype))
 
 
-def _prior_term(field: Heightfield, prior: Prior) -> Term:
-    shape, dtype = field.heights.shape, field.heights.dtype
-    std = np.asarray(numbers(prior.std), np.float64)
+def prior_std(field: Heightfield, prior: Prior) -> Float[np.ndarray, "..."]:
+    """The deviations of a prior, () or (ny, nx); ArgumentError where they do not belong to the heights."""
+    shape, std = field.heights.shape, np.asarray(numbers(prior.std), np.float64)
     if std.shape not in ((), shape):
         raise ArgumentError("Prior", "std", f"must be a number or of shape {shape}, as the heights; its shape is {std.shape}")
+    return std
+
+
+def _prior_term(field: Heightfield, prior: Prior) -> Term:
+    shape, dtype, std = field.heights.shape, field.heights.dtype, prior_std(field, prior)
     if prior.length is not None:
         _require_plausible(field, prior.length)
     border = padding(field, prior.length)

@@ -17,7 +17,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from ...core.types import AnyArray, Flag, Scalar
+from ...core.types import Flag, Scalar
 from ...xla.compilation import compiled
 from ...xla.devices import divided, on_every_device
 from ...xla.plain import insides
@@ -49,8 +49,8 @@ class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
     modes.
     """
 
-    tolerance: Float[AnyArray, ""] = eqx.field(converter=np.asarray)
-    iterations: Int[AnyArray, ""] = eqx.field(converter=np.asarray)
+    tolerance: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    iterations: Int[Array, ""] = eqx.field(converter=jnp.asarray)
     others: Any
 
     def init(self, y: Unknowns, f_info_struct: Any) -> Any:
