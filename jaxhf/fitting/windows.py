@@ -14,7 +14,7 @@ from ..core.errors import ArgumentError, counted
 from ..core.precision import numbers
 from ..core.rules import Whole, require
 from ..core.settings import Settings
-from ..io.checkpoint import load_arrays, load_facts_of, save_checkpoint
+from ..io.checkpoint import digest, load_arrays, load_facts_of, save_checkpoint
 from ..preparation.localise import localise
 from ..scene.scene import Scene
 from .cropped import Seen, cropped, sides_in_sight, surroundings
@@ -22,7 +22,6 @@ from .fit import fit
 from .given import Checkpoint, Draws, Prior, Step
 from .model.pictures import EDGE_SAMPLES, checked_pictures, choose_edge_samples, choose_samples
 from .model.unknowns import Window, make_heights, with_seam
-from .solve.stages import digest
 from .trust.judge import Fit, in_short
 
 _LEAST_WINDOW, _LEAST_OVERLAP = 32, 8  # heights: the outermost four or so of a window are hardly told by its pictures

@@ -7,11 +7,21 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
+import jax
+import numpy as np
 
 from .errors import FileError
 from .files import PathLike, replacing, require_file
 
 _MAGIC = b"jaxhf checkpoint 2\n"
+
+
+def digest(choices: Any, values: Any) -> str:
+    """A hash of what `repr` tells of choices, and of the bits of a pytree's leaves."""
+    found = hashlib.sha256(repr(choices).encode())
+    for leaf in map(np.asarray, jax.tree.leaves(values)):
+        found.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
+    return found.hexdigest()
 
 
 def save_checkpoint(path: PathLike, facts: dict[str, Any], arrays: Any) -> None:

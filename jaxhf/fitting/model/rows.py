@@ -46,11 +46,7 @@ def pictures_by_heights(expansion: Expansion) -> Sparse | None:
 
 def has_rows(expansion: Expansion) -> bool:
     """Whether `pictures_by_heights` has them."""
-    return expansion.problem.basis.base.size <= MOST_HEIGHTS and can_have_rows(expansion)
-
-
-def can_have_rows(expansion: Expansion) -> bool:
-    return all(known is not None for known in expansion.linearised)
+    return expansion.problem.basis.base.size <= MOST_HEIGHTS and expansion.is_linearised
 
 
 def first_vertices(expansion: Expansion) -> Int[np.ndarray, " rows"]:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from ..model.expansion import Expansion
 from ..model.normal_matrix import MOST_OTHERS, Flat, NormalMatrix, in_row
 from ..model.problem import Problem
-from ..model.rows import can_have_rows, first_vertices, has_rows, part_by_heights
+from ..model.rows import first_vertices, has_rows, part_by_heights
 from ..model.terms import OCTAVES, by_mode, octaves
 from ..model.unknowns import Window
 
@@ -156,7 +156,7 @@ def _told(expansion: Expansion, labels: Labels) -> tuple[Int[np.ndarray, " value
     heights are many, those that show a block of them, as a part of the data tells the noise as well."""
     block, shape = None, expansion.problem.basis.base.shape
     few_others = expansion.unknowns.count - math.prod(shape) <= MOST_OTHERS
-    if can_have_rows(expansion) and max(shape) > _MOST_SIDE and few_others:
+    if expansion.is_linearised and max(shape) > _MOST_SIDE and few_others:
         block = _block(expansion, labels)
     rows, values = None, np.arange(labels.size)
     if block is not None or has_rows(expansion):

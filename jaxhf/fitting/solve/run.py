@@ -12,7 +12,6 @@ import numpy as np
 from ..given import Given, Step, Stop
 from ..model.expansion import Expansion, expand, surface_of
 from ..model.problem import LOSS_SCALE, Problem
-from ..model.rows import has_rows
 from ..model.unknowns import Unknowns, make_basis
 from .noise import Estimate, Restricted, explains_noise, rms, spreads
 from .stages import Stage, State, balanced, on_finer, stages, varies_all, why_ended
@@ -166,7 +165,9 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
 def _ends_by_factors(expansion: Expansion) -> bool:
     """Whether there are factors, and points on edges: these alone make the loss so rough that other steps stop short."""
     few = expansion.problem.basis.base.size <= _FEW_HEIGHTS
-    return few and has_rows(expansion) and any(known is not None and known.edges is not None for known in expansion.linearised)
+    return (
+        few and expansion.is_linearised and any(known is not None and known.edges is not None for known in expansion.linearised)
+    )
 
 
 def _by_factors(problems: Sequence[Problem], state: State, place: _Place | None) -> tuple[State, _Place] | None:

@@ -2,7 +2,6 @@
 which units, and when each has done its part."""
 
 import dataclasses
-import hashlib
 import itertools
 import math
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...io.checkpoint import load_arrays, load_facts_of, save_checkpoint
+from ...io.checkpoint import digest, load_arrays, load_facts_of, save_checkpoint
 from ..given import Given, Step, Stop
 from ..model.expansion import Expansion, surface_of
 from ..model.problem import LOSS_SCALE, Problem
@@ -142,14 +141,6 @@ def fingerprint(problem: Problem, unknowns: Unknowns, given: Given) -> str:
     # What is left open is chosen anew on the way, also where it begins with what another fit is given.
     choices = (settings, structure, given.noise is None, given.settings.edge_samples is None)
     return digest(choices, leaves)
-
-
-def digest(choices: Any, values: Any) -> str:
-    """A hash of what `repr` tells of choices, and of the bits of a pytree's leaves."""
-    found = hashlib.sha256(repr(choices).encode())
-    for leaf in map(np.asarray, jax.tree.leaves(values)):
-        found.update(repr((leaf.shape, leaf.dtype.str)).encode() + leaf.tobytes())
-    return found.hexdigest()
 
 
 class Stage(NamedTuple):
