@@ -107,6 +107,8 @@ def draw_boundaries(
     contributions, seen = lax.stop_gradient(_draw_edges(world, camera, key, mesh, chunks, draws))
     pixel, _, sizes, _ = (values.ravel() for values in seen.unpacked())
     all_pixels = camera.width * camera.height
+
+    # They are chosen by the boundaries alone: a choice by the picture's own samples would keep what these happen to miss.
     count = min(math.ceil(edge_samples / resampled_side(settings) ** 2), all_pixels)
     count = count if resampled is None else min(resampled, all_pixels)
     _, chosen = lax.top_k(jnp.zeros(all_pixels, sizes.dtype).at[pixel].add(sizes), count)

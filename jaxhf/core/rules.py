@@ -42,7 +42,7 @@ def finite(value: float) -> str | None:
 
 
 def positive(value: float) -> str | None:
-    return None if 0 < value < math.inf else f"must be positive and finite, it is {value}"
+    return None if 0 < value <= sys.float_info.max else f"must be positive and finite, it is {value}"
 
 
 def flag(value: Any) -> str | None:

@@ -54,8 +54,8 @@ def film(camera: Any, half: Scalar, parallel: bool) -> Projection:
     def rows(p: Any, w: Any) -> jax.Array:
         return jnp.stack([p[0] * scale + w * (camera.width / 2), -p[1] * scale + w * (camera.height / 2), w, p[2]])
 
-    w, one = (jnp.zeros_like(offset), jnp.ones_like(half)) if parallel else (inverse.linear[2], offset[2])
-    return Projection(rows(inverse.linear, w), rows(offset, one))
+    w, w_offset = (jnp.zeros_like(offset), jnp.ones_like(half)) if parallel else (inverse.linear[2], offset[2])
+    return Projection(rows(inverse.linear, w), rows(offset, w_offset))
 
 
 def projected(camera: Any, points: Any, half: Callable[[Any], Any]) -> Float[np.ndarray, "*n 2"]:

@@ -73,7 +73,8 @@ class Expansion(eqx.Module):
     def left(self) -> list[Float[np.ndarray, "n h w c"]]:
         """(picture - target) / noise, by NumPy: each operation of JAX's would be a program to compile."""
         pairs = zip(self.problem.groups, self.pictures(), strict=True)
-        return [np.asarray(group.weights) * (np.asarray(image) - np.asarray(group.targets)) for group, image in pairs]
+        with np.errstate(over="ignore"):  # of a fit that ends as not finite
+            return [np.asarray(group.weights) * (np.asarray(image) - np.asarray(group.targets)) for group, image in pairs]
 
     def informing(self) -> list[Bool[np.ndarray, "n h w c"]]:
         """Which values depend on the heights; all of those with a weight where that is not known."""

@@ -34,13 +34,13 @@ _FEW_HEIGHTS = 2**17  # of 512² steps by factors took as long again as all befo
 
 
 class Ended(NamedTuple):
-    """How a fit ended: where, why, and the pictures there, about which all modes of the finest heights are varied; `whole`:
-    whether they were so far."""
+    """How a fit ended: where, why, the pictures there, about which all modes of the finest heights are varied, and whether its
+    last stage varied all of them."""
 
     state: State
     stop: Stop
     expansion: Expansion
-    whole: bool
+    varied_all: bool
 
 
 class _Place(NamedTuple):

@@ -140,15 +140,19 @@ def first_position(expansion: Expansion, step_size: Float[Array, ""]) -> Any:
     """
     leaves, structure = jax.tree.flatten(expansion)
     forms = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
-    module = insides()
-    empty = _empty(_form(structure, forms, None if module is None else module.configuration()))
+    if (module := insides()) is not None:
+        traced_in = module.configuration(), module.generation()
+    else:
+        traced_in = jax.config.jax_default_matmul_precision, jax.sharding.get_abstract_mesh()  # pyright: ignore
+    empty = _empty(_form(structure, forms, traced_in))
     begin = jnp.ones_like(empty.first_step), expansion.unknowns, step_size.astype(empty.search_state.step_size.dtype)
     return eqx.tree_at(lambda state: (state.first_step, state.y_eval, state.search_state.step_size), empty, begin)
 
 
 @functools.lru_cache(maxsize=16)
 def _form(structure: Any, leaves: tuple[Any, ...], _: Any) -> Any:
-    """The form of optimistix's state of a fit, with `jax.ShapeDtypeStruct`s for its arrays; under one configuration of JAX.
+    """The form of optimistix's state of a fit, with `jax.ShapeDtypeStruct`s for its arrays; for each configuration of JAX, the
+    last argument, and anew after `jax.clear_caches`.
 
     Once for each form of an expansion: a state also holds compiled functions, which compare by identity, so that a step that is
     given others would be compiled again.

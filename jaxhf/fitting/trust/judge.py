@@ -175,7 +175,7 @@ def _restricted(ended: Ended, given: Given) -> tuple[Expansion, Freedom | None]:
     """The expansion with the noise of restricted maximum likelihood, and what of it the heights explain; None where they are
     few, or were not all fitted."""
     expansion = ended.expansion
-    if not (ended.whole and np.isfinite(ended.state.loss) and explains_noise(expansion.problem)):
+    if not (ended.varied_all and np.isfinite(ended.state.loss) and explains_noise(expansion.problem)):
         return expansion, None
     restricted = Restricted(expansion)
     estimate = restricted.noise(given.noise is None, ended.state.widths)
