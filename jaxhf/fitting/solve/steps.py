@@ -17,7 +17,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from ...core.types import Flag, Scalar
+from ...core.types import AnyArray, Flag, Scalar
 from ...xla.compilation import compiled
 from ...xla.devices import divided, on_every_device
 from ...xla.plain import insides
@@ -139,7 +139,7 @@ def first_position(expansion: Expansion, step_size: Float[Array, ""]) -> Any:
     them, if 1 / λ is the same. So a checkpoint need not hold linearised pictures.
     """
     leaves, structure = jax.tree.flatten(expansion)
-    forms = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves)
+    forms = tuple(_shape_of(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves)
     if (module := insides()) is not None:
         traced_in = module.configuration(), module.generation()
     else:
@@ -147,6 +147,12 @@ def first_position(expansion: Expansion, step_size: Float[Array, ""]) -> Any:
     empty = _empty(_form(structure, forms, traced_in))
     begin = jnp.ones_like(empty.first_step), expansion.unknowns, step_size.astype(empty.search_state.step_size.dtype)
     return eqx.tree_at(lambda state: (state.first_step, state.y_eval, state.search_state.step_size), empty, begin)
+
+
+def _shape_of(array: AnyArray) -> jax.ShapeDtypeStruct:
+    """In the precision in which JAX takes it."""
+    form = jax.typeof(array)
+    return jax.ShapeDtypeStruct(form.shape, form.dtype, weak_type=form.weak_type)
 
 
 @functools.lru_cache(maxsize=16)
