@@ -137,6 +137,10 @@ def _at_seam(field: Heightfield, normals: Float[jax.Array, "ny nx 3"]) -> Float[
     return jnp.where(jnp.isfinite(given).all(-1, keepdims=True), given, normals)
 
 
+put_at = functools.partial(eqx.tree_at, is_leaf=lambda leaf: leaf is None)
+"""`equinox.tree_at`, also in place of None."""
+
+
 def joined(grids: Grid) -> tuple[Grid, Grid]:
     """Grids of one shape, which come with a leading axis, in common arrays, so that rays on any of them make up one batch.
 
@@ -153,10 +157,9 @@ def joined(grids: Grid) -> tuple[Grid, Grid]:
     def of_all(leaf: jax.Array) -> jax.Array:
         return leaf[0] if leaf.ndim == 1 else leaf.reshape(-1, *leaf.shape[2:])
 
-    at = functools.partial(eqx.tree_at, is_leaf=lambda leaf: leaf is None)
     places = first_places(grids.rows), first_places(grids.pyramid.bounds)
-    grids = at(lambda grid: (grid.first, grid.pyramid.first), grids, places)
-    shared, own = eqx.partition(grids, at(in_common, jax.tree.map(lambda _: False, grids), replace_fn=lambda _: True))
+    grids = put_at(lambda grid: (grid.first, grid.pyramid.first), grids, places)
+    shared, own = eqx.partition(grids, put_at(in_common, jax.tree.map(lambda _: False, grids), replace_fn=lambda _: True))
     return jax.tree.map(of_all, shared), own
 
 

@@ -1,6 +1,5 @@
 """Which triangle does a ray meet? A discrete search: integers come out, which carry no derivative."""
 
-import functools
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +12,7 @@ from jax import lax
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
 from ..xla.kernel import in_parts
-from .grid import Grid, first_places
+from .grid import Grid, first_places, put_at
 from .hit import Hit
 from .walk import Walk, WalkResult, walking
 from .walk_start import walk_start
@@ -116,8 +115,6 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
       rays: in each.
     """
 
-    at = functools.partial(eqx.tree_at, is_leaf=lambda leaf: leaf is None)
-
     def flattened(leaf: jax.Array, per_ray: Any, per_batch: Any) -> jax.Array:
         if not (per_ray or per_batch):
             return leaf
@@ -131,7 +128,7 @@ def _one_batch(walk: Walk, of_ray: Walk, of_batch: Walk, axis_size: int, rays: i
             values, first = part(walk)[0], part(flat)[1]
             begin = jnp.repeat(first_places(values), rays)
             joined = values.reshape(-1), begin if first is None else begin + first
-            flat, differs = at(part, flat, joined), at(part, differs, (False, True))
+            flat, differs = put_at(part, flat, joined), put_at(part, differs, (False, True))
     return flat, differs
 
 

@@ -13,7 +13,7 @@ from small_fits import EVERYTHING, SETTINGS, SIZE, TRUTH, dense, edges_in, expan
 
 import jaxhf
 from jaxhf.fitting.model import normal_matrix as _normal_matrix
-from jaxhf.fitting.model.expansion import Expansion, prior_residuals
+from jaxhf.fitting.model.expansion import prior_residuals
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
 from jaxhf.fitting.model.rows import part_by_heights, pictures_by_heights
 from jaxhf.fitting.model.unknowns import Window
@@ -209,17 +209,16 @@ def test_boundaries_that_stand_elsewhere_widen_deviations(displacement, by_noise
     assert np.mean(plain) == pytest.approx(by_noise_alone, abs=0.03)
 
 
-def test_values_of_pixels_on_boundaries_are_found(monkeypatch):
+def test_values_of_pixels_on_boundaries_are_found():
     """In the order of rows: picture by picture. How far heights move them is the norm of their row of the derivative."""
     here = expanded(scenes(TRUTH), pictures(), **OPTIONS)
     edges = edges_in(np.zeros((3, 1)), np.zeros((3, 1)), [[5], [7], [9]])
     (known,), rows = here.linearised, pictures_by_heights(here)
     assert known is not None
     assert rows is not None
-    left = here.left()
-    monkeypatch.setattr(Expansion, "left", lambda _: left)
-    found = Boundaries(dataclasses.replace(here, linearised=(dataclasses.replace(known, edges=edges),)), rows)
+    left = in_row(here.left())
+    found = Boundaries(dataclasses.replace(here, linearised=(dataclasses.replace(known, edges=edges),)), rows, left)
     np.testing.assert_array_equal(found.rows, [5, 24 * 24 + 7, 2 * 24 * 24 + 9])
     np.testing.assert_allclose(found.reach, np.linalg.norm(rows.toarray(), axis=1)[found.rows], rtol=1e-5)
-    np.testing.assert_array_equal(found.residuals, in_row(left)[found.rows])
-    assert Boundaries(here, rows).displacements(lambda _: pytest.fail("there are none")) == (0.0, [])
+    np.testing.assert_array_equal(found.residuals, left[found.rows])
+    assert Boundaries(here, rows, left).displacements(lambda _: pytest.fail("there are none")) == (0.0, [])

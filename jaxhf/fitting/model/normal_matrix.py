@@ -195,9 +195,9 @@ def in_groups(row: np.ndarray, expansion: Expansion) -> list[Any]:
     return [jnp.asarray(part.reshape(shape)) for part, shape in zip(np.split(row, ends), shapes, strict=True)]
 
 
-def robust_matrix(expansion: Expansion) -> NormalMatrix:
-    """With the weights of the robust loss."""
-    _, _, weights = influence_function(in_row(expansion.left()), expansion.problem.loss_scale)
+def robust_matrix(expansion: Expansion, left: Float[np.ndarray, " rows"]) -> NormalMatrix:
+    """With the weights of the robust loss; `left`: `Expansion.left`, in a row."""
+    _, _, weights = influence_function(left, expansion.problem.loss_scale)
     return NormalMatrix(expansion, np.sqrt(weights), pictures_by_heights(expansion))
 
 

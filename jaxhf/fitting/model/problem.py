@@ -305,6 +305,7 @@ def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknow
             raise ArgumentError("Unknown", "albedo", rule)
         image = known.texels.shape[:2] if isinstance(known, ImageTexture) else shape
         shape = (*(image if unknown.albedo == "map" else (1, 1)), 1 if unknown.albedo_shared else channels)
+        # By NumPy, as what follows: JAX's own ones and zeros are a program for each shape.
         albedo = jax.device_put(np.full(shape, 1 if unknown.albedo_length is None else 0, dtype))
     view = jax.tree.map(lambda unit: jax.device_put(np.zeros((count, unit.size), unit.dtype)), view_unit)
     if view.material is not None:  # which all pictures show

@@ -233,7 +233,8 @@ class WholeStep(NamedTuple):
 
 def whole_step(expansion: Expansion) -> WholeStep:
     """`expansion`: one that `has_rows`, all of whose modes are varied."""
-    left, matrix = in_row(expansion.left()), robust_matrix(expansion)
+    left = in_row(expansion.left())
+    matrix = robust_matrix(expansion, left)
     gradient = matrix.gradient(matrix.roots * left)
     change = matrix.solved(-gradient, _WHOLE_TOLERANCE)
     softened = matrix.roots * left**2  # the squares of `soften`

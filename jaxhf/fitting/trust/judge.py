@@ -221,8 +221,10 @@ def standard_deviations(expansion: Expansion, count: int, report: Callable[[Draw
     Raises:
       KeyboardInterrupt: Ctrl-C before there were two draws, or one of displaced boundaries.
     """
-    matrix = robust_matrix(expansion)
-    boundaries, tolerance = (None, _TOLERANCE) if matrix.rows is None else (Boundaries(expansion, matrix.rows), _NEAR_TOLERANCE)
+    left, boundaries, tolerance = in_row(expansion.left()), None, _TOLERANCE
+    matrix = robust_matrix(expansion, left)
+    if matrix.rows is not None:
+        boundaries, tolerance = Boundaries(expansion, matrix.rows, left), _NEAR_TOLERANCE
     changes, begin = [], time.perf_counter()
     try:
         while len(changes) < count:
@@ -287,14 +289,14 @@ class Boundaries:
     equation of restricted maximum likelihood for a variance component, made robust by Huber's proposal 2 (Richardson and
     Welsh, Biometrics 51, 1429, 1995). Heights were fitted without τ, so their covariance is H⁻¹ Jᵀ diag(s²) J H⁻¹.
 
-    `rows`: `pictures_by_heights` of the expansion.
+    `rows`, `left`: `pictures_by_heights` of the expansion, and `Expansion.left` in a row.
     """
 
-    def __init__(self, expansion: Expansion, rows: Any):
+    def __init__(self, expansion: Expansion, rows: Any, left: Float[np.ndarray, " rows"]):
         reach = np.sqrt(np.asarray(rows.power(2).sum(axis=1)).ravel())
         self.rows = np.flatnonzero((in_row(facts.on_boundaries(expansion)) > 0) & (reach > 0))
         self.reach, self.size = reach[self.rows], reach.size
-        self.residuals = in_row(expansion.left())[self.rows]
+        self.residuals = left[self.rows]
         self.most = float(expansion.problem.loss_scale) ** 2
         self.left: list[np.ndarray] = []  # of simulated noise, on these rows
 
