@@ -7,6 +7,7 @@ needs the bits or the speed of users' programs is marked `optimised`; `--optimis
 import gc
 import os
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -134,6 +135,21 @@ def compilations() -> Iterator[list[str]]:
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield events
     jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.fixture
+def programs(monkeypatch) -> list[tuple[str, bool]]:
+    """Of each program that jaxhf has compiled, the function's name, and whether another thread did it."""
+    from jaxhf.xla.kept import Program  # not before annotations are checked
+
+    found, stored = [], Program._stored
+
+    def noted(self, *args):
+        found.append((self.name.rpartition(".")[2], threading.current_thread() is not threading.main_thread()))
+        return stored(self, *args)
+
+    monkeypatch.setattr(Program, "_stored", noted)
+    return found
 
 
 @pytest.fixture

@@ -92,9 +92,56 @@ def _is_right(name: str) -> bool:
     return _is_known({"xla_cpu_use_fusion_emitters": False})
 
 
+class Compiled:
+    """A function by programs that jaxhf compiles; see `compiled`."""
+
+    def __init__(self, fun: Callable[..., Any], jit: Callable[..., Any], newer: bool | None, options: dict[str, Any]):
+        self.fun, self.jit, self.newer, self.options = fun, jit, newer, options
+        self._inside = jit(fun, **options)
+        functools.update_wrapper(self, fun)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        with _garbage_left():
+            if self._serves():
+                return self._kept(*args, **kwargs)
+            if insides() is None or is_traced():
+                return self._inside(*args, **kwargs)
+            return self._alone(*args, **kwargs)
+
+    def meanwhile(self, then: Callable[[Any], None], *args: Any, **kwargs: Any) -> Any:
+        """As called with these arguments. If its program must be compiled first, then meanwhile `then` is called with the
+        `jax.ShapeDtypeStruct`s of what it will return, to `begin` programs that take this."""
+        forms = self.begin(*args, **kwargs)
+        if forms is not None:
+            then(forms)
+        return self(*args, **kwargs)
+
+    def begin(self, *args: Any, **kwargs: Any) -> Any:
+        """See `Kept.begin`; None, too, where programs are not kept."""
+        with _garbage_left():
+            return self._kept.begin(*args, **kwargs) if self._serves() else None
+
+    def _serves(self) -> bool:
+        return insides() is not None and Kept.serves(self.fun) and not (is_traced() and is_staged())
+
+    @functools.cached_property
+    def _given(self) -> dict[str, Any] | None:
+        return None if self.newer is None else compiler_options(self.newer)
+
+    @functools.cached_property
+    def _alone(self) -> Callable[..., Any]:
+        return self.jit(self.fun, compiler_options=self._given, **self.options)
+
+    @functools.cached_property
+    def _kept(self) -> Kept:
+        static = self.options.get("static_argnames", ()) if self.jit is jax.jit else None
+        donated = list(inspect.signature(self.fun).parameters)[1:] if "donate" in self.options else ()
+        return Kept(self.fun, self._given, static, donated)
+
+
 def compiled(
     fun: Callable[..., Any], jit: Callable[..., Any] = jax.jit, newer: bool | None = False, **options: Any
-) -> Callable[..., Any]:
+) -> Compiled:
     """`jit(fun, **options)`, with `compiler_options` where it is called as it is, not as part of another program.
 
     JAX allows them only there; a program round this one may be compiled with them by its own `jax.jit`.
@@ -106,29 +153,4 @@ def compiled(
         fast. None: as XLA compiles by itself.
       options: of `jit`: `static_argnames`, or "all-except-first" as `donate`.
     """
-
-    inside = jit(fun, **options)
-
-    @functools.cache
-    def given() -> dict[str, Any] | None:
-        return None if newer is None else compiler_options(newer)
-
-    @functools.cache
-    def alone() -> Callable[..., Any]:
-        return jit(fun, compiler_options=given(), **options)
-
-    @functools.cache
-    def kept() -> Kept:
-        static = options.get("static_argnames", ()) if jit is jax.jit else None
-        donated = list(inspect.signature(fun).parameters)[1:] if "donate" in options else ()
-        return Kept(fun, given(), static, donated)
-
-    @functools.wraps(fun)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        with _garbage_left():
-            serves = insides() is not None and Kept.serves(fun)
-            if insides() is None or (is_traced() and (not serves or is_staged())):
-                return inside(*args, **kwargs)
-            return (kept() if serves else alone())(*args, **kwargs)
-
-    return call
+    return Compiled(fun, jit, newer, options)

@@ -153,8 +153,8 @@ def divided(tree: Any, mesh: Mesh) -> Any:
     copied to each."""
 
     def placed(leaf: Any) -> Any:
-        whole = not isinstance(leaf, jax.Array) or leaf.size < _LEAST_DIVIDED or leaf.shape[0] % mesh.devices.size
-        return _placed(leaf, mesh, P() if whole else P(mesh.axis_names))
+        fits = getattr(leaf, "size", 0) >= _LEAST_DIVIDED and leaf.shape[0] % mesh.devices.size == 0
+        return _placed(leaf, mesh, P(mesh.axis_names) if fits else P())
 
     return tree if _at_home(mesh) else jax.tree.map(placed, tree)
 
@@ -167,6 +167,9 @@ def _at_home(mesh: Mesh) -> bool:
 
 def _placed(leaf: Any, mesh: Mesh, place: P) -> Any:
     around = jax.sharding.get_abstract_mesh()
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        kind = mesh.devices.flat[0].default_memory().kind  # which an array's own sharding names
+        return leaf.update(sharding=NamedSharding(mesh, place, memory_kind=kind))
     if not isinstance(leaf, jax.Array):
         return leaf
     traced = isinstance(leaf, Tracer)

@@ -8,34 +8,33 @@ import hashlib
 import inspect
 import os
 import pickle
-import sys
 import threading
 import time
 import warnings
 import zlib
 from collections.abc import Callable, Collection, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache, cached_property
-from importlib.metadata import PackageNotFoundError, version
+from functools import cached_property
 from pathlib import Path
-from types import FunctionType, MethodType, ModuleType
+from types import ModuleType
 from typing import Any
 
 import equinox as eqx
 import jax
 from jax.core import Tracer
-from jax.sharding import Mesh, NamedSharding, SingleDeviceSharding
+from jax.sharding import NamedSharding, SingleDeviceSharding
 
-from . import folder
+from . import folder, identity
 from .plain import insides
 
 LOADED = "/jaxhf/program_loaded"
 """JAX's monitoring is told under this name how long it took to load a program, in seconds."""
 
-_PACKAGE, _IMPORTED = Path(__file__).parents[1], time.time()
 _LOCK = threading.RLock()
+_SWITCH, _WITHIN = threading.Lock(), list[int]()  # of JAX's cache, see `_without_jax_cache`
+_NO_MATTER = "jax_enable_compilation_cache", "jax_transfer_guard"  # to a program
 _PLACES = (NamedSharding, SingleDeviceSharding)
-_OURS = {"jaxhf", "jax", "jaxlib", "equinox", "optimistix", "lineax", "jaxtyping", "numpy", "collections", "builtins"}
 
 
 class Kept:
@@ -76,12 +75,26 @@ class Kept:
         return jax.default_backend() == "cpu" and jax.process_count() == 1
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        program, leaves = self._found(*args, **kwargs)
+        traced = any(isinstance(leaf, Tracer) for leaf in leaves)
+        module = insides()
+        assert module is not None
+        return program.returned(module.call_program(program, leaves) if traced else program(*leaves))
+
+    def begin(self, *args: Any, **kwargs: Any) -> Any:
+        """As `Program.begin`; among the arguments may be `jax.ShapeDtypeStruct`s, for arrays to come."""
+        program, leaves = self._found(*args, **kwargs)
+        forms = None if any(isinstance(leaf, Tracer) for leaf in leaves) else program.begin(*leaves)
+        return None if forms is None else program.returned(forms)
+
+    def _found(self, *args: Any, **kwargs: Any) -> tuple["Program", list[Any]]:
+        """The program for these arguments, and their arrays."""
         given = self.signature.bind(*args, **kwargs).arguments
         static = tuple((name, given.pop(name)) for name in self.static or () if name in given)
         leaves, tree = jax.tree.flatten(given)
         others = {}
         if self.static is None:
-            others = {k: leaf for k, leaf in enumerate(leaves) if not eqx.is_array(leaf)}
+            others = {k: leaf for k, leaf in enumerate(leaves) if not _is_array(leaf)}
             leaves = [leaf for k, leaf in enumerate(leaves) if k not in others]
         module = insides()
         assert module is not None
@@ -93,10 +106,7 @@ class Kept:
         program = self.ready.get(form)
         if program is None:
             program = self.ready.setdefault(form, self._program(static, others, tree, types))
-        traced = any(isinstance(leaf, Tracer) for leaf in leaves)
-        results = module.call_program(program, leaves) if traced else program(*leaves)
-        structure, others = program.outcome
-        return jax.tree.unflatten(structure, _among(others, results))
+        return program, leaves
 
     def _program(self, static: Any, others: dict[int, Any], tree: Any, types: Any) -> "Program":
         def flat(*leaves: Any) -> tuple[list[Any], Any]:
@@ -107,17 +117,21 @@ class Kept:
             return [value for k, value in enumerate(results) if k not in no_arrays], note
 
         name = f"{self.fun.__module__}.{self.fun.__qualname__}"
-        said = {k: _named(value) for k, value in others.items()}
+        said = {k: identity.named(value) for k, value in others.items()}
         places = jax.tree.unflatten(tree, _among(dict.fromkeys(others), range(len(types))))
         donated = tuple(jax.tree.leaves([places[name] for name in self.donated if name in places]))
-        known = repr((name, static, said, tree, _classes(tree), types, self.options, donated))
-        return Program(name, known if _says_all((static, said, tree)) else None, flat, self.options, donated)
+        known = repr((name, static, said, tree, identity.classes(tree), types, self.options, donated))
+        return Program(name, known if identity.says_all((static, said, tree)) else None, flat, self.options, donated)
 
 
 def _type(leaf: Any) -> tuple[Any, ...]:
     """What a trace sees of an array; JAX's own type also has a mesh, which differs between the results of programs."""
     form = jax.typeof(leaf)
     return form.shape, form.dtype, form.weak_type
+
+
+def _is_array(leaf: Any) -> bool:
+    return eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct)
 
 
 def _among(others: dict[int, Any], values: Any) -> list[Any]:
@@ -152,22 +166,45 @@ class Program:
         """
         self.name, self.known, self.fun, self.options, self.donated = name, known, fun, options, donated
         self.note: Any = None
-        self.placed: dict[Any, Callable[..., list[Any]]] = {}
+        self.placed: dict[Any, Any] = {}  # what to call, or a `Future` of it
         self.made_of_it: dict[str, Program] = {}
         self.linear: dict[Any, Any] = {}
 
+    def returned(self, results: list[Any]) -> Any:
+        """What a `Kept` function returns whose program has these results."""
+        structure, others = self._outcome
+        return jax.tree.unflatten(structure, _among(others, results))
+
     @cached_property
-    def outcome(self) -> tuple[Any, dict[int, Any]]:
-        """The structure of what a `Kept` function returns, and what in that is no array."""
+    def _outcome(self) -> tuple[Any, dict[int, Any]]:
         return jax.tree.structure(self.note[0]), self.note[1]
 
     def __call__(self, *leaves: Any) -> list[Any]:
-        place = tuple(leaf.sharding if isinstance(leaf, jax.Array) and leaf.committed else None for leaf in leaves)
+        place = _place(leaves)
         program = self.placed.get(place)
-        if program is None:
-            with _LOCK:  # round JAX's cache, see below
-                program = self.placed.setdefault(place, self._compiled(place, leaves))
+        if isinstance(program, Future):
+            program = self.placed[place] = None if program.exception() else program.result()
+        if program is None:  # or it could not be compiled elsewhere, which is tried here once more
+            with _LOCK:
+                program = self.placed[place] = self.placed.get(place) or self._compiled(place, leaves)
         return program(*leaves)
+
+    def begin(self, *leaves: Any) -> list[Any] | None:
+        """Traces the program and begins to compile it, in another thread; the forms of its results, so that what follows can be
+        traced meanwhile. None where there is nothing to begin: it is there, or another thread has another configuration."""
+        module, place = insides(), _place(leaves)
+        assert module is not None
+        if place in self.placed or module.configuration() != module.untraced(module.configuration):
+            return None
+        with _LOCK:
+            path, key = self._path(place)
+            if place in self.placed or (path is not None and path.exists()):
+                return None
+            traced = self._traced(leaves)
+            lowered, other = traced.lower(), ThreadPoolExecutor(1)
+            self.placed[place] = other.submit(self._stored, lowered, path, key)
+            other.shutdown(wait=False)
+        return [jax.ShapeDtypeStruct(form.shape, form.dtype, weak_type=form.weak_type) for form in traced.jaxpr.out_avals]
 
     @cached_property
     def staged(self) -> Callable[..., list[Any]]:
@@ -208,11 +245,19 @@ class Program:
             except Exception as error:  # whatever a damaged file leads to
                 self._warn("reading", error)
 
+        return self._stored(self._traced(leaves).lower(), path, key)
+
+    def _traced(self, leaves: Any) -> Any:
         def flat(*leaves: Any) -> list[Any]:
             return self.traced(*leaves)
 
         flat.__name__ = self.name.rpartition(".")[2]
-        lowered = jax.jit(flat, compiler_options=self.options, donate_argnums=self.donated).lower(*leaves)
+        return jax.jit(flat, compiler_options=self.options, donate_argnums=self.donated).trace(*leaves)
+
+    def _stored(self, lowered: Any, path: Path | None, key: str) -> Callable[..., list[Any]]:
+        """Compiled, and put into the folder."""
+        module = insides()
+        assert module is not None
         if path is None:
             return lowered.compile()
         with _without_jax_cache(module):
@@ -227,11 +272,12 @@ class Program:
     def _path(self, place: tuple[Any, ...]) -> tuple[Path | None, str]:
         """Its file, and a hash of all that it is found by; None: it cannot be kept."""
         kept_in = None if self.known is None else folder.current()
-        source = None if kept_in is None else _source()
+        source = None if kept_in is None else identity.source()
         if kept_in is None or source is None or not all(at is None or isinstance(at, _PLACES) for at in place):
             return None, ""
-        config = [(name, getattr(jax.config, name, value)) for name, value in sorted(jax.config.values.items())]
-        known = repr((self.known, list(map(_devices, place)), config, os.environ.get("XLA_FLAGS"), jax.devices()))
+        names = sorted(name for name in jax.config.values if not name.startswith(_NO_MATTER))
+        config = [(name, getattr(jax.config, name, jax.config.values[name])) for name in names]
+        known = repr((self.known, list(map(identity.devices, place)), config, os.environ.get("XLA_FLAGS"), jax.devices()))
         key = hashlib.sha256(known.encode() + source).hexdigest()
         return kept_in / f"{self.name}-{key[:32]}", key
 
@@ -241,86 +287,37 @@ class Program:
         warnings.warn(f"{said}: {type(error).__name__}: {error}", stacklevel=3)
 
 
-def _named(value: Any) -> Any:
-    """A module's function by its name, else the value."""
-    if not isinstance(value, FunctionType) or not _is_code_of_ours(value.__module__):
-        return value
-    is_there = getattr(sys.modules.get(value.__module__), value.__qualname__, None) is value  # and nobody has replaced it
-    return f"{value.__module__}.{value.__qualname__}" if is_there else value
+def _place(leaves: Any) -> tuple[Any, ...]:
+    """Where arrays are to be, None for those that may be anywhere."""
 
+    def of(leaf: Any) -> Any:
+        is_told = leaf.committed if isinstance(leaf, jax.Array) else isinstance(leaf, jax.ShapeDtypeStruct)
+        return leaf.sharding if is_told else None
 
-def _devices(at: Any) -> Any:
-    """A place with the numbers of its devices in their order, which its `repr` does not name."""
-    devices = at.mesh.devices.flat if isinstance(at, NamedSharding) else at.device_set if at else ()  # pyright: ignore
-    return at, [device.id for device in devices]
-
-
-def _classes(tree: Any) -> list[str]:
-    """The classes of a structure with their modules, which its `repr` does not name."""
-    node = tree.node_data()
-    own = [] if node is None else [f"{node[0].__module__}.{node[0].__qualname__}"]
-    return own + [name for child in tree.children() for name in _classes(child)]
-
-
-def _says_all(given: Any) -> bool:
-    """Whether the `repr` of these static values and structures says all about them, in any process.
-
-    Not where a class is of somebody else's code, which may change; where a `Mesh` has other devices than the first ones,
-    which it does not name; or where something is named by its address, or an array is too long to be written out.
-    """
-    said = repr(given)
-    return " at 0x" not in said and "..." not in said and _is_ours(given)
-
-
-def _is_ours(value: Any) -> bool:
-    if isinstance(value, MethodType):
-        return False
-    if isinstance(value, Mesh):
-        return list(value.devices.ravel()) == jax.devices()[: value.devices.size]
-    if isinstance(value, jax.tree_util.PyTreeDef):
-        node = value.node_data()
-        return node is None or (_is_ours(node) and all(map(_is_ours, value.children())))
-    if isinstance(value, dict):
-        return all(map(_is_ours, value.values()))
-    if isinstance(value, tuple | list | frozenset):
-        return _is_code_of_ours(type(value).__module__) and all(map(_is_ours, value))
-    return _is_code_of_ours((value if isinstance(value, type) else type(value)).__module__)
-
-
-def _is_code_of_ours(module: str) -> bool:
-    return module.partition(".")[0] in _OURS
+    return tuple(map(of, leaves))
 
 
 @contextmanager
 def _without_jax_cache(module: ModuleType) -> Iterator[None]:
-    """A program out of JAX's cache could not be stored again: XLA leaves its kernels out, without an error."""
-    before = jax.config.values["jax_enable_compilation_cache"]
-    if not (before and jax.config.values["jax_compilation_cache_dir"]):
-        yield
-        return
-    jax.config.update("jax_enable_compilation_cache", False)
-    module.compilation_cache.reset_cache()
+    """A program out of JAX's cache could not be stored again: XLA leaves its kernels out, without an error.
+
+    The cache is off for all threads from the first that is within on to the last.
+    """
+
+    def switch(on: bool) -> None:
+        jax.config.update("jax_enable_compilation_cache", on)
+        module.compilation_cache.reset_cache()
+
+    with _SWITCH:
+        has_one = jax.config.values["jax_enable_compilation_cache"] and jax.config.values["jax_compilation_cache_dir"]
+        switches = bool(_WITHIN or has_one)
+        if switches:
+            _WITHIN.append(threading.get_ident())
+            switch(False)
     try:
         yield
     finally:
-        jax.config.update("jax_enable_compilation_cache", before)
-        module.compilation_cache.reset_cache()
-
-
-def _source() -> bytes | None:
-    """A hash of all that traces: this package, and those that its modules and steps are made of; None where nothing tells, or
-    where files have changed since they were imported."""
-    try:
-        files = sorted(_PACKAGE.rglob("*.py"))
-        is_as_imported = files and max(path.stat().st_mtime for path in files) < _IMPORTED
-        return _hashed(tuple(files)) if is_as_imported else None
-    except (OSError, PackageNotFoundError):
-        return None
-
-
-@cache
-def _hashed(files: tuple[Path, ...]) -> bytes:
-    said = hashlib.sha256(repr([version(name) for name in ("equinox", "optimistix", "lineax")]).encode())
-    for path in files:
-        said.update(f"{path.relative_to(_PACKAGE)}".encode() + path.read_bytes())
-    return said.digest()
+        with _SWITCH:
+            if switches:
+                _WITHIN.remove(threading.get_ident())
+                switch(not _WITHIN)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxhf.xla.compilation import compiled
-from jaxhf.xla.kept import LOADED
+from jaxhf.xla.kept import LOADED, Program
 
 traced = []
 
@@ -26,7 +26,7 @@ def scaled(pair, factor, *, power):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setattr("jaxhf.xla.folder._chosen", [tmp_path])
-    monkeypatch.setattr("jaxhf.xla.kept._is_code_of_ours", lambda module: True)
+    monkeypatch.setattr("jaxhf.xla.identity._is_code_of_ours", lambda module: True)
     traced.clear()
     return tmp_path
 
@@ -55,11 +55,58 @@ def test_a_kept_program_is_not_traced_again(folder):
     assert traced == [2, 3, 2, 2, 2]
 
 
+def call_both():
+    """What follows is begun by the forms of what it will take."""
+    first, second, told = compiled(scaled, static_argnames=("power",)), compiled(of_pair), []
+
+    def begin(forms):
+        told.append(forms)
+        pair, _ = second.begin(forms[0], np.float32(3))
+        assert (pair.a.shape, pair.b.dtype, pair.name) == ((3,), np.float32, "returned")
+
+    pair, _ = first.meanwhile(begin, Pair(jnp.arange(3.0), jnp.ones(2)), np.float32(2), power=2)
+    found, _ = second(pair, np.float32(3))
+    np.testing.assert_allclose(found.a, 3 * np.sin(2 * np.arange(3.0) ** 2), rtol=1e-5)
+    return told
+
+
+def test_what_follows_is_compiled_meanwhile(folder, programs):
+    """And once; where the first is found in the folder, nothing is begun."""
+    ((pair, more),) = call_both()
+    assert (type(pair.a), pair.a.shape, more["sum"].shape) == (jax.ShapeDtypeStruct, (3,), ())
+    assert (sorted(programs), traced) == ([("of_pair", True), ("scaled", True)], [2, "pair"])
+    assert len(list(folder.iterdir())) == 2
+    assert jax.config.values["jax_enable_compilation_cache"]  # which is off while programs are compiled to be kept
+    assert (call_both(), traced) == ([], [2, "pair"])
+
+
+def test_what_other_threads_would_compile_otherwise_is_not_begun(folder, programs):
+    with jax.default_matmul_precision("float32"):
+        assert call_both() == []
+    assert [other for _, other in programs] == [False, False]
+
+
+def test_what_goes_wrong_elsewhere_is_raised_where_it_is_called(folder, monkeypatch):
+    """Where it is tried once more."""
+    stored, fails = Program._stored, [True, True, True]
+
+    def unless_it_fails(self, *args):
+        if fails and fails.pop():
+            raise RuntimeError("no memory")
+        return stored(self, *args)
+
+    monkeypatch.setattr(Program, "_stored", unless_it_fails)
+    with pytest.raises(RuntimeError, match="no memory"):
+        call_both()
+    call_both()
+    assert (len(fails), len(list(folder.iterdir()))) == (0, 2)
+
+
 def test_another_source_or_configuration_is_traced_again(folder, monkeypatch):
     call(np.arange(3.0))
     with jax.default_matmul_precision("float32"):
         call(np.arange(3.0))
-    monkeypatch.setattr("jaxhf.xla.kept._source", lambda: b"another")
+    monkeypatch.setattr("jaxhf.xla.identity.source", lambda: b"another")
     call(np.arange(3.0))
     assert traced == [2, 2, 2]
 
@@ -86,7 +133,7 @@ def test_what_jax_has_kept_is_not_kept_again(folder, monkeypatch):
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     try:
         for source in (b"old", b"new", b"new"):
-            monkeypatch.setattr("jaxhf.xla.kept._source", lambda source=source: source)
+            monkeypatch.setattr("jaxhf.xla.identity.source", lambda source=source: source)
             call(np.arange(5.0))
     finally:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", before)
