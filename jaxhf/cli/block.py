@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..core.errors import ArgumentError
-from ..rendering.render import Prepared, render
-from ..scene.camera import Perspective, cropped
+from ..rendering.render import Prepared, prepare_to_render, render
+from ..scene.camera import Camera, Perspective, cropped
 from ..scene.heightfield import Heightfield
 from ..scene.light import Directional, Light, Sky
 from ..scene.material import Material, Matte
@@ -26,6 +26,7 @@ _ABOVE, _BELOW = (0.60, 0.72, 0.86), (0.95, 0.95, 0.93)  # the background's high
 _HAZE = (0.78, 0.84, 0.90)
 _SHALLOW, _DEEP = (0.16, 0.38, 0.46), (0.02, 0.09, 0.20)
 _WALLS = (0.27, 0.245, 0.22)
+_AOVS = ("depth",)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +109,11 @@ def lights(field: Heightfield, look: Look) -> list[Light]:
     return [sun, Sky(np.array(_SKY), occlusion=_OCCLUSION) if occluded else Sky(np.array(_EVEN_SKY))]
 
 
+def prepared(scene: Scene, look: Look) -> Prepared:
+    """A `block`, ready for `photograph`."""
+    return prepare_to_render(scene.with_camera(_cameras(scene.camera, look)[0]), aovs=_AOVS)
+
+
 def photograph(
     ready: Prepared, camera: Perspective, look: Look, progress: Callable[[], Any] | None = None
 ) -> Float[np.ndarray, "h w 3"]:
@@ -116,19 +122,24 @@ def photograph(
     Each of a pixel's samples gets haze by its own distance, so it is a picture of its own, from a camera that looks past the
     pixel's centre; `progress` is called after each.
     """
-    side = math.isqrt(look.samples)
     field = ready.scene.heightfields[0]
     ny, nx = field.heights.shape
     size = math.hypot((nx - 1) * field.dx, (ny - 1) * field.dy)
     total = np.zeros((camera.height, camera.width, 3), np.float32)
-    for k in range(side * side):
-        dx, dy = ((k % side + 0.5) / side - 0.5, (k // side + 0.5) / side - 0.5)
-        moved = cropped(camera, dx, dy, camera.width, camera.height)
-        image, aovs = render(ready.with_camera(moved), aovs=("depth",))
+    cameras = _cameras(camera, look)
+    for moved in cameras:
+        image, aovs = render(ready.with_camera(moved), aovs=_AOVS)
         total += _in_haze(np.asarray(image, np.float32), np.asarray(aovs["depth"], np.float32), size, look.haze)
         if progress is not None:
             progress()
-    return total / np.float32(side**2)
+    return total / np.float32(len(cameras))
+
+
+def _cameras(camera: Camera, look: Look) -> list[Camera]:
+    """That of each sample."""
+    side = math.isqrt(look.samples)
+    places = [(k + 0.5) / side - 0.5 for k in range(side)]
+    return [cropped(camera, dx, dy, camera.width, camera.height) for dy in places for dx in places]
 
 
 def _in_haze(

@@ -4,7 +4,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -28,6 +28,8 @@ from ..xla.materialise import materialise
 from .ceiling import Ceiling
 from .localise import precision
 from .world import Ceilings, World, make_ceilings, make_world
+
+Module = TypeVar("Module", bound=eqx.Module)
 
 _LEAST_CELLS, _MOST_CELLS = 2**14, 2**22  # beyond, room takes hundreds of megabytes
 _SPARE = 5 / 4  # of the cells' number: vertices and the bins of a `Ceiling` are more
@@ -188,10 +190,18 @@ def with_shapes_of(scene: Scene, world: World) -> World:
     def with_shape(surface: Surface, shape: Shape) -> Surface:
         if not isinstance(surface, Grid | Walls) or surface.known_shape is not None:
             return surface
-        return dataclasses.replace(surface, known_shape=_known_shape(shape))
+        return _changed(surface, known_shape=_known_shape(shape))
 
     surfaces = tuple(with_shape(surface, obj.shape) for surface, obj in zip(world.surfaces, scene.objects, strict=True))
-    return dataclasses.replace(world, surfaces=surfaces)
+    return _changed(world, surfaces=surfaces)
+
+
+def _changed(module: Module, **fields: Any) -> Module:
+    """As `dataclasses.replace`, but leaves may be of any kind: `jax.ShapeDtypeStruct`s, where a program is only compiled."""
+    new = object.__new__(type(module))
+    for name, value in (vars(module) | fields).items():
+        object.__setattr__(new, name, value)
+    return new
 
 
 def _roomy_walls(walls: Walls, room: Room) -> Walls:
@@ -278,8 +288,8 @@ def of_any_terrain(world: World) -> World:
     leaves, structure = jax.tree.flatten(world)
     if structure not in _FORMS:
         pairs = zip(world.surfaces, _rooms(world.surfaces, squared=False), strict=True)
-        surfaces = (surface if room is None else dataclasses.replace(surface, known_shape=None) for surface, room in pairs)
-        _FORMS[structure] = jax.tree.structure(dataclasses.replace(world, surfaces=tuple(surfaces)))
+        surfaces = (surface if room is None else _changed(surface, known_shape=None) for surface, room in pairs)
+        _FORMS[structure] = jax.tree.structure(_changed(world, surfaces=tuple(surfaces)))
     return jax.tree.unflatten(_FORMS[structure], leaves)
 
 

@@ -3,6 +3,7 @@
 import functools
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,13 +37,31 @@ def picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key
     """The picture ("image") and AOVs, each of shape (h, w, ...)."""
     is_part = is_part_of_more((world, camera))
     if is_part or _are_few(Tiling(camera.width, camera.height, world.settings)):
-        drawn = on_every_device(key, mesh) if world.settings.edge_samples else None  # else the settings draw nothing
-        seen = world if is_part or has_edges(world) else of_any_terrain(world)
-        return trace_picture(seen, camera, aovs, mesh, drawn)
+        return trace_picture(*_at_its_size(world, camera, aovs, mesh, key, is_part))
     if mesh.devices.size > 1:  # of whose parts XLA makes many copies, on each device
         return everywhere(trace_in_parts(world, camera, aovs, mesh, None), mesh)
     parts = [part for _, part in _parts(world, camera, aovs, mesh, _at_once(world.settings, mesh))]
     return _assembled(parts, camera.width, camera.height, world.settings)
+
+
+def begin_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> None:
+    """Begins to compile the program of `picture` and of `trace_in_parts`, for a world whose arrays may be forms of those to
+    come."""
+    if _are_few(Tiling(camera.width, camera.height, world.settings)):
+        trace_picture.begin(*_at_its_size(world, camera, aovs, mesh, key))
+    else:
+        most = _at_once(world.settings, mesh)
+        corners = np.zeros((most, 2), np.int32)
+        _trace_tiles.begin(mesh, of_any_terrain(world), of_any_size(camera), aovs, corners, np.int32(most))
+
+
+def _at_its_size(
+    world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None, is_part: bool = False
+) -> tuple[Any, ...]:
+    """What `trace_picture` takes."""
+    drawn = on_every_device(key, mesh) if world.settings.edge_samples else None  # else the settings draw nothing
+    seen = world if is_part or has_edges(world) else of_any_terrain(world)
+    return seen, camera, aovs, mesh, drawn
 
 
 def _are_few(tiling: Tiling) -> bool:

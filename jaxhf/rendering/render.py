@@ -28,7 +28,7 @@ from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, held_everywhere, on_every_device, prepared_mesh, takes_numbers, where_called
 from ..xla.materialise import unfolded
 from .aovs import known_aovs
-from .picture import picture, trace_in_parts, trace_picture
+from .picture import begin_picture, picture, trace_in_parts, trace_picture
 
 
 class _Given:
@@ -146,9 +146,21 @@ def prepare(
         grid = heightfield_grids(heights.reshape(-1, *heights.shape[-2:]), scene.dx, scene.dy, settings)
         return PreparedHeightfield(scene, settings, grid if heights.ndim > 2 else jax.tree.map(lambda leaf: leaf[0], grid))
     _require_scene("prepare", scene, Scene)
+    return prepare_to_render(scene, settings, mesh)
+
+
+def prepare_to_render(
+    scene: Scene, settings: Settings | None = None, mesh: Mesh | None = None, aovs: tuple[str, ...] | None = None
+) -> Prepared:
+    """As `prepare`; with `aovs` the program for pictures with these is compiled beside that which prepares."""
     mesh = chosen_mesh("prepare", mesh, scene)
     local = on_every_device(localise(scene), mesh)
-    world = held_everywhere(prepared_world(local, resolve_settings(settings or Settings(), scene)), mesh)
+
+    def begin(world: World) -> None:
+        if aovs is not None:
+            begin_picture(world, local.camera, aovs, mesh, None)
+
+    world = held_everywhere(prepared_world(local, resolve_settings(settings or Settings(), scene), mesh, begin), mesh)
     form = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), scene)
     return Prepared(scene.camera, mesh, world, tuple(anchor(scene).tolist()), form, _Given(scene))
 
@@ -195,7 +207,12 @@ def render(
     if isinstance(scene, Scene):
         here = chosen_mesh("render", mesh, (scene, key))
         local = on_every_device(localise(scene), here)
-        world, camera = prepared_world(local, resolve_settings(settings or Settings(), scene)), local.camera
+        camera = local.camera
+
+        def begin(world: World) -> None:
+            begin_picture(world, camera, aovs, here, key)
+
+        world = prepared_world(local, resolve_settings(settings or Settings(), scene), here, begin)
     else:
         here, world = prepared_mesh("render", scene.mesh, mesh, (scene, key)), scene._world
         if settings is not None and resolve_settings(settings, scene._form) != scene.settings:
@@ -263,11 +280,20 @@ _make_world = compiled(_made_world, static_argnames=("rooms", "settings"))
 _make_world_with_horizons = compiled(_made_world, newer=True, static_argnames=("rooms", "settings"))
 
 
-def prepared_world(scene: Scene, settings: Settings) -> World:
-    """Of a `localise`d scene, by one program for all cameras; with room, where programs of its own are to trace it."""
+def prepared_world(
+    scene: Scene, settings: Settings, mesh: Mesh | None = None, then: Callable[[World], None] = lambda world: None
+) -> World:
+    """Of a `localise`d scene, by one program for all cameras; with room, where programs of its own are to trace it.
+
+    If that must be compiled first, `then` is called meanwhile with a world of forms, on a mesh as the scene is.
+    """
     make = _make_world if scene.sky_occlusion is None else _make_world_with_horizons
     if is_traced():
         scene = eqx.tree_at(lambda scene: scene.camera, unfolded(scene), None)
         return make(scene, (), rooms=None, settings=settings)
     seen, sizes, rooms = in_room(scene, settings)
-    return with_shapes_of(scene, make(seen, sizes, rooms=rooms, settings=settings))
+
+    def following(world: World) -> None:
+        then(with_shapes_of(scene, world if mesh is None else on_every_device(world, mesh)))
+
+    return with_shapes_of(scene, make.meanwhile(following, seen, sizes, rooms=rooms, settings=settings))

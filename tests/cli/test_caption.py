@@ -59,7 +59,7 @@ def test_a_slender_terrain_has_its_bar_along_its_length_and_degrees_are_metres()
 def test_the_command(tmp_path, monkeypatch, command):
     """Of noise for a picture, as real ones are those of test_view_command.py."""
     noise = np.random.default_rng(0).uniform(size=(HEIGHT, WIDTH, 3)).astype(np.float32)
-    monkeypatch.setattr(view, "prepare", lambda scene: scene)
+    monkeypatch.setattr(view, "prepared", lambda scene, _: scene)
     monkeypatch.setattr(view, "photograph", lambda *_: noise)
     jaxhf.save_heights(tmp_path / "in.npz", Terrain(np.eye(13, 17, dtype=np.float32), 100.0, 100.0))
     words = ["view", tmp_path / "in.npz", "--size", "240x160", "--preset", "draft", "--devices", 1, "--exaggeration", 2]

@@ -33,8 +33,8 @@ def terrain(tmp_path_factory) -> str:
 def test_films_turn_round_and_have_a_moving_sun(terrain, tmp_path, monkeypatch, command):
     """Each film prepares its terrain once."""
     framing, views = jaxhf.Perspective.framing, []
-    prepare, prepared = view.prepare, []
-    monkeypatch.setattr(view, "prepare", lambda scene: (prepared.append(scene), prepare(scene))[1])
+    prepare, prepared = view.prepared, []
+    monkeypatch.setattr(view, "prepared", lambda scene, look: (prepared.append(scene), prepare(scene, look))[1])
 
     def recorded(field, azimuth, *rest, **options):
         views.append((azimuth, options["around"]))

@@ -45,6 +45,15 @@ def test_heights_come_back_from_a_flat_start(targets):
     assert np.all(found.residuals[0][4:7, 5:9] == 0)
 
 
+def test_what_follows_the_pictures_is_compiled_beside_them(targets, programs):
+    """And no program twice, as if another had been guessed than comes."""
+    jax.clear_caches()
+    jaxhf.fit(scenes(), targets, **OPTIONS)
+    names, beside = [name for name, _ in programs], {name for name, other in programs if other}
+    assert len(names) == len(set(names))
+    assert beside == {"_linearised", "_advance", "_pull", "_pictures"}
+
+
 def test_another_fit_of_the_same_size_compiles_nothing(targets, compilations):
     jaxhf.fit(scenes(), targets, **OPTIONS)
     compilations.clear()

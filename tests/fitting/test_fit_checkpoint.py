@@ -206,7 +206,7 @@ def without_pictures(setattr: Callable[..., None]) -> None:
         loss = 1e6 * jnp.exp(-size / 10)
         return new, Position(there, size), Outcome(loss, jnp.asarray(True), loss, size, 1 / size)
 
-    setattr(_run, "expand", lambda unknowns, problem: Expansion(problem, unknowns, (None,) * len(problem.groups)))
+    setattr(_run, "expand", lambda unknowns, problem, *_: Expansion(problem, unknowns, (None,) * len(problem.groups)))
     setattr(_run, "advance", advance)
     setattr(_run, "first_position", lambda expansion, step_size: Position(expansion.unknowns, step_size, True))
     setattr(_run, "spreads", lambda expansion: np.ones(1))

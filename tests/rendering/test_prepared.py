@@ -1,6 +1,7 @@
 """A scene prepared once for many pictures."""
 
 import copy
+import dataclasses
 import pickle
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import jaxhf
 from jaxhf.core.affine import translate
 from jaxhf.rendering import render
 from jaxhf.scene.procedural import fractal
+from jaxhf.xla.compilation import Compiled
 from jaxhf.xla.devices import local_mesh
 
 CORNER = (5e6, 4.5e6)  # far from the origin: the camera has to be moved in double precision
@@ -44,11 +46,31 @@ def test_another_camera_compiles_nothing_and_moves_the_picture(compilations):
     assert np.abs(np.asarray(moved) - np.asarray(first)).max() > 0.1
 
 
+@pytest.mark.parametrize("side", [24, 140])  # the latter has more tiles than a program for its size traces
+@pytest.mark.parametrize("aovs", [(), AOVS])
+def test_the_picture_is_compiled_beside_the_world(programs, side, aovs):
+    """By `render`, and by `jaxhf view`; and neither of them twice."""
+    seen = scene().with_camera(dataclasses.replace(camera(0.0), width=side, height=side))
+    expected = ["_made_world", "trace_picture" if side == 24 else "trace_tiles"]
+    for make in (lambda: seen, lambda: render.prepare_to_render(seen, SETTINGS, aovs=aovs)):
+        jax.clear_caches()
+        programs.clear()
+        jaxhf.render(make(), SETTINGS, aovs=aovs)
+        assert sorted(name for name, other in programs if other) == expected
+        assert {name for name, other in programs if not other} <= {"_assembled"}
+
+
 @pytest.mark.deep
 def test_another_light_keeps_the_hidden_sky(monkeypatch):
     """The same bits as the scene in that light prepared anew; another occlusion is looked for."""
-    looks, make = [], render._make_world_with_horizons
-    monkeypatch.setattr(render, "_make_world_with_horizons", lambda *args, **named: looks.append(args) or make(*args, **named))
+    looks, meanwhile = [], Compiled.meanwhile
+
+    def noted(self, *args, **named):
+        if self is render._make_world_with_horizons:
+            looks.append(args)
+        return meanwhile(self, *args, **named)
+
+    monkeypatch.setattr(Compiled, "meanwhile", noted)
     sky = jaxhf.Sky(0.5, occlusion=4)
     first, then = (scene().with_lights([jaxhf.Directional((x, -1, 0.3)), sky]) for x in (1, -1))
     prepared = jaxhf.prepare(first, SETTINGS)

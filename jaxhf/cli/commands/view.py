@@ -20,14 +20,14 @@ from ...io.terrain.drape import load_drape
 from ...io.terrain.load import jacksboro_file, load_heights
 from ...io.terrain.terrain import Terrain
 from ...maps.relief import color_relief
-from ...rendering.render import Prepared, prepare
+from ...rendering.render import Prepared
 from ...scene.camera import Perspective
 from ...scene.heightfield import Heightfield
 from ...scene.material import SCATTERING
 from ...scene.sun import sun, utc
 from ...xla.devices import local_mesh
 from .. import arguments, limits
-from ..block import Look, block, exaggeration, has_sea, lights, photograph, with_water
+from ..block import Look, block, exaggeration, has_sea, lights, photograph, prepared, with_water
 from ..caption import annotated
 from ..catalogue import PRESETS
 from ..overwriting import require_no_input
@@ -107,7 +107,7 @@ def run(options: argparse.Namespace) -> None:
     camera, look = frames[0]
     scene = block(field, colours, camera, look, base, SCATTERING[options.material])
     limits.require_memory(scene, local_mesh().size)
-    ready, said = prepare(scene), "{} x {} pixels".format(*options.size)
+    ready, said = prepared(scene, look), "{} x {} pixels".format(*options.size)
     if film:
         _film(output, ready, frames)
         said = f"{len(frames)} frames of {said}"

@@ -107,11 +107,21 @@ class Expansion(eqx.Module):
         return np.stack(found), of_others
 
 
-def expand(unknowns: Unknowns, problem: Problem) -> Expansion:
-    """The problem about these unknowns: its pictures are rendered here, by one program."""
+def expand(unknowns: Unknowns, problem: Problem, then: Callable[[Expansion], None] = lambda about: None) -> Expansion:
+    """The problem about these unknowns: its pictures are rendered here, by one program.
+
+    If that must be compiled first, other programs are meanwhile, and `then` is called with an expansion of forms alone.
+    """
     # What enters a compiled program must lie in the same places each time, or it is compiled again for the other ones.
     unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
-    return Expansion(problem, unknowns, _linearised(unknowns, problem))
+
+    def begin(linearised: tuple[Linearised | None, ...]) -> None:
+        about = on_every_device(Expansion(problem, unknowns, linearised), problem.mesh)
+        then(about)
+        _pull.begin(about, [group.targets for group in problem.groups])
+        _pictures.begin(about)
+
+    return Expansion(problem, unknowns, _linearised.meanwhile(begin, unknowns, problem))
 
 
 def residuals(unknowns: Unknowns, about: Expansion) -> tuple[Any, None]:

@@ -138,18 +138,23 @@ def first_position(expansion: Expansion, step_size: Float[Array, ""]) -> Any:
     The next step evaluates there, and always accepts: the state is then, to the bit, what it was after the step that reached
     them, if 1 / λ is the same. So a checkpoint need not hold linearised pictures.
     """
-    leaves, structure = jax.tree.flatten(expansion)
-    forms = tuple(_shape_of(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves)
-    if (module := insides()) is not None:
-        traced_in = module.configuration(), module.generation()
-    else:
-        traced_in = jax.config.jax_default_matmul_precision, jax.sharding.get_abstract_mesh()  # pyright: ignore
-    empty = _empty(_form(structure, forms, traced_in))
+    empty = _empty(_form_of(expansion))
     begin = jnp.ones_like(empty.first_step), expansion.unknowns, step_size.astype(empty.search_state.step_size.dtype)
     return eqx.tree_at(lambda state: (state.first_step, state.y_eval, state.search_state.step_size), empty, begin)
 
 
-def _shape_of(array: AnyArray) -> jax.ShapeDtypeStruct:
+def _form_of(expansion: Expansion) -> Any:
+    """That of optimistix's state, see `_form`."""
+    leaves, structure = jax.tree.flatten(expansion)
+    forms = tuple(_shape_of(leaf) if hasattr(leaf, "shape") else leaf for leaf in leaves)
+    if (module := insides()) is not None:
+        traced_in = module.configuration(), module.generation()
+    else:
+        traced_in = jax.config.jax_default_matmul_precision, jax.sharding.get_abstract_mesh()  # pyright: ignore
+    return _form(structure, forms, traced_in)
+
+
+def _shape_of(array: AnyArray | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
     """In the precision in which JAX takes it."""
     form = jax.typeof(array)
     return jax.ShapeDtypeStruct(form.shape, form.dtype, weak_type=form.weak_type)
@@ -180,14 +185,30 @@ def advance(
 
     What the old state holds of J makes room for that of the new one: it is gone.
     """
-    exactly = (_TOLERANCE, _ITERATIONS) if expansion.problem.albedo is None else (_FIELD_TOLERANCE, _FIELD_ITERATIONS)
-    solver = LevenbergMarquardt(rejections, others, exactly)
-    of_j, rest = _of_j(position)
-    kept = on_every_device((solver, unknowns, rest, expansion), expansion.problem.mesh)
-    new, arrays, outcome = _advance(kept, divided(of_j, expansion.problem.mesh))
+    new, arrays, outcome = _advance(*_placed(unknowns, position, expansion, others, rejections))
     # What else the state holds, functions among it, stays as it is, and could not be kept with a compiled program.
     following, (leaves, structure) = iter(arrays), jax.tree.flatten(position)
     return new, jax.tree.unflatten(structure, [next(following) if eqx.is_array(leaf) else leaf for leaf in leaves]), outcome
+
+
+def begin_steps(expansion: Expansion) -> None:
+    """Begins to compile the program of `advance`, for an expansion whose pictures may be forms of those to come."""
+
+    def typed(leaf: Any) -> Any:
+        return leaf.update(weak_type=False) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
+
+    unknowns, position = expansion.unknowns, jax.tree.map(typed, _form_of(expansion))  # of arrays as `_empty` makes them
+    others = jax.tree.map(np.asarray, unknowns.without_modes())
+    _advance.begin(*_placed(unknowns, position, expansion, others, 0))
+
+
+def _placed(unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int) -> tuple[Any, Any]:
+    """What `_advance` takes."""
+    exactly = (_TOLERANCE, _ITERATIONS) if expansion.problem.albedo is None else (_FIELD_TOLERANCE, _FIELD_ITERATIONS)
+    solver = LevenbergMarquardt(rejections, others, exactly)
+    of_j, rest = _of_j(position)
+    mesh = expansion.problem.mesh
+    return on_every_device((solver, unknowns, rest, expansion), mesh), divided(of_j, mesh)
 
 
 def _of_j(position: Any) -> tuple[Any, Any]:
