@@ -38,6 +38,7 @@ def _differentiated(primals: Any, tangents: Any, *, program: Program) -> tuple[l
         return values, _zeros(values)
     if any(isinstance(slope, Tracer) for slope in moves):
         storing = _storing(program, moving)
+        _begin(program, moving, primals)
         results = _call.bind(*primals, program=storing)
         moved, places, program.note = storing.note
         values, stored = results[: len(moved)], all_stored(results[len(moved) :], places, primals)
@@ -99,6 +100,19 @@ def _storing(program: Program, moving: _Moving) -> Program:
     return program.derived(f"{moving} linearised", storing)
 
 
+def _begin(program: Program, moving: _Moving, primals: Any) -> None:
+    """Begins to compile what differentiates in reverse mode, which most who ask for a linear function want; on one device."""
+    if any(isinstance(value, Tracer) or (isinstance(value, jax.Array) and value.committed) for value in primals):
+        return
+    forms = _storing(program, moving).begin(*primals)
+    if forms is None:
+        return
+    moved, places, program.note = _storing(program, moving).note
+    types, values = tuple(map(jax.typeof, primals)), forms[: len(moved)]
+    stored = all_stored(forms[len(moved) :], places, primals)
+    _transposed_program(program, moving, types).begin(*stored, *chosen(moved, values))
+
+
 def _linear_function(program: Program, moving: _Moving, types: Any) -> tuple[Any, _Moving]:
     """The linear function's structure, into which what it stores is put, and which of its results are not zero."""
     if moving not in program.linear:  # the linearised program was found in the folder
@@ -121,17 +135,21 @@ def _linear_program(program: Program, moving: _Moving, types: Any, **_: Any) -> 
     return program.derived(f"{moving} linear", lambda *leaves: (_pushing(program, moving, types)(*leaves), None))
 
 
-def _transposed(cotangents: Any, *leaves: Any, program: Program, moving: _Moving, types: Any, **_: Any) -> list[Any]:
+def _transposed_program(program: Program, moving: _Moving, types: Any) -> Program:
     def pulled(*leaves: Any) -> tuple[list[Any], None]:
         count = _linear_function(program, moving, types)[0].num_leaves
         stored, given = leaves[:count], leaves[count:]
         slopes = functools.partial(_pushing(program, moving, types), *stored)
         return list(jax.linear_transpose(slopes, *chosen(moving, types))(list(given))), None
 
+    return program.derived(f"{moving} transposed", pulled)
+
+
+def _transposed(cotangents: Any, *leaves: Any, program: Program, moving: _Moving, types: Any, **_: Any) -> list[Any]:
     count = len(leaves) - sum(moving)
     stored, moves = leaves[:count], leaves[count:]  # of these some may be known
     given = map(ad.instantiate_zeros, cotangents)
-    results = _call.bind(*stored, *given, program=program.derived(f"{moving} transposed", pulled))
+    results = _call.bind(*stored, *given, program=_transposed_program(program, moving, types))
     own = [value if ad.is_undefined_primal(move) else None for move, value in zip(moves, results, strict=True)]
     return [None] * count + own
 

@@ -231,6 +231,19 @@ def derivatives(a):
     )
 
 
+def test_reverse_mode_is_compiled_beside_what_it_needs(folder, programs):
+    """Each program once. Forward mode needs one."""
+    keeps, a = compiled(of_pair), jnp.arange(3.0)
+
+    def loss(a):
+        return jnp.sum(keeps(Pair(a, jnp.ones(2)), np.float32(3))[0].a)
+
+    np.testing.assert_allclose(jax.grad(loss)(a), 3 * np.cos(np.arange(3)), rtol=1e-5)
+    assert programs == [("of_pair", True), ("of_pair", True)]
+    np.testing.assert_allclose(jax.jvp(loss, (a,), (jnp.ones(3),))[1], 3 * np.cos(np.arange(3)).sum(), rtol=1e-5)
+    assert programs[2:] == [("of_pair", False)]
+
+
 def test_a_batch_compiles_once():
     keeps, a = compiled(of_pair), jnp.ones((4, 3))
 
