@@ -44,21 +44,21 @@ def picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key
     return _assembled(parts, camera.width, camera.height, world.settings)
 
 
-def begin_picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> None:
-    """Begins to compile the program of `picture` and of `trace_in_parts`, for a world whose arrays may be forms of those to
-    come."""
+def compile_picture_ahead(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None) -> None:
+    """The program of `picture` and, without a key, of `trace_in_parts`, for a world whose arrays may be forms of those to come,
+    see `Compiled.compile_ahead`."""
     if _are_few(Tiling(camera.width, camera.height, world.settings)):
-        trace_picture.begin(*_at_its_size(world, camera, aovs, mesh, key))
+        trace_picture.compile_ahead(*_at_its_size(world, camera, aovs, mesh, key))
     else:
         most = _at_once(world.settings, mesh)
         corners = np.zeros((most, 2), np.int32)
-        _trace_tiles.begin(mesh, of_any_terrain(world), of_any_size(camera), aovs, corners, np.int32(most))
+        _trace_tiles.compile_ahead(mesh, of_any_terrain(world), of_any_size(camera), aovs, corners, np.int32(most))
 
 
 def _at_its_size(
     world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key: jax.Array | None, is_part: bool = False
 ) -> tuple[Any, ...]:
-    """What `trace_picture` takes."""
+    """What `trace_picture` takes; `is_part`: of a program or a derivative of more, see `is_part_of_more`."""
     drawn = on_every_device(key, mesh) if world.settings.edge_samples else None  # else the settings draw nothing
     seen = world if is_part or has_edges(world) else of_any_terrain(world)
     return seen, camera, aovs, mesh, drawn
@@ -121,7 +121,7 @@ def trace_in_parts(
     tiling, most = Tiling(camera.width, camera.height, world.settings), _at_once(world.settings, mesh)
     pixels, found = tiling.width * tiling.height, {}
     if _are_few(tiling):
-        found = jax.device_get(trace_picture(of_any_terrain(world), camera, aovs, mesh, None))
+        found = jax.device_get(trace_picture(*_at_its_size(world, camera, aovs, mesh, None)))
         if progress is not None:
             progress(pixels, pixels)
         return found

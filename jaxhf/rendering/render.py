@@ -28,7 +28,7 @@ from ..xla.compilation import compiled, is_traced
 from ..xla.devices import chosen_mesh, held_everywhere, on_every_device, prepared_mesh, takes_numbers, where_called
 from ..xla.materialise import unfolded
 from .aovs import known_aovs
-from .picture import begin_picture, picture, trace_in_parts, trace_picture
+from .picture import compile_picture_ahead, picture, trace_in_parts, trace_picture
 
 
 class _Given:
@@ -156,11 +156,12 @@ def prepare_to_render(
     mesh = chosen_mesh("prepare", mesh, scene)
     local = on_every_device(localise(scene), mesh)
 
-    def begin(world: World) -> None:
+    def compile_ahead(world: World) -> None:
         if aovs is not None:
-            begin_picture(world, local.camera, aovs, mesh, None)
+            compile_picture_ahead(world, local.camera, aovs, mesh, None)
 
-    world = held_everywhere(prepared_world(local, resolve_settings(settings or Settings(), scene), mesh, begin), mesh)
+    world = prepared_world(local, resolve_settings(settings or Settings(), scene), mesh, compile_ahead)
+    world = held_everywhere(world, mesh)
     form = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), scene)
     return Prepared(scene.camera, mesh, world, tuple(anchor(scene).tolist()), form, _Given(scene))
 
@@ -209,10 +210,10 @@ def render(
         local = on_every_device(localise(scene), here)
         camera = local.camera
 
-        def begin(world: World) -> None:
-            begin_picture(world, camera, aovs, here, key)
+        def compile_ahead(world: World) -> None:
+            compile_picture_ahead(world, camera, aovs, here, key if progress is None else None)
 
-        world = prepared_world(local, resolve_settings(settings or Settings(), scene), here, begin)
+        world = prepared_world(local, resolve_settings(settings or Settings(), scene), here, compile_ahead)
     else:
         here, world = prepared_mesh("render", scene.mesh, mesh, (scene, key)), scene._world
         if settings is not None and resolve_settings(settings, scene._form) != scene.settings:

@@ -110,16 +110,16 @@ class Compiled:
 
     def meanwhile(self, then: Callable[[Any], None], *args: Any, **kwargs: Any) -> Any:
         """As called with these arguments. If its program must be compiled first, then meanwhile `then` is called with the
-        `jax.ShapeDtypeStruct`s of what it will return, to `begin` programs that take this."""
-        forms = self.begin(*args, **kwargs)
-        if forms is not None:
-            then(forms)
-        return self(*args, **kwargs)
-
-    def begin(self, *args: Any, **kwargs: Any) -> Any:
-        """See `Kept.begin`; None, too, where programs are not kept."""
+        `jax.ShapeDtypeStruct`s of what it will return, to `compile_ahead` programs that take this. Its errors do not count."""
+        if not self._serves():
+            return self(*args, **kwargs)
         with _garbage_left():
-            return self._kept.begin(*args, **kwargs) if self._serves() else None
+            return self._kept.meanwhile(then, *args, **kwargs)
+
+    def compile_ahead(self, *args: Any, **kwargs: Any) -> Any:
+        """See `Kept.compile_ahead`; None, too, where programs are not kept."""
+        with _garbage_left():
+            return self._kept.compile_ahead(*args, **kwargs) if self._serves() else None
 
     def _serves(self) -> bool:
         return insides() is not None and Kept.serves(self.fun) and not (is_traced() and is_staged())

@@ -9,14 +9,18 @@ import re
 import stat
 import sys
 import tempfile
+import threading
 import warnings
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from types import ModuleType
 
 import jax
 
 from .plain import is_asked_for
 
+_SWITCH, _WITHIN = threading.Lock(), list[int]()  # see `without_jax_cache`
 _MOST = 500_000_000  # bytes; a picture's programs take 0.3 million, a gradient's 0.6
 
 _FOLDER = re.compile(r"jaxhf-.*-jax-.*-jaxlib-.*-[0-9a-f]{16}")
@@ -143,3 +147,29 @@ def _remove_oldest(root: Path, most: int) -> None:
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)
             total -= said.st_size
+
+
+@contextlib.contextmanager
+def without_jax_cache(module: ModuleType) -> Iterator[None]:
+    """A program out of JAX's cache could not be stored again: XLA leaves its kernels out, without an error.
+
+    The cache is off for all threads from the first that is within on to the last.
+    """
+
+    def switch(on: bool) -> None:
+        jax.config.update("jax_enable_compilation_cache", on)
+        module.compilation_cache.reset_cache()
+
+    with _SWITCH:
+        has_one = jax.config.values["jax_enable_compilation_cache"] and jax.config.values["jax_compilation_cache_dir"]
+        switches = bool(_WITHIN or has_one)
+        if switches:
+            _WITHIN.append(threading.get_ident())
+            switch(False)
+    try:
+        yield
+    finally:
+        with _SWITCH:
+            if switches:
+                _WITHIN.remove(threading.get_ident())
+                switch(not _WITHIN)

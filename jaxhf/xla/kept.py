@@ -12,9 +12,9 @@ import threading
 import time
 import warnings
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
@@ -32,8 +32,8 @@ LOADED = "/jaxhf/program_loaded"
 """JAX's monitoring is told under this name how long it took to load a program, in seconds."""
 
 _LOCK = threading.RLock()
-_SWITCH, _WITHIN = threading.Lock(), list[int]()  # of JAX's cache, see `_without_jax_cache`
-_NO_MATTER = "jax_enable_compilation_cache", "jax_transfer_guard"  # to a program
+# How names of JAX's settings begin that change no program: `without_jax_cache` and `takes_numbers` set them.
+_NO_MATTER = "jax_enable_compilation_cache", "jax_transfer_guard"
 _PLACES = (NamedSharding, SingleDeviceSharding)
 
 
@@ -75,17 +75,20 @@ class Kept:
         return jax.default_backend() == "cpu" and jax.process_count() == 1
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        program, leaves = self._found(*args, **kwargs)
-        traced = any(isinstance(leaf, Tracer) for leaf in leaves)
-        module = insides()
-        assert module is not None
-        return program.returned(module.call_program(program, leaves) if traced else program(*leaves))
+        return _called(*self._found(*args, **kwargs))
 
-    def begin(self, *args: Any, **kwargs: Any) -> Any:
-        """As `Program.begin`; among the arguments may be `jax.ShapeDtypeStruct`s, for arrays to come."""
+    def compile_ahead(self, *args: Any, **kwargs: Any) -> Any:
+        """As `Program.compile_ahead`; among the arguments may be `jax.ShapeDtypeStruct`s, for arrays to come."""
+        return _compiled_ahead(*self._found(*args, **kwargs))
+
+    def meanwhile(self, then: Callable[[Any], None], *args: Any, **kwargs: Any) -> Any:
+        """See `Compiled.meanwhile`."""
         program, leaves = self._found(*args, **kwargs)
-        forms = None if any(isinstance(leaf, Tracer) for leaf in leaves) else program.begin(*leaves)
-        return None if forms is None else program.returned(forms)
+        forms = _compiled_ahead(program, leaves)
+        if forms is not None:
+            with suppress(Exception):  # which the user is told of by what is called then
+                then(forms)
+        return _called(program, leaves)
 
     def _found(self, *args: Any, **kwargs: Any) -> tuple["Program", list[Any]]:
         """The program for these arguments, and their arrays."""
@@ -122,6 +125,18 @@ class Kept:
         donated = tuple(jax.tree.leaves([places[name] for name in self.donated if name in places]))
         known = repr((name, static, said, tree, identity.classes(tree), types, self.options, donated))
         return Program(name, known if identity.says_all((static, said, tree)) else None, flat, self.options, donated)
+
+
+def _called(program: "Program", leaves: list[Any]) -> Any:
+    module = insides()
+    assert module is not None
+    traced = any(isinstance(leaf, Tracer) for leaf in leaves)
+    return program.returned(module.call_program(program, leaves) if traced else program(*leaves))
+
+
+def _compiled_ahead(program: "Program", leaves: list[Any]) -> Any:
+    forms = None if any(isinstance(leaf, Tracer) for leaf in leaves) else program.compile_ahead(*leaves)
+    return None if forms is None else program.returned(forms)
 
 
 def _type(leaf: Any) -> tuple[Any, ...]:
@@ -166,7 +181,7 @@ class Program:
         """
         self.name, self.known, self.fun, self.options, self.donated = name, known, fun, options, donated
         self.note: Any = None
-        self.placed: dict[Any, Any] = {}  # what to call, or a `Future` of it
+        self.placed: dict[Any, Callable[..., list[Any]] | Future[Any]] = {}
         self.made_of_it: dict[str, Program] = {}
         self.linear: dict[Any, Any] = {}
 
@@ -182,19 +197,16 @@ class Program:
     def __call__(self, *leaves: Any) -> list[Any]:
         place = _place(leaves)
         program = self.placed.get(place)
-        if isinstance(program, Future):
-            program = self.placed[place] = None if program.exception() else program.result()
-        if program is None:  # or it could not be compiled elsewhere, which is tried here once more
-            with _LOCK:
-                program = self.placed[place] = self.placed.get(place) or self._compiled(place, leaves)
+        if program is None or isinstance(program, Future):
+            program = self._awaited(place, leaves)
         return program(*leaves)
 
-    def begin(self, *leaves: Any) -> list[Any] | None:
+    def compile_ahead(self, *leaves: Any) -> list[Any] | None:
         """Traces the program and begins to compile it, in another thread; the forms of its results, so that what follows can be
-        traced meanwhile. None where there is nothing to begin: it is there, or another thread has another configuration."""
+        traced meanwhile. None where it is there or in the folder, or another thread has another configuration or cannot be."""
         module, place = insides(), _place(leaves)
         assert module is not None
-        if place in self.placed or module.configuration() != module.untraced(module.configuration):
+        if place in self.placed or not _threads_compile_alike(module):
             return None
         with _LOCK:
             path, key = self._path(place)
@@ -204,7 +216,29 @@ class Program:
             lowered, other = traced.lower(), ThreadPoolExecutor(1)
             self.placed[place] = other.submit(self._stored, lowered, path, key)
             other.shutdown(wait=False)
-        return [jax.ShapeDtypeStruct(form.shape, form.dtype, weak_type=form.weak_type) for form in traced.jaxpr.out_avals]
+        told = {at for at in place if at is not None}  # where on one device results are then
+        at = told.pop() if len(told) == 1 else None
+        kept_there = at if isinstance(at, SingleDeviceSharding) else None
+        return [
+            jax.ShapeDtypeStruct(form.shape, form.dtype, weak_type=form.weak_type, sharding=kept_there)
+            for form in traced.jaxpr.out_avals
+        ]
+
+    def _awaited(self, place: tuple[Any, ...], leaves: Any) -> Callable[..., list[Any]]:
+        """What is compiled here, or elsewhere: an error there is raised here, and a later call tries again."""
+        with _LOCK:
+            program = self.placed.get(place)
+            if program is None:
+                program = self.placed[place] = self._compiled(place, leaves)
+        if not isinstance(program, Future):
+            return program
+        done = program if program.exception() else program.result()
+        with _LOCK:
+            if self.placed.get(place) is program:
+                self.placed.pop(place)
+                if done is not program:
+                    self.placed[place] = done
+        return program.result()
 
     @cached_property
     def staged(self) -> Callable[..., list[Any]]:
@@ -260,7 +294,7 @@ class Program:
         assert module is not None
         if path is None:
             return lowered.compile()
-        with _without_jax_cache(module):
+        with folder.without_jax_cache(module):
             program = lowered.compile()
         try:
             ids = [device.id for device in program.runtime_executable().local_devices()]  # pyright: ignore
@@ -287,6 +321,14 @@ class Program:
         warnings.warn(f"{said}: {type(error).__name__}: {error}", stacklevel=3)
 
 
+def _threads_compile_alike(module: ModuleType) -> bool:
+    """Whether another thread has the same configuration of JAX; not where the interpreter ends, and begins none."""
+    try:
+        return module.configuration() == module.untraced(module.configuration)
+    except RuntimeError:
+        return False
+
+
 def _place(leaves: Any) -> tuple[Any, ...]:
     """Where arrays are to be, None for those that may be anywhere."""
 
@@ -295,29 +337,3 @@ def _place(leaves: Any) -> tuple[Any, ...]:
         return leaf.sharding if is_told else None
 
     return tuple(map(of, leaves))
-
-
-@contextmanager
-def _without_jax_cache(module: ModuleType) -> Iterator[None]:
-    """A program out of JAX's cache could not be stored again: XLA leaves its kernels out, without an error.
-
-    The cache is off for all threads from the first that is within on to the last.
-    """
-
-    def switch(on: bool) -> None:
-        jax.config.update("jax_enable_compilation_cache", on)
-        module.compilation_cache.reset_cache()
-
-    with _SWITCH:
-        has_one = jax.config.values["jax_enable_compilation_cache"] and jax.config.values["jax_compilation_cache_dir"]
-        switches = bool(_WITHIN or has_one)
-        if switches:
-            _WITHIN.append(threading.get_ident())
-            switch(False)
-    try:
-        yield
-    finally:
-        with _SWITCH:
-            if switches:
-                _WITHIN.remove(threading.get_ident())
-                switch(not _WITHIN)

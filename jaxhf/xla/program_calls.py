@@ -4,6 +4,7 @@ What `jax.grad` and the like do outside of any `jax.jit` then needs no trace whe
 `vmap` a program is traced. Only `insides` imports this module.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -38,7 +39,8 @@ def _differentiated(primals: Any, tangents: Any, *, program: Program) -> tuple[l
         return values, _zeros(values)
     if any(isinstance(slope, Tracer) for slope in moves):
         storing = _storing(program, moving)
-        _begin(program, moving, primals)
+        if not any(hasattr(slope, "batch_dim") for slope in moves):  # of `jacfwd`, which pushes many
+            _compile_reverse_ahead(program, moving, primals)
         results = _call.bind(*primals, program=storing)
         moved, places, program.note = storing.note
         values, stored = results[: len(moved)], all_stored(results[len(moved) :], places, primals)
@@ -100,17 +102,21 @@ def _storing(program: Program, moving: _Moving) -> Program:
     return program.derived(f"{moving} linearised", storing)
 
 
-def _begin(program: Program, moving: _Moving, primals: Any) -> None:
-    """Begins to compile what differentiates in reverse mode, which most who ask for a linear function want; on one device."""
+def _compile_reverse_ahead(program: Program, moving: _Moving, primals: Any) -> None:
+    """Compiles what differentiates in reverse mode beside what stores for it: on one device, where arrays may be anywhere.
+
+    Most who ask for a linear function want that; for who only pushes through that of `jax.linearize` it is too much.
+    """
     if any(isinstance(value, Tracer) or (isinstance(value, jax.Array) and value.committed) for value in primals):
         return
-    forms = _storing(program, moving).begin(*primals)
+    forms = _storing(program, moving).compile_ahead(*primals)
     if forms is None:
         return
     moved, places, program.note = _storing(program, moving).note
     types, values = tuple(map(jax.typeof, primals)), forms[: len(moved)]
     stored = all_stored(forms[len(moved) :], places, primals)
-    _transposed_program(program, moving, types).begin(*stored, *chosen(moved, values))
+    with contextlib.suppress(Exception):  # as of a loop that has no reverse mode: said where that is asked for
+        _transposed_program(program, moving, types).compile_ahead(*stored, *chosen(moved, values))
 
 
 def _linear_function(program: Program, moving: _Moving, types: Any) -> tuple[Any, _Moving]:

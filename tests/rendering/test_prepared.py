@@ -60,6 +60,23 @@ def test_the_picture_is_compiled_beside_the_world(programs, side, aovs):
         assert {name for name, other in programs if not other} <= {"_assembled"}
 
 
+@pytest.mark.parametrize(
+    "given",
+    [{"key": jax.random.key(1)}, {"progress": lambda *_: None}, {"key": jax.random.key(1), "progress": lambda *_: None}],
+)
+def test_with_points_on_edges_the_picture_is_compiled_once(programs, given):
+    jax.clear_caches()
+    jaxhf.render(scene(), dataclasses.replace(SETTINGS, edge_samples=64), **given)
+    assert sorted(programs) == [("_made_world", True), ("trace_picture", True)]
+
+
+def test_for_heights_that_lie_on_a_device_the_picture_is_compiled_once(programs):
+    jax.clear_caches()
+    heights = jax.device_put(scene().heights, jax.devices()[0])
+    jaxhf.render(scene().with_heights(heights), SETTINGS)
+    assert sorted(programs) == [("_made_world", True), ("trace_picture", True)]
+
+
 @pytest.mark.deep
 def test_another_light_keeps_the_hidden_sky(monkeypatch):
     """The same bits as the scene in that light prepared anew; another occlusion is looked for."""

@@ -1,5 +1,8 @@
 """Programs in a folder: found by all that tracing depends on, and replaced where they are damaged."""
 
+import time
+from concurrent.futures import ThreadPoolExecutor
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -61,7 +64,7 @@ def call_both():
 
     def begin(forms):
         told.append(forms)
-        pair, _ = second.begin(forms[0], np.float32(3))
+        pair, _ = second.compile_ahead(forms[0], np.float32(3))
         assert (pair.a.shape, pair.b.dtype, pair.name) == ((3,), np.float32, "returned")
 
     pair, _ = first.meanwhile(begin, Pair(jnp.arange(3.0), jnp.ones(2)), np.float32(2), power=2)
@@ -87,8 +90,8 @@ def test_what_other_threads_would_compile_otherwise_is_not_begun(folder, program
 
 
 def test_what_goes_wrong_elsewhere_is_raised_where_it_is_called(folder, monkeypatch):
-    """Where it is tried once more."""
-    stored, fails = Program._stored, [True, True, True]
+    """And tried once more when that is called again."""
+    stored, fails, keeps, pair = Program._stored, [True], compiled(of_pair), Pair(jnp.ones(3), jnp.ones(2))
 
     def unless_it_fails(self, *args):
         if fails and fails.pop():
@@ -96,10 +99,51 @@ def test_what_goes_wrong_elsewhere_is_raised_where_it_is_called(folder, monkeypa
         return stored(self, *args)
 
     monkeypatch.setattr(Program, "_stored", unless_it_fails)
+    assert keeps.compile_ahead(pair, np.float32(3)) is not None
     with pytest.raises(RuntimeError, match="no memory"):
-        call_both()
-    call_both()
-    assert (len(fails), len(list(folder.iterdir()))) == (0, 2)
+        keeps(pair, np.float32(3))
+    np.testing.assert_allclose(keeps(pair, np.float32(3))[0].a, 3 * np.sin(np.ones(3)), rtol=1e-5)
+
+
+def test_another_thread_waits_for_what_is_compiled_ahead(folder, monkeypatch, programs):
+    """Also where it came while that was traced."""
+    traced_as_it_is, keeps, pair, other = Program._traced, compiled(of_pair), Pair(jnp.ones(3), jnp.ones(2)), []
+
+    thread = ThreadPoolExecutor(1)
+
+    def traced_slowly(self, leaves):
+        other.append(thread.submit(keeps, pair, np.float32(3)))
+        time.sleep(0.3)
+        return traced_as_it_is(self, leaves)
+
+    monkeypatch.setattr(Program, "_traced", traced_slowly)
+    keeps.compile_ahead(pair, np.float32(3))
+    for found in (other[0].result(), keeps(pair, np.float32(3))):
+        np.testing.assert_allclose(found[0].a, 3 * np.sin(np.ones(3)), rtol=1e-5)
+    thread.shutdown()
+    assert programs == [("of_pair", True)]
+
+
+def test_errors_of_what_follows_are_those_of_its_own_call(folder):
+    def fails(_):
+        raise ValueError("not yet")
+
+    pair, _ = compiled(scaled, static_argnames=("power",)).meanwhile(
+        fails, Pair(jnp.ones(3), jnp.ones(2)), np.float32(2), power=2
+    )
+    np.testing.assert_array_equal(pair.a, 2)
+
+
+def looped(x):
+    return jax.lax.while_loop(lambda x: x < 4, lambda x: 2 * x, x)
+
+
+def test_a_loop_without_reverse_mode_has_forward_mode(folder):
+    keeps = compiled(looped)
+    value, push = jax.linearize(keeps, jnp.float32(1))
+    assert (value, push(jnp.float32(1)), jax.jacfwd(keeps)(jnp.float32(1))) == (4, 4, 4)
+    with pytest.raises(ValueError, match="Reverse-mode differentiation does not work"):
+        jax.grad(keeps)(jnp.float32(1))
 
 
 def test_another_source_or_configuration_is_traced_again(folder, monkeypatch):

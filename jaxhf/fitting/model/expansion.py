@@ -115,13 +115,13 @@ def expand(unknowns: Unknowns, problem: Problem, then: Callable[[Expansion], Non
     # What enters a compiled program must lie in the same places each time, or it is compiled again for the other ones.
     unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
 
-    def begin(linearised: tuple[Linearised | None, ...]) -> None:
+    def compile_ahead(linearised: tuple[Linearised | None, ...]) -> None:
         about = on_every_device(Expansion(problem, unknowns, linearised), problem.mesh)
         then(about)
-        _pull.begin(about, [group.targets for group in problem.groups])
-        _pictures.begin(about)
+        _pull.compile_ahead(about, [group.targets for group in problem.groups])
+        _pictures.compile_ahead(about)
 
-    return Expansion(problem, unknowns, _linearised.meanwhile(begin, unknowns, problem))
+    return Expansion(problem, unknowns, _linearised.meanwhile(compile_ahead, unknowns, problem))
 
 
 def residuals(unknowns: Unknowns, about: Expansion) -> tuple[Any, None]:

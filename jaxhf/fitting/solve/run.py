@@ -23,7 +23,7 @@ from .steps import (
     Outcome,
     WholeStep,
     advance,
-    begin_steps,
+    compile_steps_ahead,
     first_position,
     relaxed,
     whole_step,
@@ -131,7 +131,7 @@ def _next_stage(problems: Sequence[Problem], state: State, place: _Place | None,
     else:
         if place is not None:
             state = on_finer(state, problems, stage.level, given)
-        here = expand(state.unknowns, state.posed(problems[stage.level], 1.0), begin_steps)
+        here = expand(state.unknowns, state.posed(problems[stage.level], 1.0), compile_steps_ahead)
     posed, told = here.problem, _estimated(here, state, order, repeats, given)
     edge_samples, units, others = state.edge_samples, state.units, state.others
     if repeats:
@@ -187,7 +187,7 @@ def _begun(problems: Sequence[Problem], state: State, known: Expansion | None) -
     stage = stages(problems)[state.stage]
     posed = state.posed(problems[stage.level], stage.share)
     if known is None or known.problem.settings != posed.settings:
-        known = expand(state.begin, posed, begin_steps)
+        known = expand(state.begin, posed, compile_steps_ahead)
     return dataclasses.replace(known, problem=posed, unknowns=state.begin).with_noise(state.noise)
 
 

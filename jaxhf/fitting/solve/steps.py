@@ -185,24 +185,24 @@ def advance(
 
     What the old state holds of J makes room for that of the new one: it is gone.
     """
-    new, arrays, outcome = _advance(*_placed(unknowns, position, expansion, others, rejections))
+    new, arrays, outcome = _advance(*_arguments(unknowns, position, expansion, others, rejections))
     # What else the state holds, functions among it, stays as it is, and could not be kept with a compiled program.
     following, (leaves, structure) = iter(arrays), jax.tree.flatten(position)
     return new, jax.tree.unflatten(structure, [next(following) if eqx.is_array(leaf) else leaf for leaf in leaves]), outcome
 
 
-def begin_steps(expansion: Expansion) -> None:
-    """Begins to compile the program of `advance`, for an expansion whose pictures may be forms of those to come."""
+def compile_steps_ahead(expansion: Expansion) -> None:
+    """The program of `advance`, for an expansion whose pictures may be forms of those to come."""
 
     def typed(leaf: Any) -> Any:
         return leaf.update(weak_type=False) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
 
     unknowns, position = expansion.unknowns, jax.tree.map(typed, _form_of(expansion))  # of arrays as `_empty` makes them
     others = jax.tree.map(np.asarray, unknowns.without_modes())
-    _advance.begin(*_placed(unknowns, position, expansion, others, 0))
+    _advance.compile_ahead(*_arguments(unknowns, position, expansion, others, 0))
 
 
-def _placed(unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int) -> tuple[Any, Any]:
+def _arguments(unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int) -> tuple[Any, Any]:
     """What `_advance` takes."""
     exactly = (_TOLERANCE, _ITERATIONS) if expansion.problem.albedo is None else (_FIELD_TOLERANCE, _FIELD_ITERATIONS)
     solver = LevenbergMarquardt(rejections, others, exactly)
