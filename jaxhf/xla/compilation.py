@@ -113,6 +113,7 @@ class Compiled:
         `jax.ShapeDtypeStruct`s of what it will return, to `compile_ahead` programs that take this. Its errors do not count."""
         if not self._serves():
             return self(*args, **kwargs)
+        compiler_options(False)  # tried out now for what follows: while a program is compiled, JAX's cache is off
         with _garbage_left():
             return self._kept.meanwhile(then, *args, **kwargs)
 
