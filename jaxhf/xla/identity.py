@@ -26,8 +26,8 @@ def named(value: Any) -> Any:
 
 def devices(at: Any) -> Any:
     """A place with the numbers of its devices in their order, which its `repr` does not name."""
-    devices = at.mesh.devices.flat if isinstance(at, NamedSharding) else at.device_set if at else ()  # pyright: ignore
-    return at, [device.id for device in devices]
+    there = at.mesh.devices.flat if isinstance(at, NamedSharding) else at.device_set if at else ()  # pyright: ignore
+    return at, [device.id for device in there]
 
 
 def classes(tree: Any) -> list[str]:

@@ -209,8 +209,11 @@ class Program:
         if place in self.placed or not _threads_compile_alike(module):
             return None
         with _LOCK:
+            if place in self.placed:
+                return None
             path, key = self._path(place)
-            if place in self.placed or (path is not None and path.exists()):
+            if (program := self._loaded(path, key)) is not None:
+                self.placed[place] = program
                 return None
             traced = self._traced(leaves)
             lowered, other = traced.lower(), ThreadPoolExecutor(1)
@@ -229,15 +232,18 @@ class Program:
         with _LOCK:
             program = self.placed.get(place)
             if program is None:
-                program = self.placed[place] = self._compiled(place, leaves)
+                path, key = self._path(place)
+                program = self._loaded(path, key) or self._stored(self._traced(leaves).lower(), path, key)
+                self.placed[place] = program
         if not isinstance(program, Future):
             return program
-        done = program if program.exception() else program.result()
+        failed = program.exception() is not None
         with _LOCK:
             if self.placed.get(place) is program:
-                self.placed.pop(place)
-                if done is not program:
-                    self.placed[place] = done
+                if failed:
+                    del self.placed[place]
+                else:
+                    self.placed[place] = program.result()
         return program.result()
 
     @cached_property
@@ -257,29 +263,27 @@ class Program:
             self.made_of_it[kind] = Program(self.name, known, fun)
         return self.made_of_it[kind]
 
-    def _compiled(self, place: tuple[Any, ...], leaves: Any) -> Callable[..., list[Any]]:
-        """From the folder, or compiled and put there."""
-        module = insides()
+    def _loaded(self, path: Path | None, key: str) -> Callable[..., list[Any]] | None:
+        """From the folder; None where it is not there, or damaged."""
+        if path is None:
+            return None
+        module, begin = insides(), time.perf_counter()
         assert module is not None
-        path, key = self._path(place)
-        if path is not None:
-            begin = time.perf_counter()
-            try:
-                its_key, *parts = pickle.loads(zlib.decompress(folder.read(path)))  # with zlib's checksum
-                if its_key != key:
-                    raise ValueError("it is another program")
-                stored, in_tree, out_tree, note, ids = parts
-                devices = {device.id: device for device in jax.devices()}
-                program = module.deserialize_and_load(stored, in_tree, out_tree, execution_devices=[devices[k] for k in ids])
-                self.note = note
-                jax.monitoring.record_event_duration_secs(LOADED, time.perf_counter() - begin)
-                return program
-            except FileNotFoundError:
-                pass
-            except Exception as error:  # whatever a damaged file leads to
-                self._warn("reading", error)
-
-        return self._stored(self._traced(leaves).lower(), path, key)
+        try:
+            its_key, *parts = pickle.loads(zlib.decompress(folder.read(path)))  # with zlib's checksum
+            if its_key != key:
+                raise ValueError("it is another program")
+            stored, in_tree, out_tree, note, ids = parts
+            devices = {device.id: device for device in jax.devices()}
+            program = module.deserialize_and_load(stored, in_tree, out_tree, execution_devices=[devices[k] for k in ids])
+            self.note = note
+            jax.monitoring.record_event_duration_secs(LOADED, time.perf_counter() - begin)
+            return program
+        except FileNotFoundError:
+            pass
+        except Exception as error:  # whatever a damaged file leads to
+            self._warn("reading", error)
+        return None
 
     def _traced(self, leaves: Any) -> Any:
         def flat(*leaves: Any) -> list[Any]:

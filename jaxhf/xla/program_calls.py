@@ -40,7 +40,7 @@ def _differentiated(primals: Any, tangents: Any, *, program: Program) -> tuple[l
     if any(isinstance(slope, Tracer) for slope in moves):
         storing = _storing(program, moving)
         if not any(hasattr(slope, "batch_dim") for slope in moves):  # of `jacfwd`, which pushes many
-            _compile_reverse_ahead(program, moving, primals)
+            _compile_reverse_ahead(program, storing, moving, primals)
         results = _call.bind(*primals, program=storing)
         moved, places, program.note = storing.note
         values, stored = results[: len(moved)], all_stored(results[len(moved) :], places, primals)
@@ -102,17 +102,17 @@ def _storing(program: Program, moving: _Moving) -> Program:
     return program.derived(f"{moving} linearised", storing)
 
 
-def _compile_reverse_ahead(program: Program, moving: _Moving, primals: Any) -> None:
+def _compile_reverse_ahead(program: Program, storing: Program, moving: _Moving, primals: Any) -> None:
     """Compiles what differentiates in reverse mode beside what stores for it: on one device, where arrays may be anywhere.
 
     Most who ask for a linear function want that; for who only pushes through that of `jax.linearize` it is too much.
     """
     if any(isinstance(value, Tracer) or (isinstance(value, jax.Array) and value.committed) for value in primals):
         return
-    forms = _storing(program, moving).compile_ahead(*primals)
+    forms = storing.compile_ahead(*primals)
     if forms is None:
         return
-    moved, places, program.note = _storing(program, moving).note
+    moved, places, program.note = storing.note
     types, values = tuple(map(jax.typeof, primals)), forms[: len(moved)]
     stored = all_stored(forms[len(moved) :], places, primals)
     with contextlib.suppress(Exception):  # as of a loop that has no reverse mode: said where that is asked for

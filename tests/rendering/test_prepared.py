@@ -60,13 +60,12 @@ def test_the_picture_is_compiled_beside_the_world(programs, side, aovs):
         assert {name for name, other in programs if not other} <= {"_assembled"}
 
 
-@pytest.mark.parametrize(
-    "given",
-    [{"key": jax.random.key(1)}, {"progress": lambda *_: None}, {"key": jax.random.key(1), "progress": lambda *_: None}],
-)
-def test_with_points_on_edges_the_picture_is_compiled_once(programs, given):
+@pytest.mark.parametrize("seed", [None, 1])
+@pytest.mark.parametrize("progress", [None, lambda *_: None])
+def test_with_points_on_edges_the_picture_is_compiled_once(programs, seed, progress):
+    key, settings = None if seed is None else jax.random.key(seed), dataclasses.replace(SETTINGS, edge_samples=64)
     jax.clear_caches()
-    jaxhf.render(scene(), dataclasses.replace(SETTINGS, edge_samples=64), **given)
+    jaxhf.render(scene(), settings, key=key, progress=progress)
     assert sorted(programs) == [("_made_world", True), ("trace_picture", True)]
 
 

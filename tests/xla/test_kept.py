@@ -108,7 +108,6 @@ def test_what_goes_wrong_elsewhere_is_raised_where_it_is_called(folder, monkeypa
 def test_another_thread_waits_for_what_is_compiled_ahead(folder, monkeypatch, programs):
     """Also where it came while that was traced."""
     traced_as_it_is, keeps, pair, other = Program._traced, compiled(of_pair), Pair(jnp.ones(3), jnp.ones(2)), []
-
     thread = ThreadPoolExecutor(1)
 
     def traced_slowly(self, leaves):

@@ -174,7 +174,10 @@ def _form(structure: Any, leaves: tuple[Any, ...], _: Any) -> Any:
         shape, _ = eqx.filter_eval_shape(residuals, expansion.unknowns, expansion)
         return solver.init(residuals, expansion.unknowns, expansion, {}, shape, None, frozenset())
 
-    return eqx.filter_eval_shape(first, jax.tree.unflatten(structure, leaves))
+    def strongly_typed(leaf: Any) -> Any:  # as `_empty` and steps make them
+        return leaf.update(weak_type=False) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
+
+    return jax.tree.map(strongly_typed, eqx.filter_eval_shape(first, jax.tree.unflatten(structure, leaves)))
 
 
 def advance(
@@ -193,13 +196,8 @@ def advance(
 
 def compile_steps_ahead(expansion: Expansion) -> None:
     """The program of `advance`, for an expansion whose pictures may be forms of those to come."""
-
-    def typed(leaf: Any) -> Any:
-        return leaf.update(weak_type=False) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf
-
-    unknowns, position = expansion.unknowns, jax.tree.map(typed, _form_of(expansion))  # of arrays as `_empty` makes them
-    others = jax.tree.map(np.asarray, unknowns.without_modes())
-    _advance.compile_ahead(*_arguments(unknowns, position, expansion, others, 0))
+    others = jax.tree.map(np.asarray, expansion.unknowns.without_modes())
+    _advance.compile_ahead(*_arguments(expansion.unknowns, _form_of(expansion), expansion, others, 0))
 
 
 def _arguments(unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int) -> tuple[Any, Any]:
