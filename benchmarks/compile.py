@@ -4,8 +4,8 @@ Each program is made in a process of its own, without a cache. The scene is one 
 directional light, with shadows and smooth normals, 512 x 512 pixels (for the fit 128 x 128).
 
 With --second: what a first process takes, with an empty folder of programs, and what the second one does, which finds them
-there; then pictures of another size, and of another terrain of another size. CPU seconds of all threads, and seconds of the
-clock; from start to end, with the import of JAX and the work itself.
+there; then pictures and fits of another size, and another terrain of another size. CPU seconds of all threads, and seconds of
+the clock; from start to end, with the import of JAX and the work itself.
 """
 
 import json
@@ -32,12 +32,15 @@ PROGRAMS = {
     "step": "a step of a fit, from that",
 }
 FIT = """
+import sys
 import numpy as np
 import jaxhf
 from jaxhf.scene.procedural import fractal
 
-heights = fractal([32, 32], seed=3, exponent=2.4, range=(0.0, 3.0)).astype(np.float32)
-camera = jaxhf.Orthographic.look_at((15.5, 15.5, 500), (15.5, 15.5, 0), up=(0, 1, 0), extent=31.0, width=32, height=32)
+side = int(sys.argv[1])
+heights = fractal([side, side], seed=3, exponent=2.4, range=(0.0, 3.0)).astype(np.float32)
+c = (side - 1) / 2
+camera = jaxhf.Orthographic.look_at((c, c, 500), (c, c, 0), up=(0, 1, 0), extent=2 * c, width=side, height=side)
 
 def scene(heights, azimuth):
     field = jaxhf.Heightfield(heights, dx=1.0)
@@ -201,12 +204,13 @@ def second(run: benchmark.Run) -> None:
     other_view = ["other.npy" if word == "terrain.tif" else word for word in view]
     others = {
         "a picture of 344 x 403 heights": {"of 310 x 360": ["-c", PICTURE, "other.npy"]},
+        "a fit of 32 x 32 heights": {"of 48 x 48": ["-c", FIT, "48"]},
         "`jaxhf view`": {"with --size 700x500": [*view, "--size", "700x500"], "of 310 x 360 heights": other_view},
     }
     processes = {
         "README's Python block": ["-c", readme[1]],
         "a picture of 344 x 403 heights": ["-c", PICTURE, "terrain.tif"],
-        "a fit of 32 x 32 heights": ["-c", FIT],
+        "a fit of 32 x 32 heights": ["-c", FIT, "32"],
         "`jaxhf view`": view,
     }
     with tempfile.TemporaryDirectory() as folder:

@@ -66,6 +66,7 @@ def test_imports_follow_the_flow():
 
 MAPS_OVER_RAYS = {
     "rendering/tiles", "rendering/samples", "rendering/render", "rendering/cast", "rendering/chunks", "boundary/term",
+    "boundary/points",
     "fitting/model/linearise", "fitting/model/expansion", "maps/viewshed", "mujoco/geoms", "mujoco/primitives",
     "mujoco/scan", "mujoco/sensors", "preparation/sky", "xla/insides", "xla/kernel", "xla/program_calls",
 }  # fmt: skip

@@ -10,10 +10,10 @@ from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import dot, select, unit
 from ..preparation.world import World, nearest_hit, no_hit
 from ..scene.camera import Camera
-from ..trace.edges import whole_cells
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit, Status
 from ..trace.intersect import intersect
+from ..trace.triangle import corners
 from ..xla.materialise import materialise
 from .sample import BoundarySample, between_ends, end_heights, on_edge, ways_to_lights
 
@@ -107,7 +107,8 @@ def _fold_on(grid: Grid, number: int, sample: BoundarySample, past: Ray, distanc
 def _has_cell(grid: Grid, ix: Index, iy: Index) -> Flag:
     """Whether there is such a cell, with all its vertices."""
     x, y = jnp.clip(ix, 0, grid.cells[0] - 1), jnp.clip(iy, 0, grid.cells[1] - 1)
-    return materialise((x == ix) & (y == iy) & whole_cells(grid.z)[y, x])
+    z00, z10, z01, z11 = corners(grid.rows, grid.nx, x, y, None)
+    return materialise((x == ix) & (y == iy) & jnp.isfinite(z00 + z10 + z01 + z11))
 
 
 def meet(

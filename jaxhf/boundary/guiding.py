@@ -1,10 +1,12 @@
 """The distribution from which edges are drawn: by how much each is expected to change the picture as it moves."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Float, Int
 
 from ..core.errors import ArgumentError
@@ -16,28 +18,33 @@ from ..scene.camera import Camera
 from ..scene.light import Directional, Point, Sun
 from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube
-from ..trace.edges import EdgeFlags
 from ..trace.grid import Grid
-from .silhouette import EdgeWeights, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes
+from ..trace.triangle import value_at
+from ..xla.materialise import materialise
+from .silhouette import EdgeFlags, EdgeWeights, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes, vertices_of
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
 _TOTAL_WEIGHT = 2**30
+RUN = 32
+"""Edges of which a distribution keeps the sum of the weights."""
 # Vertices along the side of the blocks over which a first round of draws is averaged.
 _BLOCK = 8
 
 
 class EdgeSet(NamedTuple):
-    """The edges of one surface, seen where they stand (`light` -1) or by their shadow; `first` is the number of its first."""
+    """The edges of one surface, seen where they stand (`light` -1) or by their shadow; `first` is the number of its first.
+
+    They are numbered as an array of the shape (3, vertices) is, see `silhouette`.
+    """
 
     surface: int
     light: int
     first: int
-    ny: int
-    nx: int
+    vertices: int
 
     @property
     def end(self) -> int:
-        return self.first + 3 * self.ny * self.nx
+        return self.first + 3 * self.vertices
 
 
 def edge_sets(world: World) -> tuple[EdgeSet, ...]:
@@ -46,9 +53,17 @@ def edge_sets(world: World) -> tuple[EdgeSet, ...]:
     casting = [number for number, _ in sharp_lights(world)] if world.settings.shadows else []
     for k, grid, _ in world.grids:
         for light in casting if grid.still else (-1, *casting):
-            found.append(EdgeSet(k, light, first, *grid.shape))
+            found.append(EdgeSet(k, light, first, grid.rows.shape[0]))
             first = found[-1].end
     return tuple(found)
+
+
+def edges_stand_still(world: World) -> World:
+    """The world, of whose grids all but the first stay where they are."""
+    surfaces = list(world.surfaces)
+    for k, grid, _ in world.grids[1:]:
+        surfaces[k] = dataclasses.replace(grid, still=True)
+    return dataclasses.replace(world, surfaces=tuple(surfaces))
 
 
 def has_edges(world: World) -> bool:
@@ -68,7 +83,7 @@ def initial_weights(world: World, camera: Camera) -> Float[jax.Array, " edges"]:
             flags, lengths = _standing(grid, camera, standing, world.settings.shading), seen_lengths(grid, camera)
         else:
             flags, lengths = silhouettes(grid, lights[edges.light]), lit_lengths(grid, lights[edges.light])
-        weights.append(_shares(jnp.where(flags, lengths, 0)))
+        weights.append(_shares(materialise(jnp.where(materialise(flags), lengths, 0))))
     return jnp.concatenate(weights)
 
 
@@ -122,15 +137,34 @@ class GuidingDistribution(eqx.Module):
     """A discrete distribution over the edges, with integer weights, for stratified sampling.
 
     A running sum of a million weights loses small ones in single precision; one of integers is exact, and so are the
-    probabilities that follow from it.
+    probabilities that follow from it. It is kept for runs of edges: to sum up all of them one by one takes longer than to draw.
 
     Attributes:
-      cumulative: the sum of the weights up to and with each edge.
+      weights: of each edge; with zeros behind, so that runs are complete.
+      ends: the sum of the weights up to and with each run of `RUN` edges.
       stratum: the weight of each stratum; every draw has a stratum of its own.
+      strata: how many there are.
     """
 
-    cumulative: Int[jax.Array, " edges"]
+    weights: Int[jax.Array, " edges"]
+    ends: Int[jax.Array, " runs"]
     stratum: Index
+    strata: Index
+
+    def at(self, chosen: Index) -> tuple[Index, Index, Index]:
+        """The edge that has the unit of weight of this number, from 0 on; its weight, and that of all edges before it."""
+        run = jnp.searchsorted(self.ends, chosen, side="right").astype(jnp.int32)
+        run = jnp.minimum(run, self.ends.shape[0] - 1)
+        before, first = jnp.where(run > 0, self.ends[jnp.maximum(run - 1, 0)], 0), run * RUN
+
+        def pass_one(k: Index, found: tuple[Index, Index]) -> tuple[Index, Index]:
+            edge, before = found
+            end = before + value_at(self.weights, edge)
+            passed = (edge == first + k) & (end <= chosen)
+            return jnp.where(passed, edge + 1, edge), jnp.where(passed, end, before)
+
+        edge, before = lax.fori_loop(0, RUN - 1, pass_one, (first, before))
+        return edge, value_at(self.weights, edge), before
 
 
 def make_distribution(weights: Float[jax.Array, " edges"], draws: Index | int) -> GuidingDistribution:
@@ -144,10 +178,13 @@ def make_distribution(weights: Float[jax.Array, " edges"], draws: Index | int) -
             "Settings", "edge_samples", f"works for fewer than {_TOTAL_WEIGHT // 2} edges, the scene has {count}"
         )
     weights = jnp.where(weights > 0, floor_to_power_of_two(weights), 0)
-    total = jnp.sum(weights)
-    integers = jnp.ceil(weights / jnp.where(total > 0, total, 1) * (_TOTAL_WEIGHT - count)).astype(jnp.int32)
-    cumulative = jnp.cumsum(integers, dtype=jnp.int32)
-    return GuidingDistribution(cumulative, jnp.maximum((cumulative[-1] + draws - 1) // draws, 1))
+    total, positive = jnp.sum(weights), jnp.sum(weights > 0, dtype=jnp.int32)
+    most = (_TOTAL_WEIGHT - positive).astype(weights.dtype)  # each may be rounded up by one
+    integers = jnp.ceil(weights / jnp.where(total > 0, total, 1) * most).astype(jnp.int32)
+    integers = jnp.pad(integers, (0, -count % RUN))
+    ends = jnp.cumsum(jnp.sum(integers.reshape(-1, RUN), axis=1, dtype=jnp.int32), dtype=jnp.int32)
+    stratum = jnp.maximum((ends[-1] + draws - 1) // draws, 1)
+    return GuidingDistribution(integers, ends, stratum, jnp.asarray(draws, jnp.int32))
 
 
 def refined_weights(
@@ -166,25 +203,26 @@ def refined_weights(
     Args:
       world: for `edge_sets`.
       weights: `initial_weights`.
-      edge, found: of each draw, its edge and the size of the change that it contributes.
+      edge, found: of each draw, its edge and the size of the change that it contributes; those beyond all edges do not count.
     """
-    counted = jnp.zeros((weights.shape[0], 2), weights.dtype).at[edge].add(jnp.stack([jnp.ones_like(found), found], axis=1))
-    everywhere = jnp.mean(found)
-    refined = []
+    number = (edge < weights.shape[0]).astype(found.dtype)
+    found = number * found
+    everywhere = jnp.sum(found) / jnp.maximum(jnp.sum(number), 1)
+    none, factors, mean_there = jnp.zeros_like(weights), [], jnp.zeros_like(found)
+    n, total = (none.at[edge].add(values)[edge] for values in (number, found))
     for edges in edge_sets(world):
-        n, total = (value.reshape(3, edges.ny, edges.nx) for value in counted[edges.first : edges.end].T)
-        n_block, total_block = _over_blocks(n), _over_blocks(total)
-        mean = (jnp.sum(total) + everywhere) / (jnp.sum(n) + 1)
-        mean = (total_block + mean) / (n_block + 1)
-        refined.append(((total + mean[None].repeat(3, axis=0)) / (n + 1)).ravel())
-    factors = jnp.concatenate(refined)
-    return weights * jnp.sqrt(jnp.where((factors > 0).any(), factors, 1))
-
-
-def _over_blocks(values: Float[jax.Array, "3 ny nx"]) -> Float[jax.Array, "ny nx"]:
-    """At each vertex, the sum over all edges that begin in its block."""
-    _, ny, nx = values.shape
-    rows, columns = -(-ny // _BLOCK), -(-nx // _BLOCK)
-    padded = jnp.pad(values, ((0, 0), (0, rows * _BLOCK - ny), (0, columns * _BLOCK - nx)))
-    blocks = padded.reshape(3, rows, _BLOCK, columns, _BLOCK).sum((0, 2, 4))
-    return blocks.repeat(_BLOCK, axis=0).repeat(_BLOCK, axis=1)[:ny, :nx]
+        grid = world.surfaces[edges.surface]
+        assert isinstance(grid, Grid)
+        x, y = vertices_of(grid)
+        block, blocks = y // _BLOCK * (grid.cells[0] // _BLOCK + 1) + x // _BLOCK, edges.vertices // 4 + 1
+        here = (edges.first <= edge) & (edge < edges.end)
+        drawn = jnp.where(here, block[(edge - edges.first) % edges.vertices], blocks)  # beyond the last: not counted
+        values = jnp.stack([number, found], axis=1)
+        of_set = jnp.sum(jnp.where(here[:, None], values, 0), axis=0)
+        of_blocks = jnp.zeros((blocks, 2), weights.dtype).at[drawn].add(values, mode="drop")
+        means = (of_blocks[:, 1] + (of_set[1] + everywhere) / (of_set[0] + 1)) / (of_blocks[:, 0] + 1)
+        mean_there = jnp.where(here, means.at[drawn].get(mode="clip"), mean_there)
+        factors += 3 * [jnp.sqrt(means).at[block].get(mode="clip")]  # of edges that were not drawn
+    refined = weights * jnp.concatenate(factors)
+    refined = refined.at[edge].set(weights[edge] * jnp.sqrt((total + mean_there) / (n + 1)))
+    return jnp.where(everywhere > 0, refined, weights)

@@ -18,6 +18,7 @@ from ..core.types import Flag, Index, Point2, Scalar, Vector
 from ..core.vector import dot, select
 from ..preparation.world import World, no_hit
 from ..scene.camera import Camera
+from ..scene.projection import size_of
 from ..shade.radiance import radiance_from, shadowed_radiance
 from ..shade.reflectance import depends_on_view
 from ..trace.hit import Hit, Status
@@ -98,7 +99,8 @@ def boundary_segment(world: World, camera: Camera, sample: BoundarySample, fold:
     x, along, valid = materialise(jax.jvp(at, (sample.s,), (jnp.ones_like(sample.s),), has_aux=True))
     length = jnp.sqrt(along[0] * along[0] + along[1] * along[1])
     # Of what would cross the whole picture within less than the rounding of s, no position is known.
-    valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < camera.width + camera.height)
+    width, height = size_of(camera)
+    valid = valid & (length > 0) & (length * float(jnp.finfo(x.dtype).eps) < width + height)
     across = jnp.where(valid, jnp.stack([-along[1], along[0]]), 0)
     _, motion, _ = jax.jvp(functools.partial(at, sample.s), (jnp.zeros_like(fold.across),), (fold.across,), has_aux=True)
     rate = (across[0] * motion[0] + across[1] * motion[1]) / jnp.where(valid, length, 1)

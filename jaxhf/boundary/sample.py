@@ -28,6 +28,7 @@ from ..core.vector import dot, floor_to_power_of_two, largest_component, quotien
 from ..preparation.world import World
 from ..scene.camera import Camera
 from ..scene.light import Point
+from ..scene.projection import size_of
 from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube
 from ..trace.edges import STEPS
@@ -46,7 +47,7 @@ class BoundarySample(eqx.Module):
 
     Attributes:
       valid: whether there is such a point, and it can be seen in the picture but for what hides it.
-      edge: its number, see `edge_sets`.
+      edge: its number, see `edge_sets`; beyond all where a stratum has none.
       surface: the object whose edge it is.
       light: the one that casts its shadow; -1: it is seen where it stands.
       start, end: the edge's vertices, (ix, iy).
@@ -72,27 +73,26 @@ class BoundarySample(eqx.Module):
 
 
 def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u: Point2) -> BoundarySample:
-    """The sample of the k-th stratum, from two uniform random numbers."""
+    """The sample of the k-th stratum, from two uniform random numbers; none where there are fewer strata."""
     dtype = u.dtype
     chosen = jnp.minimum((u[0] * guiding.stratum.astype(dtype)).astype(jnp.int32), guiding.stratum - 1)
     chosen = chosen + k * guiding.stratum  # of the integers that the weights add up to
-    cumulative = guiding.cumulative
-    edge = jnp.searchsorted(cumulative, chosen, side="right").astype(jnp.int32)
-    valid = chosen < cumulative[-1]
-    edge = jnp.minimum(edge, cumulative.shape[0] - 1)
-    before = jnp.where(edge > 0, cumulative[jnp.maximum(edge - 1, 0)], 0)
-    weight = jnp.maximum(cumulative[edge] - before, 1)
+    sets = edge_sets(world)
+    edge, weight, before = guiding.at(chosen)
+    edge = jnp.minimum(edge, sets[-1].end - 1)
+    valid, weight = (k < guiding.strata) & (chosen < guiding.ends[-1]), jnp.maximum(weight, 1)
     s = ((chosen - before).astype(dtype) + u[1]) / weight.astype(dtype)
     measure = guiding.stratum.astype(dtype) / weight.astype(dtype)
 
-    sets = edge_sets(world)
     number = sum((edge >= later.first).astype(jnp.int32) for later in sets[1:])
-    surface, light, first, ny, nx = jnp.array(sets, jnp.int32)[number]
-    kind, vertex = (edge - first) // (ny * nx), (edge - first) % (ny * nx)
+    surface, light, first, vertices = jnp.array(sets, jnp.int32)[number]
+    kind, vertex = (edge - first) // vertices, (edge - first) % vertices
+    nx = select(surface, ((k, grid.nx) for k, grid, _ in world.grids))
     start, none = jnp.stack([vertex % nx, vertex // nx]), jnp.zeros((), jnp.int32)
     point = BoundarySample(
-        valid=valid, edge=edge, surface=surface, light=light, start=start, end=start + jnp.array(STEPS, jnp.int32)[kind], s=s,
-        measure=measure, receiver=none, cell=jnp.zeros(2, jnp.int32), upper=jnp.zeros((), bool), t=jnp.zeros((), dtype),
+        valid=valid, edge=jnp.where(valid, edge, sets[-1].end), surface=surface, light=light, start=start,
+        end=start + jnp.array(STEPS, jnp.int32)[kind], s=s, measure=measure, receiver=none, cell=jnp.zeros(2, jnp.int32),
+        upper=jnp.zeros((), bool), t=jnp.zeros((), dtype),
     )  # fmt: skip
     # Of an edge that is seen where it stands, only the part in the frame is drawn from.
     film = camera.film_from_world()
@@ -220,5 +220,5 @@ def picture_point(
     at = materialise(camera.film_from_world()(materialise(jnp.where(point.valid, p, lax.stop_gradient(ahead)))))
     before = (at[2] > 0) & (at[3] > 0)
     x = quotient(at[:2], jnp.where(before, at[2], 1))
-    size = jnp.array([camera.width, camera.height], x.dtype)
+    size = jnp.stack([jnp.asarray(side, x.dtype) for side in size_of(camera)])
     return x, point.valid & before & (x >= 0).all() & (x < size).all()

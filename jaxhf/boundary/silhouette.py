@@ -1,21 +1,25 @@
 """Which edges of a heightfield bound what is seen or lit: dense arithmetic over the grid, without a derivative.
 
-Arrays over edges are those of `trace.edges`; an edge that would leave the grid bounds nothing.
+The kinds of edges are those of `trace.edges`. Arrays over them have the shape (3, vertices), with vertices as in `Grid.rows`:
+so a program may serve terrains of many sizes. Edges that would leave the grid are there too; they bound nothing.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int, Shaped
 
 from ..core.types import Vector
 from ..scene.camera import Camera
-from ..trace.edges import STEPS, EdgeFlags, at_second_vertices, compare_sides, present_edges, whole_cells
+from ..scene.projection import size_of
+from ..trace.edges import STEPS
 from ..trace.grid import Grid
 from ..xla.materialise import materialise
 
-EdgeWeights = Float[jax.Array, "3 ny nx"]
+EdgeFlags = Bool[jax.Array, "3 vertices"]
+EdgeWeights = Float[jax.Array, "3 vertices"]
 
 Viewpoint = tuple[Vector, bool]
 """An eye or a light: at this point (True), or infinitely far away in this direction (False); world frame."""
@@ -27,80 +31,119 @@ def silhouettes(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     (Hertzmann and Zorin, Illustrating smooth surfaces, SIGGRAPH 2000, section 4.1, on polygons.) Edges at the border and
     at holes have one triangle, but where the surface goes on in another grid.
     """
-    return _without_seam(grid, compare_sides(*_facing(grid, viewpoint), lambda a, b: a != b))
+    return _without_seam(grid, _compare_sides(grid, *_facing(grid, viewpoint), lambda a, b: a != b))
 
 
 def all_edges(grid: Grid) -> EdgeFlags:
     """The edges with at least one triangle, but for those with one where the surface goes on in another grid."""
-    return _without_seam(grid, present_edges(grid.z))
+    present = _whole_cells(grid)
+    return _without_seam(grid, _compare_sides(grid, present, present, lambda a, b: a | b))
 
 
 def _without_seam(grid: Grid, flags: EdgeFlags) -> EdgeFlags:
     if grid.seam is None:
         return flags
-    present, on_seam = whole_cells(grid.z), grid.seam[None] & at_second_vertices(grid.seam)
-    return flags & ~(on_seam & compare_sides(present, present, lambda a, b: a != b))
+    present, seam = _whole_cells(grid), grid.seam.reshape(-1)
+    alone = _compare_sides(grid, present, present, lambda a, b: a != b)
+    return flags & ~(seam[None] & _at_second_vertices(grid, seam) & alone)
 
 
 def folds(grid: Grid, viewpoint: Viewpoint) -> EdgeFlags:
     """The edges with one triangle that faces the viewpoint and one that faces away."""
-    return compare_sides(*_facing(grid, viewpoint), lambda a, b: a * b < 0)
+    return _compare_sides(grid, *_facing(grid, viewpoint), lambda a, b: a * b < 0)
 
 
-def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[jax.Array, jax.Array]:
-    """1 where the viewpoint stands on the +z side of a triangle, -1 on the other, 0 where there is no triangle."""
+def _facing(grid: Grid, viewpoint: Viewpoint) -> tuple[Int[jax.Array, " vertices"], Int[jax.Array, " vertices"]]:
+    """Of the lower and the upper triangle of the cell that begins at each vertex: 1 where the viewpoint stands on its +z side,
+    -1 on the other, 0 where there is no triangle."""
     (v, at_place), to_grid = viewpoint, grid.grid_from_world
     v = to_grid.point(v) if at_place else to_grid.vector(v)
-    z00, z10, z01, z11 = grid.z[:-1, :-1], grid.z[:-1, 1:], grid.z[1:, :-1], grid.z[1:, 1:]
+    z00, z10, z01, z11 = (_further(grid, grid.rows, *step) for step in _CORNERS)
     to_x, to_y, to_z = v[0], v[1], v[2]
     if at_place:
-        x, y = _vertices(grid)
-        to_x, to_y, to_z = v[0] - x[:-1, :-1], v[1] - y[:-1, :-1], v[2] - z00
-    present = whole_cells(grid.z)
+        x, y = vertices_of(grid)
+        to_x, to_y, to_z = v[0] - x.astype(v.dtype), v[1] - y.astype(v.dtype), v[2] - z00
+    present = _whole_cells(grid)
 
     def facing(a: jax.Array, b: jax.Array) -> jax.Array:
         return jnp.where(present, jnp.where(to_z - a * to_x - b * to_y >= 0, 1, -1), 0).astype(jnp.int8)
 
-    return facing(z10 - z00, z11 - z10), facing(z11 - z01, z01 - z00)
+    return materialise((facing(z10 - z00, z11 - z10), facing(z11 - z01, z01 - z00)))
 
 
-def _vertices(grid: Grid) -> tuple[jax.Array, jax.Array]:
-    ny, nx = grid.shape
-    x, y = jnp.meshgrid(jnp.arange(nx, dtype=grid.z.dtype), jnp.arange(ny, dtype=grid.z.dtype))
-    return x, y
+_CORNERS = ((0, 0), *STEPS)  # of a cell: 00, 10, 01, 11
+
+
+def _further(grid: Grid, values: Shaped[jax.Array, " n"], x: int, y: int) -> Shaped[jax.Array, " n"]:
+    """At each vertex, what stands so many vertices further along x and along y; beyond the grid's border some other value."""
+    return values if x == y == 0 else jnp.roll(values, -(y * grid.nx + x))
+
+
+def _whole_cells(grid: Grid) -> Bool[jax.Array, " vertices"]:
+    """Whether a cell begins at a vertex that has all of its vertices; a hole is nan."""
+    z00, z10, z01, z11 = (_further(grid, grid.rows, *step) for step in _CORNERS)
+    x, y = vertices_of(grid)
+    return jnp.isfinite(z00 + z10 + z01 + z11) & (x < grid.cells[0]) & (y < grid.cells[1])
+
+
+def _compare_sides(grid: Grid, lower: jax.Array, upper: jax.Array, compare: Callable[[Any, Any], jax.Array]) -> EdgeFlags:
+    """Compares the two triangles of every edge, given values of the lower and the upper one of the cell that begins at each
+    vertex; they are zero where none does, so that zero stands beyond the border, whichever vertex `_further` takes."""
+    below, left = _further(grid, upper, 0, -1), _further(grid, lower, -1, 0)
+    return jnp.stack([compare(lower, below), compare(upper, left), compare(lower, upper)])
+
+
+def _at_second_vertices(grid: Grid, values: Shaped[jax.Array, " n"]) -> Shaped[jax.Array, "3 n"]:
+    """Of values at vertices, those at the second vertices of edges."""
+    return jnp.stack([_further(grid, values, *step) for step in STEPS])
+
+
+def vertices_of(grid: Grid) -> tuple[Int[jax.Array, " vertices"], Int[jax.Array, " vertices"]]:
+    """(ix, iy) of every number in `Grid.rows`; those that only fill the array come after the last row."""
+    number = jnp.arange(grid.rows.shape[0], dtype=jnp.int32)
+    y = materialise(number // grid.nx)  # once: whole numbers are divided slowly
+    return number - y * grid.nx, y
+
+
+def _places(grid: Grid) -> tuple[Float[jax.Array, " vertices"], Float[jax.Array, " vertices"]]:
+    x, y = vertices_of(grid)
+    return x.astype(grid.rows.dtype), y.astype(grid.rows.dtype)
 
 
 def _steps(dtype: Any) -> tuple[jax.Array, jax.Array]:
-    """From the first vertex of the edges of each kind to the second, in x and in y; shape (3, 1, 1)."""
-    along_x, along_y = (jnp.array(steps, dtype)[:, None, None] for steps in zip(*STEPS, strict=True))
+    """From the first vertex of the edges of each kind to the second, in x and in y; shape (3, 1)."""
+    along_x, along_y = (jnp.array(steps, dtype)[:, None] for steps in zip(*STEPS, strict=True))
     return along_x, along_y
 
 
-def _heights(grid: Grid) -> tuple[Float[jax.Array, "ny nx"], EdgeWeights]:
-    """At the first vertices of edges, and at the second ones; zero in holes and beyond the grid."""
-    z = jnp.where(jnp.isfinite(grid.z), grid.z, 0)
-    return z, materialise(at_second_vertices(z))
+def _heights(grid: Grid) -> tuple[Float[jax.Array, " vertices"], EdgeWeights]:
+    """At the first vertices of edges, and at the second ones; zero in holes."""
+    z = jnp.where(jnp.isfinite(grid.rows), grid.rows, 0)
+    return z, materialise(_at_second_vertices(grid, z))
 
 
 def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
     """The length in the picture, in pixels, of the part of every edge that lies in its frame; hidden or not."""
-    film, (z, second) = camera.film_from_world().of(grid.world_from_grid), _heights(grid)
+    film, z = camera.film_from_world().of(grid.world_from_grid), jnp.where(jnp.isfinite(grid.rows), grid.rows, 0)
+    width, height = size_of(camera)
+    (x, y), across = _places(grid), jnp.asarray(width + height, z.dtype)
 
     def seen(x: jax.Array, y: jax.Array, z: jax.Array) -> list[jax.Array]:
         return [film.linear[k, 0] * x + film.linear[k, 1] * y + film.linear[k, 2] * z + film.offset[k] for k in range(4)]
 
-    (x, y), (along_x, along_y) = _vertices(grid), _steps(z.dtype)
-    a = [jnp.stack([row] * 3) for row in materialise(seen(x, y, z))]
-    b = materialise(seen(x[None] + along_x, y[None] + along_y, second))
-    first, last = materialise(framed_part(camera, a, b))
-    w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
-    ends = [
-        tuple((a[k] + s * (b[k] - a[k])) / jnp.where(w > 0, w, 1) for k in (0, 1))
-        for s, w in zip((first, last), w, strict=True)
-    ]
-    across = jnp.asarray(camera.width + camera.height, a[0].dtype)
-    dx, dy = (jnp.clip(ends[1][k] - ends[0][k], -across, across) for k in (0, 1))
-    return jnp.where(last > first, jnp.sqrt(dx * dx + dy * dy), 0)
+    def length(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
+        first, last = framed_part(camera, a, b)
+        w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
+        ends = [
+            tuple((a[k] + s * (b[k] - a[k])) / jnp.where(w > 0, w, 1) for k in (0, 1))
+            for s, w in zip((first, last), w, strict=True)
+        ]
+        dx, dy = (jnp.clip(ends[1][k] - ends[0][k], -across, across) for k in (0, 1))
+        return jnp.where(last > first, jnp.sqrt(dx * dx + dy * dy), 0)
+
+    a = seen(x, y, z)
+    # Kind by kind, each in one pass: all at once, with what they share in memory, took four times as long.
+    return jnp.stack([length(a, seen(x + dx, y + dy, _further(grid, z, dx, dy))) for dx, dy in STEPS])
 
 
 def framed_part(camera: Camera, a: Any, b: Any) -> tuple[jax.Array, jax.Array]:
@@ -123,13 +166,13 @@ def framed_part(camera: Camera, a: Any, b: Any) -> tuple[jax.Array, jax.Array]:
 
 def _inside(camera: Camera, at: Any) -> tuple[jax.Array, ...]:
     """Positive within each border of the frame, and before the camera."""
-    x, y, w, depth = at[0], at[1], at[2], at[3]
-    return x, camera.width * w - x, y, camera.height * w - y, depth
+    (x, y, w, depth), (width, height) = (at[k] for k in range(4)), size_of(camera)
+    return x, width * w - x, y, height * w - y, depth
 
 
 def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:
     """The length of every edge as seen from a light: projected across its direction; for a point light, as an angle."""
-    world, (x, y), (z, second), (v, at_place) = grid.world_from_grid, _vertices(grid), _heights(grid), light
+    world, (x, y), (z, second), (v, at_place) = grid.world_from_grid, _places(grid), _heights(grid), light
 
     def turned(vx: jax.Array, vy: jax.Array, vz: jax.Array) -> list[jax.Array]:
         return [world.linear[k, 0] * vx + world.linear[k, 1] * vy + world.linear[k, 2] * vz for k in range(3)]

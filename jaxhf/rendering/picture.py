@@ -13,7 +13,8 @@ from jax.sharding import Mesh
 from jaxtyping import Float
 
 from ..boundary.guiding import has_edges
-from ..boundary.term import Boundaries, draw_boundaries, moved_light
+from ..boundary.points import draw_edges
+from ..boundary.term import Boundaries, choose_resampled, moved_light
 from ..core.autodiff import with_tangent
 from ..core.settings import Settings
 from ..core.types import room
@@ -86,7 +87,7 @@ def trace_picture(
 
     def across_boundaries(world: World, camera: Camera, key: jax.Array | None) -> dict[str, jax.Array]:
         others = picture(world, camera) if aovs else {}
-        drawn = draw_boundaries(world, camera, key, mesh)
+        drawn = choose_resampled(draw_edges(world, camera, key, mesh), camera, world.settings)
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
 
     return in_turn(picture, world, camera, key, derivative_of=across_boundaries if has_edges(world) else None)

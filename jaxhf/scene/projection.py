@@ -35,12 +35,17 @@ class Projection(eqx.Module):
         return Projection(jnp.stack([self._vector(world.linear[:, k]) for k in range(3)], axis=1), self(world.offset))
 
 
+def size_of(camera: Any) -> tuple[Any, Any]:
+    """Width and height of a camera's picture, in pixels: as they were given, or as numbers, see `of_any_size`."""
+    return (camera.width, camera.height) if camera._size is None else (camera._size[0], camera._size[1])
+
+
 def screen(camera: Any, x: Any, y: Any) -> tuple[Any, Any]:
     """Pixels to screen coordinates: -1 to 1 along the shorter side, x right, y up."""
+    width, height = size_of(camera)
     if camera._size is None:
-        short = min(camera.width, camera.height)
-        return (2 * x - camera.width) / short, (camera.height - 2 * y) / short
-    width, height = camera._size
+        short = min(width, height)
+        return (2 * x - width) / short, (height - 2 * y) / short
     times = 1 / jnp.minimum(width, height)  # as XLA has it for a constant
     return (2 * x - width) * times, (height - 2 * y) * times
 
@@ -49,10 +54,11 @@ def film(camera: Any, half: Scalar, parallel: bool) -> Projection:
     """The inverse of `screen`: x = (short X / half + width W) / (2 W), W the depth or, of parallel rays, 1; y likewise."""
     inverse = affine(jnp.asarray(camera.world_from_camera)).inverse()
     offset = inverse.offset if camera._ahead is None else inverse.offset.at[2].add(camera._ahead)
-    scale = min(camera.width, camera.height) / (2 * half)
+    width, height = size_of(camera)
+    scale = (min(width, height) if camera._size is None else jnp.minimum(width, height)) / (2 * half)
 
     def rows(p: Any, w: Any) -> jax.Array:
-        return jnp.stack([p[0] * scale + w * (camera.width / 2), -p[1] * scale + w * (camera.height / 2), w, p[2]])
+        return jnp.stack([p[0] * scale + w * (width / 2), -p[1] * scale + w * (height / 2), w, p[2]])
 
     w, w_offset = (jnp.zeros_like(offset), jnp.ones_like(half)) if parallel else (inverse.linear[2], offset[2])
     return Projection(rows(inverse.linear, w), rows(offset, w_offset))

@@ -1,9 +1,7 @@
 """The edges of a heightfield's triangles, by their kinds: 0 along x, 1 along y, 2 along the diagonal.
 
-An edge begins at a vertex, so arrays over edges have shape (3, ny, nx). Those that would leave the grid are there too.
+An edge begins at a vertex, so here arrays over edges have shape (3, ny, nx). Those that would leave the grid are there too.
 """
-
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -12,28 +10,20 @@ from jaxtyping import Bool, Float, Shaped
 # From an edge's first vertex to its second, in x and in y.
 STEPS = ((1, 0), (0, 1), (1, 1))
 
-EdgeFlags = Bool[jax.Array, "3 ny nx"]
-
 
 def whole_cells(z: Float[jax.Array, "ny nx"]) -> Bool[jax.Array, "cells_y cells_x"]:
     """Which cells have all their vertices; a hole is nan."""
     return jnp.isfinite(z[:-1, :-1] + z[:-1, 1:] + z[1:, :-1] + z[1:, 1:])
 
 
-def present_edges(z: Float[jax.Array, "ny nx"]) -> EdgeFlags:
+def present_edges(z: Float[jax.Array, "ny nx"]) -> Bool[jax.Array, "3 ny nx"]:
     """The edges with at least one triangle."""
     present = whole_cells(z)
-    return compare_sides(present, present, lambda a, b: a | b)
+    here, below, left = (jnp.pad(present, sides) for sides in (((0, 1), (0, 1)), ((1, 0), (0, 1)), ((0, 1), (1, 0))))
+    return jnp.stack([here | below, here | left, here])
 
 
 def at_second_vertices(values: Shaped[jax.Array, "ny nx"], beyond: float = 0.0) -> Shaped[jax.Array, "3 ny nx"]:
     """Of values at vertices, those at the second vertices of edges; `beyond` where an edge leaves the grid."""
     (ny, nx), padded = values.shape, jnp.pad(values, ((0, 1), (0, 1)), constant_values=beyond)
     return jnp.stack([padded[iy : iy + ny, ix : ix + nx] for ix, iy in STEPS])
-
-
-def compare_sides(lower: jax.Array, upper: jax.Array, compare: Callable[[jax.Array, jax.Array], jax.Array]) -> jax.Array:
-    """Compares the two triangles of every edge, given values per cell of its two triangles; beyond the border stands zero."""
-    above, right = jnp.pad(lower, ((0, 1), (0, 1))), jnp.pad(upper, ((0, 1), (0, 1)))
-    below, left = jnp.pad(upper, ((1, 0), (0, 1))), jnp.pad(lower, ((0, 1), (1, 0)))
-    return jnp.stack([compare(above, below), compare(right, left), compare(above, right)])

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_fits import rms
+from small_fits import expanded, rms
 from test_expansion import CAMERAS, SUN, scene_of, waves
 
 import jaxhf
@@ -101,3 +101,27 @@ def test_slopes_and_boundaries_between_pixels_make_no_error():
     np.testing.assert_array_equal(sampling_error(jnp.asarray(step), 2), 0)
     within = samples_of(lambda x, y: np.where(x < 11.5, 1.0, 0.0), 2)
     assert (np.asarray(sampling_error(jnp.asarray(within), 2))[:, 11] > 0.1).all()
+
+
+@pytest.mark.deep
+def test_the_sky_that_a_terrain_hides_is_what_render_takes(programs):
+    """It is looked for once, with the points on edges; of terrains of two sizes by the same programs."""
+    sun, shared = jaxhf.Directional((1, 2, 1)), {"_draw_edges_of_any", "_made_world"}
+    for side, others in ((12, set()), (15, shared)):
+        settings = jaxhf.Settings(samples=4, edge_samples=150 + 5 * side)
+        heights = np.random.default_rng(side).uniform(0, 4, (side, side)).astype(np.float32)
+        eye, target = (side / 2, -side, side), (side / 2, side / 2, 0.0)
+        camera = jaxhf.Orthographic.look_at(eye, target, extent=side - 2.0, width=side, height=side)
+        ground = [jaxhf.Object(jaxhf.Heightfield(heights, dx=1.0))]
+        hidden, whole = (jaxhf.Scene(ground, camera, [sun, jaxhf.Sky(1.0, occlusion=n)]) for n in (8, None))
+        programs.clear()
+        here = expanded([hidden], [np.zeros((side, side))], settings=settings, noise=0.1)
+        assert {name for name, _ in programs} & shared == shared - others
+        shown = [np.asarray(jaxhf.render(scene.with_heights(here.heights), settings))[..., 0] for scene in (hidden, whole)]
+        (known,) = here.linearised
+        assert known is not None
+        assert known.edges is not None
+        once = np.isin(np.arange(side * side).reshape(side, side), known.edges.resampled, invert=True)
+        assert 20 < once.sum() < once.size
+        np.testing.assert_allclose(here.pictures()[0][0, ..., 0][once], shown[0][once], atol=1e-5)
+        assert np.abs(shown[1] - shown[0]).max() > 0.1

@@ -4,6 +4,7 @@ This is the only place that knows how J is kept: as `Linearised` pictures, or, w
 depend on more than one triangle, as a program that renders again for each product.
 """
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -25,10 +26,11 @@ from ...rendering.samples import PictureSamples
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, over_spread
+from .edge_points import EdgePoints, EdgePointsEach, draw_edge_points, forms_of_edge_points
 from .linearise import Linearised, LinearisedEdges, SampleRows, changing_pixels, linearise_each
 from .pictures import Group, can_be_linearised, vertex_values, with_albedo, with_material
-from .problem import Problem
-from .unknowns import KNOWN, Basis, Unknowns, View, moved_each
+from .problem import Problem, surface_of
+from .unknowns import KNOWN, Unknowns, View, moved_each
 
 Rows = list[Float[Array, "_ _ _ _"]]
 """A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""
@@ -108,20 +110,22 @@ class Expansion(eqx.Module):
 
 
 def expand(unknowns: Unknowns, problem: Problem, then: Callable[[Expansion], None] = lambda about: None) -> Expansion:
-    """The problem about these unknowns: its pictures are rendered here, by one program.
+    """The problem about these unknowns: points on edges are drawn here, and the pictures rendered, by one program.
 
-    If that must be compiled first, other programs are meanwhile, and `then` is called with an expansion of forms alone.
+    If that must be compiled first, others are meanwhile, and `then` is called with an expansion of forms alone.
     """
     # What enters a compiled program must lie in the same places each time, or it is compiled again for the other ones.
     unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
 
-    def compile_ahead(linearised: tuple[Linearised | None, ...]) -> None:
-        about = on_every_device(Expansion(problem, unknowns, linearised), problem.mesh)
-        then(about)
-        _pull.compile_ahead(about, [group.targets for group in problem.groups])
-        _pictures.compile_ahead(about)
+    def begin() -> None:
+        known = _linearised.compile_ahead(unknowns, problem, forms_of_edge_points(unknowns, problem))
+        with contextlib.suppress(Exception):  # which the user is told of by what is called then
+            if known is not None:  # it is compiled now
+                then(about := on_every_device(Expansion(problem, unknowns, known), problem.mesh))
+                _pull.compile_ahead(about, [group.targets for group in problem.groups])
+                _pictures.compile_ahead(about)
 
-    return Expansion(problem, unknowns, _linearised.meanwhile(compile_ahead, unknowns, problem))
+    return Expansion(problem, unknowns, _linearised(unknowns, problem, draw_edge_points(unknowns, problem, begin)))
 
 
 def residuals(unknowns: Unknowns, about: Expansion) -> tuple[Any, None]:
@@ -142,18 +146,13 @@ def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
     return [surface, *(term.residual(values) for term, values in problem.terms.others(unknowns))]
 
 
-@functools.partial(compiled, jit=eqx.filter_jit, newer=None)
-def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
-    """The heights with their padding, by one program."""
-    return basis.surface(unknowns.coefficients)
-
-
 @functools.partial(compiled, jit=eqx.filter_jit)
-def _linearised(unknowns: Unknowns, problem: Problem) -> tuple[Linearised | None, ...]:
-    def of(group: Group) -> Linearised | None:
-        return linearise_each(group, unknowns, problem) if can_be_linearised(group.scenes, problem.settings) else None
+def _linearised(unknowns: Unknowns, problem: Problem, drawn: EdgePointsEach) -> tuple[Linearised | None, ...]:
+    def of(group: Group, drawn: EdgePoints | None) -> Linearised | None:
+        known = can_be_linearised(group.scenes, problem.settings)
+        return linearise_each(group, unknowns, problem, drawn) if known else None
 
-    return on_every_device(tuple(map(of, problem.groups)), problem.mesh)
+    return on_every_device(tuple(map(of, problem.groups, drawn)), problem.mesh)
 
 
 @functools.partial(compiled, jit=eqx.filter_jit, newer=None)

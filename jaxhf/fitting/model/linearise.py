@@ -19,12 +19,12 @@ from jax import lax
 from jax.sharding import Mesh
 from jaxtyping import Bool, Float, Int
 
-from ...boundary.guiding import has_edges
+from ...boundary.points import Packed, Points
 from ...boundary.sample import BoundarySample, deciding_vertices, picture_point
-from ...boundary.term import Packed, draw_boundaries
+from ...boundary.term import choose_resampled
 from ...core.settings import Settings
 from ...core.types import AnyArray
-from ...preparation.world import World, make_world
+from ...preparation.world import VisibleSky, World, make_world
 from ...rendering.samples import PictureSamples
 from ...scene.camera import Camera
 from ...scene.light import Light
@@ -37,6 +37,7 @@ from ...trace.triangle import Corners, triangle_vertices
 from ...xla.devices import Spread, map_and_spread, map_over, on_every_device
 from ...xla.kernel import one_kernel
 from ...xla.materialise import materialise
+from .edge_points import EdgePoints
 from .pictures import Group, albedo_of
 from .problem import Problem
 from .unknowns import KNOWN, Unknowns, View, moved, with_numbers
@@ -120,16 +121,18 @@ def changing_pixels(known: Linearised) -> Bool[np.ndarray, "n h w"]:
     return found
 
 
-def linearise_each(group: Group, unknowns: Unknowns, problem: Problem) -> Linearised:
+def linearise_each(group: Group, unknowns: Unknowns, problem: Problem, drawn: EdgePoints | None) -> Linearised:
     """The pictures of a group whose scenes `can_be_linearised`, one after the other, and their derivatives in the heights and
-    in what else is sought; leaves have a leading axis of n pictures."""
+    in what else is sought; leaves have a leading axis of n pictures. `drawn`: see `draw_edge_points`."""
     heights, factors = problem.basis.heights(unknowns.coefficients), problem.factors(unknowns)
 
-    def one(seen: tuple[Scene, View]) -> Linearised:
-        scene, view = on_every_device((group.complete(seen[0], heights, factors), seen[1]), problem.mesh)
-        return _linearise(_Seen.of(scene, view, problem.settings), problem.mesh, group.targets.shape[-1], factors)
+    def one(seen: tuple[Scene, View, EdgePoints | None]) -> Linearised:
+        scene, view, drawn = on_every_device((group.complete(seen[0], heights, factors), *seen[1:]), problem.mesh)
+        about = _Seen.of(scene, view, problem.settings, None if drawn is None else drawn.sky)
+        points = None if drawn is None else drawn.points
+        return _linearise(about, points, problem.mesh, group.targets.shape[-1], factors)
 
-    return lax.map(one, (group.scenes, problem.moves(unknowns, group)))
+    return lax.map(one, (group.scenes, problem.moves(unknowns, group), drawn))
 
 
 class _Seen(NamedTuple):
@@ -142,11 +145,10 @@ class _Seen(NamedTuple):
     view: View
 
     @classmethod
-    def of(cls, scene: Scene, view: View, settings: Settings) -> "_Seen":
+    def of(cls, scene: Scene, view: View, settings: Settings, sky: VisibleSky | None) -> "_Seen":
         lights, camera = moved(scene.lights, scene.camera, view)
-        world, material = make_world(scene.with_lights(lights), settings), scene.objects[scene.first_heightfield].material
-        if view.camera is None:
-            world = _with_still_grids(world)
+        world = make_world(scene.with_lights(lights), settings, sky=sky)
+        material = scene.objects[scene.first_heightfield].material
         return cls(_with_material(world, material, view), camera, (scene.lights, scene.camera, material), view)
 
     def moved(self, view: View) -> tuple[World, Camera]:
@@ -160,14 +162,6 @@ class _Seen(NamedTuple):
         return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*leaf.shape, count)), self.view)
 
 
-def _with_still_grids(world: World) -> World:
-    """The world, of whose grids all but the first stay where they are."""
-    surfaces = list(world.surfaces)
-    for k, grid, _ in world.grids[1:]:
-        surfaces[k] = dataclasses.replace(grid, still=True)
-    return dataclasses.replace(world, surfaces=tuple(surfaces))
-
-
 def _with_material(world: World, material: Material | Mirror, view: View) -> World:
     """The world with the first heightfield's material, its numbers moved."""
     number, *_ = world.grids[0]
@@ -175,11 +169,13 @@ def _with_material(world: World, material: Material | Mirror, view: View) -> Wor
     return dataclasses.replace(world, materials=tuple(materials)) if view.names else world
 
 
-def _linearise(seen: _Seen, mesh: Mesh, channels: int, factors: Float[jax.Array, "ty tx k"] | None) -> Linearised:
-    world, camera = seen.world, seen.camera
-    drawn, edge_samples = None, world.settings.edge_samples or 0
-    if has_edges(world):
-        drawn = draw_boundaries(world, camera, None, mesh, math.ceil(edge_samples / _POINTS_PER_PIXEL))
+def _linearise(
+    seen: _Seen, points: Points | None, mesh: Mesh, channels: int, factors: Float[jax.Array, "ty tx k"] | None
+) -> Linearised:
+    world, camera, drawn = seen.world, seen.camera, None
+    if points is not None:
+        resampled = math.ceil((world.settings.edge_samples or 0) / _POINTS_PER_PIXEL)
+        drawn = choose_resampled(points, camera, world.settings, resampled)
     samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
     sampled = functools.partial(_samples, channels, None if factors is None else factors.shape)
     (light, moving), rows = map_and_spread(mesh, lambda *args: one_kernel(sampled, *args), seen, samples.positions())
@@ -188,8 +184,8 @@ def _linearise(seen: _Seen, mesh: Mesh, channels: int, factors: Float[jax.Array,
     if drawn is not None:
         followed = functools.partial(_boundary_samples, channels)
         edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, seen, drawn.contributions)
-        points, _ = drawn.contributions.unpacked()
-        kind = jnp.where(points.valid, jnp.where(points.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
+        found, _ = drawn.contributions.unpacked()
+        kind = jnp.where(found.valid, jnp.where(found.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
         edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled, edge_view)
         finer = samples.of_resampled(light)
         side = math.isqrt(finer.shape[1])

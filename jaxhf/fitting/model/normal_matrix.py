@@ -19,7 +19,8 @@ import scipy.sparse.linalg
 from jaxtyping import Float
 
 from ...scene.heightfield import Heightfield
-from .expansion import Expansion, influence_function, surface_of
+from .expansion import Expansion, influence_function
+from .problem import surface_of
 from .rows import THREADS, Sparse, pictures_by_heights, scaled
 from .unknowns import Unknowns, Window, interpolation, slope_units
 

@@ -1,6 +1,7 @@
 """What a fit minimises, but for the unknowns: pictures with their noise, priors, and how to render."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,6 +19,7 @@ from ...scene.heightfield import Heightfield
 from ...scene.light import Sky
 from ...scene.scene import Scene
 from ...scene.texture import ImageTexture
+from ...xla.compilation import compiled
 from ...xla.devices import chosen_mesh
 from ..given import NOISE_RULE, Given, Unknown
 from .pictures import Group, albedo_of, choose_edge_samples, choose_samples, make_groups
@@ -317,3 +319,9 @@ def _first_unknowns(scenes: Sequence[Scene], basis: Basis, channels: int, unknow
         jax.device_put(np.zeros(count, dtype)) if unknown.offsets else None,
         view,
     )
+
+
+@functools.partial(compiled, jit=eqx.filter_jit, newer=None)
+def surface_of(unknowns: Unknowns, basis: Basis) -> Float[Array, "my mx"]:
+    """The heights with their padding, by one program."""
+    return basis.surface(unknowns.coefficients)

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..given import Given, Step, Stop
-from ..model.expansion import Expansion, expand, surface_of
-from ..model.problem import LOSS_SCALE, Problem
+from ..model.expansion import Expansion, expand
+from ..model.problem import LOSS_SCALE, Problem, surface_of
 from ..model.unknowns import Unknowns, make_basis
 from .noise import Estimate, Restricted, explains_noise, rms, spreads
 from .stages import Stage, State, balanced, on_finer, stages, varies_all, why_ended

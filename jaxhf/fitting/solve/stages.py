@@ -16,8 +16,8 @@ from jaxtyping import Array, Float
 
 from ...io.checkpoint import digest, load_arrays, load_facts_of, save_checkpoint
 from ..given import Given, Step, Stop
-from ..model.expansion import Expansion, surface_of
-from ..model.problem import LOSS_SCALE, Problem
+from ..model.expansion import Expansion
+from ..model.problem import LOSS_SCALE, Problem, surface_of
 from ..model.terms import OCTAVES
 from ..model.unknowns import Unknowns, make_basis, pad, resample, slope_units
 
