@@ -106,6 +106,16 @@ class Called(Exception):
     """Ends a fit at the call that is looked for, with the arguments of this."""
 
 
+class Ending:
+    """In place of a program: raises `Called`; nothing is compiled ahead."""
+
+    def __call__(self, *arguments: Any) -> None:
+        raise Called(*arguments)
+
+    def compile_ahead(self, *arguments: Any) -> None:
+        pass
+
+
 def in_fit(module: Any, name: str, heights: np.ndarray) -> tuple[Any, tuple[Any, ...]]:
     """As `arrays_only`, a function of a module and the arguments with which a fit of one picture first calls it."""
     import jaxhf
@@ -113,10 +123,7 @@ def in_fit(module: Any, name: str, heights: np.ndarray) -> tuple[Any, tuple[Any,
     function, scene = getattr(module, name), make_scene(heights, 128)
     target = np.asarray(jaxhf.render(scene))[..., 0]
 
-    def ended(*arguments: Any) -> None:
-        raise Called(*arguments)
-
-    setattr(module, name, ended)
+    setattr(module, name, Ending())
     try:
         jaxhf.fit([scene], [target], settings=jaxhf.Settings(edge_samples=8192))
     except Called as call:

@@ -75,7 +75,14 @@ PLACES = {  # what stands in these modules alone
     "custom_vmap": RULES,
     "jax.vmap": MAPS_OVER_RAYS | RULES,
     "lax.map(": MAPS_OVER_RAYS
-    | {"xla/devices", "preparation/horizon", "fitting/model/rows", "fitting/model/unknowns", "mujoco/hfield"},
+    | {
+        "xla/devices",
+        "boundary/silhouette",
+        "preparation/horizon",
+        "fitting/model/rows",
+        "fitting/model/unknowns",
+        "mujoco/hfield",
+    },
     "jax.jit": {"xla/compilation", "xla/insides", "xla/kept", "xla/kernel", "xla/masked", "xla/program_calls"},
     "shard_map(": {"xla/devices"},
     "default_backend(": {"xla/devices", "xla/kept", "study/plan"},  # in the last to tell measurements apart

@@ -27,8 +27,8 @@ from .silhouette import EdgeFlags, EdgeWeights, Viewpoint, all_edges, folds, lit
 _TOTAL_WEIGHT = 2**30
 RUN = 32
 """Edges of which a distribution keeps the sum of the weights."""
-# Vertices along the side of the blocks over which a first round of draws is averaged.
-_BLOCK = 8
+# The binary logarithm of vertices along the side of the blocks over which a first round of draws is averaged.
+_BLOCK = 3
 
 
 class EdgeSet(NamedTuple):
@@ -214,9 +214,9 @@ def refined_weights(
         grid = world.surfaces[edges.surface]
         assert isinstance(grid, Grid)
         x, y = vertices_of(grid)
-        block, blocks = y // _BLOCK * (grid.cells[0] // _BLOCK + 1) + x // _BLOCK, edges.vertices // 4 + 1
+        block, blocks = (y >> _BLOCK) * ((grid.cells[0] >> _BLOCK) + 1) + (x >> _BLOCK), edges.vertices // 4 + 1
         here = (edges.first <= edge) & (edge < edges.end)
-        drawn = jnp.where(here, block[(edge - edges.first) % edges.vertices], blocks)  # beyond the last: not counted
+        drawn = jnp.where(here, block[lax.rem(edge - edges.first, edges.vertices)], blocks)  # beyond the last: not counted
         values = jnp.stack([number, found], axis=1)
         of_set = jnp.sum(jnp.where(here[:, None], values, 0), axis=0)
         of_blocks = jnp.zeros((blocks, 2), weights.dtype).at[drawn].add(values, mode="drop")

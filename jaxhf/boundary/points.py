@@ -109,16 +109,25 @@ def _in_parts(draws: int) -> int:
     return math.ceil(draws / PART) * PART if draws > PART else draws
 
 
-def _no_points(size: int, dtype: Any) -> Points:
-    """A chunk that has none."""
-    no, none, at, place = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros((), dtype), jnp.zeros(2, jnp.int32)
-    sample = BoundarySample(
-        valid=no, edge=none, surface=none, light=none, start=place, end=place, s=at, measure=at, receiver=none, cell=place,
-        upper=no, t=at,
-    )  # fmt: skip
-    one = (sample, jnp.zeros((3, 2), dtype)), (none, none, at, at)
-    contributions, seen = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), one)
-    return Points(Packed.of(contributions), Packed.of(seen))
+def _form_of_points(chunks: tuple[int, ...], size: int, dtype: Any) -> Points:
+    """`jax.ShapeDtypeStruct`s in place of points, with axes for chunks."""
+
+    def one_chunk() -> Points:
+        no, none, at, place = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.zeros((), dtype), jnp.zeros(2, jnp.int32)
+        sample = BoundarySample(
+            valid=no, edge=none, surface=none, light=none, start=place, end=place, s=at, measure=at, receiver=none, cell=place,
+            upper=no, t=at,
+        )  # fmt: skip
+        one = (sample, jnp.zeros((3, 2), dtype)), (none, none, at, at)
+        contributions, seen = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), one)
+        return Points(Packed.of(contributions), Packed.of(seen))
+
+    form = jax.eval_shape(one_chunk)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((*chunks, *leaf.shape), leaf.dtype), form)
+
+
+def _zeros(form: Points) -> Points:
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
 
 
 def _draw_rounds(
@@ -162,7 +171,7 @@ def _draw_rounds(
     def if_any(known: tuple[Any, ...], item: tuple[jax.Array, ...]) -> Points:
         """A chunk that a round has, and zeros in place of one for which it has but room."""
         drawn = functools.partial(one_kernel, chunk, *known[1:], *item[1:])
-        return lax.cond(item[0] < known[0], drawn, functools.partial(_no_points, size, dtype))
+        return lax.cond(item[0] < known[0], drawn, functools.partial(_zeros, _form_of_points((), size, dtype)))
 
     weights, numbers = initial_weights(world, camera), jnp.arange(most, dtype=jnp.int32)
 
@@ -189,8 +198,7 @@ def _draw_rounds(
         kept = jax.tree.map(lambda all, part: lax.dynamic_update_slice_in_dim(all, part, before, 0), kept, drawn)
         return (lax.cond(number == 0, refined, lambda guiding: guiding, guiding), kept), None
 
-    kept = jax.tree.map(lambda leaf: jnp.zeros(((ROUNDS - 1) * most, *leaf.shape), leaf.dtype), _no_points(size, dtype))
-    begun = make_distribution(weights, per_round), kept
+    begun = make_distribution(weights, per_round), _zeros(_form_of_points(((ROUNDS - 1) * most,), size, dtype))
     return lax.scan(in_round, begun, jnp.arange(ROUNDS, dtype=jnp.int32))[0][1]
 
 
@@ -242,12 +250,7 @@ def draw_points(
 def form_of_points(edge_samples: int, settings: Settings, dtype: Any) -> Points:
     """`jax.ShapeDtypeStruct`s in place of what `draw_points` returns."""
     chunks, draws = _share(edge_samples, _draws_of_chunk(settings))
-
-    def nothing() -> Points:
-        none = _no_points(_in_parts(draws), dtype)
-        return jax.tree.map(lambda leaf: jnp.zeros(((ROUNDS - 1) * chunks, *leaf.shape), leaf.dtype), none)
-
-    return jax.eval_shape(nothing)
+    return _form_of_points(((ROUNDS - 1) * chunks,), _in_parts(draws), dtype)
 
 
 def _draws_of_chunk(settings: Settings) -> int:

@@ -11,6 +11,7 @@ import pytest
 import jaxhf
 from jaxhf.fitting.given import Given
 from jaxhf.fitting.model import expansion as _expansion
+from jaxhf.fitting.model.edge_points import forms_of_edge_points
 from jaxhf.fitting.model.problem import make_problem
 
 HEIGHTS = (0.1 * np.sin(np.arange(40.0)).reshape(5, 8)).astype(np.float32)
@@ -38,7 +39,9 @@ def linearised(heights: jax.Array) -> list[jax.Array]:
         given = Given(**{name: known[name] for name in Given.__dataclass_fields__})
         made, unknowns = make_problem([scene], [np.zeros((30, 40), np.float32)], given)
     made = eqx.tree_at(lambda problem: problem.basis.base, made, heights)
-    return jax.tree.leaves(_expansion._linearised(unknowns, made))
+    with jax.ensure_compile_time_eval():
+        drawn = jax.tree.map(lambda form: np.zeros(form.shape, form.dtype), forms_of_edge_points(unknowns, made))
+    return jax.tree.leaves(_expansion._linearised(unknowns, made, drawn))
 
 
 PROGRAMS = {
