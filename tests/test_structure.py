@@ -83,7 +83,7 @@ PLACES = {  # what stands in these modules alone
         "fitting/model/unknowns",
         "mujoco/hfield",
     },
-    "jax.jit": {"xla/compilation", "xla/insides", "xla/kept", "xla/kernel", "xla/masked", "xla/program_calls"},
+    "jax.jit": {"xla/compilation", "xla/insides", "xla/kept", "xla/masked", "xla/program_calls"},
     "shard_map(": {"xla/devices"},
     "default_backend(": {"xla/devices", "xla/kept", "study/plan"},  # in the last to tell measurements apart
 }

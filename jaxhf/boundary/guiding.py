@@ -25,8 +25,8 @@ from .silhouette import EdgeFlags, EdgeWeights, Viewpoint, all_edges, folds, lit
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.
 _TOTAL_WEIGHT = 2**30
-RUN = 32
-"""Edges of which a distribution keeps the sum of the weights."""
+# Edges of which a distribution keeps the sum of the weights.
+_RUN = 32
 # The binary logarithm of vertices along the side of the blocks over which a first round of draws is averaged.
 _BLOCK = 3
 
@@ -141,7 +141,7 @@ class GuidingDistribution(eqx.Module):
 
     Attributes:
       weights: of each edge; with zeros behind, so that runs are complete.
-      ends: the sum of the weights up to and with each run of `RUN` edges.
+      ends: the sum of the weights up to and with each run of 32 edges.
       stratum: the weight of each stratum; every draw has a stratum of its own.
       strata: how many there are.
     """
@@ -155,7 +155,7 @@ class GuidingDistribution(eqx.Module):
         """The edge that has the unit of weight of this number, from 0 on; its weight, and that of all edges before it."""
         run = jnp.searchsorted(self.ends, chosen, side="right").astype(jnp.int32)
         run = jnp.minimum(run, self.ends.shape[0] - 1)
-        before, first = jnp.where(run > 0, self.ends[jnp.maximum(run - 1, 0)], 0), run * RUN
+        before, first = jnp.where(run > 0, self.ends[jnp.maximum(run - 1, 0)], 0), run * _RUN
 
         def pass_one(k: Index, found: tuple[Index, Index]) -> tuple[Index, Index]:
             edge, before = found
@@ -163,7 +163,7 @@ class GuidingDistribution(eqx.Module):
             passed = (edge == first + k) & (end <= chosen)
             return jnp.where(passed, edge + 1, edge), jnp.where(passed, end, before)
 
-        edge, before = lax.fori_loop(0, RUN - 1, pass_one, (first, before))
+        edge, before = lax.fori_loop(0, _RUN - 1, pass_one, (first, before))
         return edge, value_at(self.weights, edge), before
 
 
@@ -181,8 +181,8 @@ def make_distribution(weights: Float[jax.Array, " edges"], draws: Index | int) -
     total, positive = jnp.sum(weights), jnp.sum(weights > 0, dtype=jnp.int32)
     most = (_TOTAL_WEIGHT - positive).astype(weights.dtype)  # each may be rounded up by one
     integers = jnp.ceil(weights / jnp.where(total > 0, total, 1) * most).astype(jnp.int32)
-    integers = jnp.pad(integers, (0, -count % RUN))
-    ends = jnp.cumsum(jnp.sum(integers.reshape(-1, RUN), axis=1, dtype=jnp.int32), dtype=jnp.int32)
+    integers = jnp.pad(integers, (0, -count % _RUN))
+    ends = jnp.cumsum(jnp.sum(integers.reshape(-1, _RUN), axis=1, dtype=jnp.int32), dtype=jnp.int32)
     stratum = jnp.maximum((ends[-1] + draws - 1) // draws, 1)
     return GuidingDistribution(integers, ends, stratum, jnp.asarray(draws, jnp.int32))
 

@@ -34,8 +34,8 @@ from .sample import BoundarySample, draw
 
 Tree = TypeVar("Tree")
 
-ROUNDS = 4
-"""The first of this many rounds of draws only refines the guiding distribution."""
+# The first of this many rounds of draws only refines the guiding distribution.
+_ROUNDS = 4
 # A program for any size draws from the edges of so many vertices, or times a power of two: at most twice as many as there are,
 # where arrays of a terrain have room for five times as many. What looks at all edges takes so much longer.
 _VERTICES = 20480
@@ -100,8 +100,8 @@ class Points(eqx.Module):
 
 def _share(edge_samples: int, most: int) -> tuple[int, int]:
     """Into how many chunks the points of a round go, and how many draws each has, at most so many."""
-    chunks = math.ceil(edge_samples / (ROUNDS * most))
-    return chunks, math.ceil(edge_samples / (ROUNDS * chunks))
+    chunks = math.ceil(edge_samples / (_ROUNDS * most))
+    return chunks, math.ceil(edge_samples / (_ROUNDS * chunks))
 
 
 def _in_parts(draws: int) -> int:
@@ -109,6 +109,7 @@ def _in_parts(draws: int) -> int:
     return math.ceil(draws / PART) * PART if draws > PART else draws
 
 
+@functools.cache
 def _form_of_points(chunks: tuple[int, ...], size: int, dtype: Any) -> Points:
     """`jax.ShapeDtypeStruct`s in place of points, with axes for chunks."""
 
@@ -192,14 +193,14 @@ def _draw_rounds(
             mean_speed = jnp.where(mean_speed > 0, mean_speed, 1)  # seen from straight above, lifting moves nothing
             sizes = sizes * (speed + mean_speed)
             edge = jnp.where(numbers[:, None] < chunks, edge, weights.shape[0])
-            return make_distribution(refined_weights(world, weights, edge.ravel(), sizes.ravel()), (ROUNDS - 1) * per_round)
+            return make_distribution(refined_weights(world, weights, edge.ravel(), sizes.ravel()), (_ROUNDS - 1) * per_round)
 
         # Later rounds overwrite the first one, in place: all of them one after the other took a third more memory, and copies.
         kept = jax.tree.map(lambda all, part: lax.dynamic_update_slice_in_dim(all, part, before, 0), kept, drawn)
         return (lax.cond(number == 0, refined, lambda guiding: guiding, guiding), kept), None
 
-    begun = make_distribution(weights, per_round), _zeros(_form_of_points(((ROUNDS - 1) * most,), size, dtype))
-    return lax.scan(in_round, begun, jnp.arange(ROUNDS, dtype=jnp.int32))[0][1]
+    begun = make_distribution(weights, per_round), _zeros(_form_of_points(((_ROUNDS - 1) * most,), size, dtype))
+    return lax.scan(in_round, begun, jnp.arange(_ROUNDS, dtype=jnp.int32))[0][1]
 
 
 def draw_edges(world: World, camera: Camera, key: jax.Array | None, mesh: Mesh) -> Points:
@@ -244,13 +245,13 @@ def draw_points(
     _draw_for_any_size.compile_ahead(*given)
     begin()
     points = _draw_for_any_size(*given)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[: (ROUNDS - 1) * chunks, :, : _in_parts(draws)], points)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[: (_ROUNDS - 1) * chunks, :, : _in_parts(draws)], points)
 
 
 def form_of_points(edge_samples: int, settings: Settings, dtype: Any) -> Points:
     """`jax.ShapeDtypeStruct`s in place of what `draw_points` returns."""
     chunks, draws = _share(edge_samples, _draws_of_chunk(settings))
-    return _form_of_points(((ROUNDS - 1) * chunks,), _in_parts(draws), dtype)
+    return _form_of_points(((_ROUNDS - 1) * chunks,), _in_parts(draws), dtype)
 
 
 def _draws_of_chunk(settings: Settings) -> int:

@@ -66,8 +66,3 @@ def in_turn(fun: _Function, *args: Any, derivative_of: _Function | None = None) 
     plain = jax.custom_jvp(fun)
     plain.defjvp(lambda primals, tangents: jax.jvp(derivative_of, primals, tangents))
     return plain(*args)
-
-
-def traced_once(fun: _Function) -> _Function:
-    """`fun`, which JAX traces once for arguments of one form, however often it is called within a program."""
-    return jax.jit(fun)

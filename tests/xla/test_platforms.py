@@ -40,7 +40,7 @@ def linearised(heights: jax.Array) -> list[jax.Array]:
         made, unknowns = make_problem([scene], [np.zeros((30, 40), np.float32)], given)
     made = eqx.tree_at(lambda problem: problem.basis.base, made, heights)
     with jax.ensure_compile_time_eval():
-        drawn = jax.tree.map(lambda form: np.zeros(form.shape, form.dtype), forms_of_edge_points(unknowns, made))
+        drawn = jax.tree.map(lambda form: np.zeros(form.shape, form.dtype), forms_of_edge_points(made))
     return jax.tree.leaves(_expansion._linearised(unknowns, made, drawn))
 
 

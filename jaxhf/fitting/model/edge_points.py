@@ -71,13 +71,14 @@ def draw_edge_points(unknowns: Unknowns, problem: Problem, begin: Callable[[], N
     return tuple(map(of_group, range(len(problem.groups))))
 
 
-def forms_of_edge_points(unknowns: Unknowns, problem: Problem) -> EdgePointsEach:
-    """`jax.ShapeDtypeStruct`s in place of what `draw_edge_points` returns."""
+def forms_of_edge_points(problem: Problem) -> EdgePointsEach:
+    """`jax.ShapeDtypeStruct`s in place of what `draw_edge_points` returns; no operation of JAX's, as each would be compiled."""
 
     def of_group(number: int) -> EdgePoints | None:
         if not _has_points(problem, number):
             return None
-        scene = jax.tree.map(lambda leaf: leaf[0], problem.groups[number].scenes)
+        scenes = problem.groups[number].scenes
+        scene = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), scenes)
         scene = problem.groups[number].complete(scene, problem.field.heights)
         points = form_of_points(problem.settings.edge_samples or 0, problem.settings, problem.field.heights.dtype)
         one = EdgePoints(points, None if scene.sky_occlusion is None else _sky_forms(scene))

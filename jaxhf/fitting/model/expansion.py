@@ -118,7 +118,7 @@ def expand(unknowns: Unknowns, problem: Problem, then: Callable[[Expansion], Non
     unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
 
     def begin() -> None:
-        known = _linearised.compile_ahead(unknowns, problem, forms_of_edge_points(unknowns, problem))
+        known = _linearised.compile_ahead(unknowns, problem, forms_of_edge_points(problem))
         with contextlib.suppress(Exception):  # which the user is told of by what is called then
             if known is not None:  # it is compiled now
                 then(about := on_every_device(Expansion(problem, unknowns, known), problem.mesh))
