@@ -216,7 +216,8 @@ def refined_weights(
         x, y = vertices_of(grid)
         block, blocks = (y >> _BLOCK) * ((grid.cells[0] >> _BLOCK) + 1) + (x >> _BLOCK), edges.vertices // 4 + 1
         here = (edges.first <= edge) & (edge < edges.end)
-        drawn = jnp.where(here, block[lax.rem(edge - edges.first, edges.vertices)], blocks)  # beyond the last: not counted
+        vertex = lax.rem(edge - edges.first, jnp.asarray(edges.vertices, edge.dtype))
+        drawn = jnp.where(here, block[vertex], blocks)  # beyond the last: not counted
         values = jnp.stack([number, found], axis=1)
         of_set = jnp.sum(jnp.where(here[:, None], values, 0), axis=0)
         of_blocks = jnp.zeros((blocks, 2), weights.dtype).at[drawn].add(values, mode="drop")
