@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxhf
-from jaxhf.boundary.guiding import make_distribution
+from jaxhf.boundary.guiding import initial_weights, make_distribution, refined_weights
 from jaxhf.boundary.points import Points, draw_edges, draw_points
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import make_world, resolve_settings
@@ -23,9 +23,9 @@ PLAIN = jaxhf.Settings(samples=1, edge_samples=0)
 SIZES = (9, 12, 20, 16), (13, 7, 31, 24)
 
 
-def scene(ny: int, nx: int, width: int, height: int, crowded: bool) -> jaxhf.Scene:
+def scene(ny: int, nx: int, width: int, height: int, crowded: bool, dtype: Any = np.float32) -> jaxhf.Scene:
     """Steep bumps with a hole; crowded: and a second heightfield that throws shadows on them, by a second light, too."""
-    heights = np.random.default_rng(ny).uniform(0, 1.5, (ny, nx)).astype(np.float32)
+    heights = np.random.default_rng(ny).uniform(0, 1.5, (ny, nx)).astype(dtype)
     heights[1, 2] = np.nan
     fields = [jaxhf.Heightfield(heights, dx=1.0)]
     lights: list[Any] = [jaxhf.Directional((1, 2, 1))]
@@ -66,6 +66,28 @@ def test_a_program_for_any_size_draws_the_points_of_one_for_its_size(crowded, pr
         np.testing.assert_allclose(flow[:, :draws][valid], its_flow[valid], rtol=1e-3, atol=1e-4)
         for name in ("start", "end", "surface", "light", "receiver", "cell", "upper"):
             np.testing.assert_array_equal(getattr(mine, name)[:, :draws][valid], getattr(theirs, name)[valid], name)
+
+
+def test_weights_are_refined_alike_in_both_precisions():
+    """By 500 draws, some of them beyond all edges, so that both precisions go on to draw the same edges."""
+    rng = np.random.default_rng(0)
+
+    def refined(double: bool) -> np.ndarray:
+        with jax.enable_x64(double):
+            given = scene(*SIZES[0], crowded=False, dtype=np.float64 if double else np.float32)
+            settings = resolve_settings(PLAIN, given)
+
+            def weights(given: jaxhf.Scene, edge: jax.Array, found: jax.Array) -> jax.Array:
+                world = make_world(given, settings)
+                return refined_weights(world, initial_weights(world, given.camera), edge, found)
+
+            return np.asarray(jax.jit(weights)(given, edge, jnp.asarray(found, given.camera.world_from_camera.dtype)))
+
+    edge, found = rng.integers(0, 700, 500).astype(np.int32), rng.uniform(size=500)
+    single, double = refined(False), refined(True)
+    assert (single.dtype, double.dtype) == (np.float32, np.float64)
+    assert (single > 0).sum() > 100
+    np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-6)
 
 
 def test_each_unit_of_weight_has_its_edge():
