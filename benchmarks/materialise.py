@@ -24,7 +24,9 @@ FORMS: dict[str, Callable] = {
 USERS = [
     module
     for name, module in sys.modules.items()
-    if name.startswith("jaxhf.") and vars(module).get("materialise") is materialise
+    if name.startswith("jaxhf.")
+    and vars(module).get("materialise") is materialise
+    and name != materialise.__module__  # where the places of gathers are kept
 ]
 
 

@@ -61,15 +61,13 @@ def with_stored_triangles() -> None:
 
     from jaxhf.preparation import world as _world
     from jaxhf.trace import grid as _grid, intersect as _hit, triangle as _triangle, walk as _walk
+    from jaxhf.xla.materialise import values_at
 
     triangle_corners, make_grid = _triangle.triangle_corners, _world.make_grid
 
-    def at(triangles: jax.Array, place: Any) -> jax.Array:
-        return triangles.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
-
     def corners_of(values: jax.Array, nx: int, ix: jax.Array, iy: jax.Array, grid: Any) -> tuple[jax.Array, ...]:
         first = 6 * (iy * (nx - 1) + ix)
-        return tuple(at(values, first + further) for further in (0, 1, 4, 2))
+        return values_at(values, first, (1, 4, 2))
 
     def triangle_corners_of(
         values: jax.Array, nx: int, ix: jax.Array, iy: jax.Array, upper: jax.Array, grid: Any = None
@@ -77,7 +75,7 @@ def with_stored_triangles() -> None:
         if values.ndim > 1:
             return triangle_corners(values, nx, ix, iy, upper, grid)
         first = 6 * (iy * (nx - 1) + ix) + 3 * upper.astype(ix.dtype)
-        return tuple(at(values, first + further) for further in (0, 1, 2))
+        return values_at(values, first, (1, 2))
 
     def grid_of(*arguments: Any, **options: Any) -> Any:
         grid = make_grid(*arguments, **options)

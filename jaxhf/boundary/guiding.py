@@ -19,8 +19,7 @@ from ..scene.light import Directional, Point, Sun
 from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube
 from ..trace.grid import Grid
-from ..trace.triangle import value_at
-from ..xla.materialise import materialise
+from ..xla.materialise import materialise, value_at
 from .silhouette import EdgeFlags, EdgeWeights, Viewpoint, all_edges, folds, lit_lengths, seen_lengths, silhouettes, vertices_of
 
 # The sum of the integer weights that edges are drawn by: below 2^31 with room for rounding up.

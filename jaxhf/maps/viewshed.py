@@ -23,10 +23,10 @@ from ..scene.heightfield import Heightfield
 from ..trace.grid import Grid, make_grid
 from ..trace.hit import hit_of_closed_form
 from ..trace.skyline import skyline_slope
-from ..trace.triangle import value_at
 from ..xla.compilation import compiled
 from ..xla.devices import chosen_mesh, map_over, on_every_device, takes_numbers
 from ..xla.kernel import one_kernel
+from ..xla.materialise import value_at
 from .choices import WANTED
 from .surface import Surface, require_positive, surface
 

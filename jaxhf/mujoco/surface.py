@@ -135,8 +135,7 @@ def triangle_heights(ground: Ground, ix: Index, iy: Index, upper: Flag) -> tuple
     """The data at the vertices of a triangle, see `triangle_corners`."""
     # XLA on the CPU fuses a gather into its only user; one with several users becomes a loop over its elements, some twenty
     # times as slow.
-    rows, first, ix, iy, upper = materialise((ground.rows, ground.first, ix, iy, upper))
-    return materialise(triangle_corners(rows, ground.shape[1], ix, iy, upper, first))
+    return materialise(triangle_corners(ground.rows, ground.shape[1], ix, iy, upper, ground.first))
 
 
 def nearest(ground: Ground, local: Ray, frame: Affine, found: WalkResult, solid: list[Side]) -> Scan:

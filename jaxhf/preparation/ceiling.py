@@ -11,9 +11,9 @@ from ..core.vector import largest_component
 from ..trace.grid import Grid, triangle_plane
 from ..trace.hit import Hit
 from ..trace.pyramid import beyond
-from ..trace.triangle import value_at
 from ..trace.walk import reciprocal
 from ..trace.walk_start import place_on_grid
+from ..xla.materialise import value_at
 
 
 class Ceiling(eqx.Module):

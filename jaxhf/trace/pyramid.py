@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 
 from ..core.types import Flag, Index, Scalar
 from ..scene.heightfield import next_power_of_two
-from .triangle import value_at
+from ..xla.materialise import value_at
 
 
 class Pyramid(eqx.Module):

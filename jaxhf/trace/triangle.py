@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from ..core.types import Flag, Index, Scalar
+from ..xla.materialise import value_at, values_at
 
 
 class Corners(eqx.Module):
@@ -24,9 +25,7 @@ def corners(
 
     Where that holds several grids, `grid` is the place of the grid's first vertex.
     """
-    first = iy * nx + ix
-    first = first if grid is None else first + grid
-    return tuple(value_at(rows, first + further) for further in (0, 1, nx, nx + 1))
+    return values_at(rows, _place(nx, ix, iy, grid), (1, nx, nx + 1))
 
 
 def triangle_corners(
@@ -36,20 +35,20 @@ def triangle_corners(
 
     `grid` is as in `corners`.
     """
-    places = triangle_vertices(nx, ix, iy, upper)
-    first, between, last = (place if grid is None else place + grid for place in places)
-    return value_at(rows, first), value_at(rows, between), value_at(rows, last)
+    first = _place(nx, ix, iy, grid)
+    z00, z11 = values_at(rows, first, (nx + 1,))
+    return z00, value_at(rows, first + jnp.where(upper, nx, 1)), z11
+
+
+def _place(nx: Index | int, ix: Index, iy: Index, grid: Index | None) -> Index:
+    first = iy * nx + ix
+    return first if grid is None else first + grid
 
 
 def triangle_vertices(nx: Index | int, ix: Index, iy: Index, upper: Flag) -> tuple[Index, Index, Index]:
     """The numbers of these vertices, row by row."""
-    first = iy * nx + ix
+    first = _place(nx, ix, iy, None)
     return first, first + jnp.where(upper, nx, 1), first + nx + 1
-
-
-def value_at(rows: jax.Array, index: Index) -> jax.Array:
-    """The value in a place that is in range."""
-    return rows.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def plane_through(heights: Any, upper: Flag) -> tuple[Scalar, Scalar, Scalar]:

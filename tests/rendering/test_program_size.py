@@ -48,10 +48,10 @@ def traced(settings: jaxhf.Settings, transform: Callable[..., Any]) -> list[Any]
 @pytest.mark.parametrize(
     ("settings", "transform", "bound"),
     [
-        pytest.param(jaxhf.Settings(), lambda loss: loss, 3950, id="frame"),
-        pytest.param(jaxhf.Settings(samples=4), jax.value_and_grad, 5250, id="gradient"),
+        pytest.param(jaxhf.Settings(), lambda loss: loss, 4050, id="frame"),
+        pytest.param(jaxhf.Settings(samples=4), jax.value_and_grad, 5350, id="gradient"),
         pytest.param(
-            jaxhf.Settings(samples=4, edge_samples=1000), jax.value_and_grad, 15800, id="edges", marks=pytest.mark.deep
+            jaxhf.Settings(samples=4, edge_samples=1000), jax.value_and_grad, 15950, id="edges", marks=pytest.mark.deep
         ),
     ],
 )
