@@ -31,7 +31,7 @@ from ..scene.light import Point
 from ..scene.projection import size_of
 from ..shade.lighting import sharp_lights
 from ..trace.cylinder import Tube
-from ..trace.edges import STEPS
+from ..trace.edges import step_of
 from ..trace.grid import Grid
 from ..trace.triangle import plane_through, triangle_corners, triangle_vertices
 from ..xla.materialise import materialise
@@ -91,7 +91,7 @@ def draw(world: World, camera: Camera, guiding: GuidingDistribution, k: Index, u
     start, none = jnp.stack([vertex % nx, vertex // nx]), jnp.zeros((), jnp.int32)
     point = BoundarySample(
         valid=valid, edge=jnp.where(valid, edge, sets[-1].end), surface=surface, light=light, start=start,
-        end=start + jnp.array(STEPS, jnp.int32)[kind], s=s, measure=measure, receiver=none, cell=jnp.zeros(2, jnp.int32),
+        end=start + step_of(kind), s=s, measure=measure, receiver=none, cell=jnp.zeros(2, jnp.int32),
         upper=jnp.zeros((), bool), t=jnp.zeros((), dtype),
     )  # fmt: skip
     # Of an edge that is seen where it stands, only the part in the frame is drawn from.

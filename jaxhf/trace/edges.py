@@ -5,10 +5,17 @@ An edge begins at a vertex, so here arrays over edges have shape (3, ny, nx). Th
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
+
+from ..core.types import Index
 
 # From an edge's first vertex to its second, in x and in y.
 STEPS = ((1, 0), (0, 1), (1, 1))
+
+
+def step_of(kind: Index) -> Int[jax.Array, "2"]:
+    """That of an edge of this kind, without a look-up."""
+    return jnp.stack([kind != 1, kind != 0]).astype(jnp.int32)
 
 
 def whole_cells(z: Float[jax.Array, "ny nx"]) -> Bool[jax.Array, "cells_y cells_x"]:

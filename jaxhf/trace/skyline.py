@@ -17,6 +17,7 @@ from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import greater, lesser, quotient
 from ..xla.materialise import materialise, values_at
+from .edges import step_of
 from .grid import Grid, triangle_plane
 from .hit import Hit
 from .search import SKIPS, until_ended
@@ -110,7 +111,7 @@ def _slope_to(grid: Grid, o: Vector, level: Vector, edge: Index, above: bool) ->
     """
     known, edge = edge >= 0, jnp.maximum(edge, 0)
     first, kind, nx = edge // 3, edge % 3, grid.nx
-    step = jnp.stack([kind != 1, kind != 0]).astype(jnp.int32)  # as `edges.STEPS`, without a look-up
+    step = step_of(kind)
     z0, z1 = values_at(grid.rows, first, (step[1] * nx + step[0],))
     known = known & jnp.isfinite(z0 + z1)
     z0, z1 = jnp.where(known, z0, 0), jnp.where(known, z1, 0)

@@ -14,6 +14,7 @@ from jaxhf.boundary.points import Points, draw_edges, draw_points
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import make_world, resolve_settings
 from jaxhf.rendering.render import prepared_world
+from jaxhf.trace.edges import STEPS, step_of
 from jaxhf.xla.devices import local_mesh
 
 ONE = local_mesh(1)
@@ -88,6 +89,10 @@ def test_weights_are_refined_alike_in_both_precisions():
     assert (single.dtype, double.dtype) == (np.float32, np.float64)
     assert (single > 0).sum() > 100
     np.testing.assert_allclose(single, double, rtol=1e-3, atol=1e-6)
+
+
+def test_steps_along_edges_without_a_look_up_are_those_of_the_table():
+    np.testing.assert_array_equal(jax.vmap(step_of)(jnp.arange(3)), STEPS)
 
 
 def test_each_unit_of_weight_has_its_edge():
