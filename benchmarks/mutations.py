@@ -53,8 +53,8 @@ maps: maps/hillshade.py maps/slope.py maps/surface.py maps/choices.py -> maps/te
 maps: maps/r*.py io/terrain/colours.py -> maps/test_maps.py cli/test_hillshade.py '-k=tint or colour or pales or adds'
 maps: maps/shadows.py -> maps/test_shadows.py
 maps: maps/skyview.py maps/windows.py -> maps/test_skyview.py
-mujoco: mujoco/[hprs]*[dreys].py -> mujoco/test_sensors.py mujoco/test_ray.py --optimised
-mujoco: mujoco/scan.py -> mujoco/test_scan.py --optimised
+mujoco: mujoco/[hprs]*[dreys].py -> mujoco/test_sensors.py mujoco/test_ray.py --optimised=tests
+mujoco: mujoco/scan.py -> mujoco/test_scan.py --optimised=tests
 io: io/pictures/[ceip]*.py -> io/test_images.py io/test_full_disk.py
 io: io/files.py io/pictures/films.py -> io/test_images.py io/test_files.py io/test_full_disk.py
 io: scene/procedural.py -> scene/test_procedural.py

@@ -1,7 +1,7 @@
 """Tests run as users run jaxhf, in single precision and without flags, but for two things.
 
 Types and ranks do not promote by themselves; and programs are compiled without most optimisations, in half the time. What
-needs the bits or the speed of users' programs is marked `optimised`; `--optimised` compiles them all so.
+needs the bits or the speed of users' programs is marked `optimised`; `--optimised FOLDER` compiles all of a folder so.
 """
 
 import gc
@@ -47,7 +47,8 @@ SEEDS = Path(__file__).parents[2] / "shared" / "pbrt"
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--optimised", action="store_true", help="compile every test's programs as users do")
+    said = "compile programs of all tests in a folder as users do, say --optimised tests/trace; again for another"
+    parser.addoption("--optimised", action="append", default=[], metavar="FOLDER", help=said)
     parser.addoption("--no-skips", action="store_true", help="fail where a test was skipped")
 
 
@@ -90,7 +91,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """
     x64 = item.get_closest_marker("x64")
     jax.config.update("jax_enable_x64", x64 is not None and x64.args != (False,))
-    optimised = item.config.option.optimised or any(map(item.get_closest_marker, ("optimised", "slow")))
+    optimised = any(map(item.get_closest_marker, ("optimised", "slow")))
+    optimised |= any(item.path.is_relative_to(item.config.rootpath / folder) for folder in item.config.option.optimised)
     if jax.config.read("jax_disable_most_optimizations") == optimised:
         jax.clear_caches()  # which do not know how their programs were compiled
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(not optimised)

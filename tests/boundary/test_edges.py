@@ -325,7 +325,7 @@ DIRECTIONS = {
 }
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_whole_picture_against_central_differences():
     """Every leaf that moves boundaries, seen in perspective; the interior part alone is far off."""
     scene, errors = whole_scene(), {}

@@ -101,7 +101,7 @@ FLAT = dataclasses.replace(NO_EDGES, shading="flat", samples=4)
     [
         (NO_EDGES, (3,), "single", MOST),
         pytest.param(NO_EDGES, (1, 3), "double", EVERYTHING, marks=[pytest.mark.x64, pytest.mark.slow]),
-        pytest.param(NO_EDGES, (1, 3), "double", SHARED, marks=[pytest.mark.x64, pytest.mark.deep]),
+        pytest.param(NO_EDGES, (1, 3), "double", SHARED, marks=[pytest.mark.x64, pytest.mark.slow]),
         pytest.param(EDGES, (3,), "double", KNOWN_LAW, marks=[pytest.mark.x64, pytest.mark.deep]),
         pytest.param(FLAT, (3,), "double", KNOWN_LAW, marks=[pytest.mark.x64, pytest.mark.deep]),
     ],

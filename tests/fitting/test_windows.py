@@ -74,7 +74,7 @@ PAINTED = jaxhf.ImageTexture(TEXELS, at_vertices=True)
     ("name", "albedo", "count"),
     [
         ("perspective", PAINTED, 1),
-        pytest.param("perspective", PAINTED, 3, marks=pytest.mark.deep),
+        pytest.param("perspective", PAINTED, 3, marks=pytest.mark.slow),
         pytest.param("orthographic", 0.7, 3, marks=pytest.mark.deep),
     ],
 )

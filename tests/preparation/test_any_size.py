@@ -93,7 +93,7 @@ def test_another_terrain_needs_no_other_program(make, pixels, traced):
     [
         (scene, [SIZES[1], (17, 40)]),
         pytest.param(holed, SIZES[1:2], marks=pytest.mark.deep),
-        pytest.param(of_two, [(17, 40)], marks=pytest.mark.deep),
+        pytest.param(of_two, [(17, 40)], marks=pytest.mark.slow),
     ],
 )
 def test_pictures_are_those_of_a_program_for_their_terrain(make, shapes, monkeypatch):
@@ -119,7 +119,7 @@ def with_holes(shape: tuple[int, int]) -> jaxhf.Scene:
     return plain.with_heights(holed(shape).heights).with_lights([jaxhf.Directional((-0.2, 1.0, 0.6)), *plain.lights])
 
 
-@pytest.mark.parametrize("make", [solid, pytest.param(with_holes, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("make", [solid, pytest.param(with_holes, marks=pytest.mark.slow)])
 def test_one_program_makes_worlds_of_many_sizes_where_mountains_hide_the_sky(make, compilations, monkeypatch):
     """As one for their size does, but for the rounding of normals; also what is made of them for another light."""
     shapes = (40, 50), (60, 47), (65, 34), (66, 40)  # the last one has a side beyond 65, up to which a program serves

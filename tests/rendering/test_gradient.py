@@ -190,7 +190,7 @@ DEEP, SLOW, X64 = pytest.mark.deep, pytest.mark.slow, pytest.mark.x64
 PRECISIONS = [
     pytest.param("plain", *SINGLE, id="plain, single"),
     pytest.param("plain", *DOUBLE, marks=[DEEP, X64], id="plain, double"),
-    pytest.param("parallel", *SINGLE, marks=DEEP, id="parallel, single"),
+    pytest.param("parallel", *SINGLE, marks=SLOW, id="parallel, single"),
     pytest.param("parallel", *DOUBLE, marks=[DEEP, X64], id="parallel, double"),
     pytest.param("reflected", *SINGLE, marks=SLOW, id="reflected, single"),
     pytest.param("reflected", *DOUBLE, marks=[DEEP, SLOW, X64], id="reflected, double"),

@@ -98,7 +98,7 @@ def test_other_lights_shine_on_it_as_on_one_grid(light):
     assert np.mean(np.abs(nested - one).max(-1) > 1e-3 * np.max(one)) <= 2 / 4096
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_the_fine_terrain_sees_as_much_of_the_sky_as_on_one_grid():
     """The coarse one sees it from its own vertices, and so differs; but it does see less where the fine one hides it."""
     *_, fine, around, whole = terrains()
