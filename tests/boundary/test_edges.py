@@ -228,7 +228,7 @@ def test_boundary_pixels_are_looked_at_again():
     assert np.abs(finer - jaxhf.render(scene, INTERIOR)[..., 0] / 0.7).max() > 0.1 * LIT
 
 
-@pytest.mark.deep  # each agrees with a truth: here forwards, in rendering/test_users.py in reverse
+@pytest.mark.slow  # each agrees with a truth: here forwards, in rendering/test_users.py in reverse
 def test_forward_and_reverse_agree():
     scene = shadow_scene()
     rng = np.random.default_rng(0)

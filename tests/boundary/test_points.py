@@ -49,7 +49,7 @@ def by_its_own(given: jaxhf.Scene, edge_samples: int) -> Points:
     return drawn(given)
 
 
-@pytest.mark.parametrize("crowded", [False, pytest.param(True, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("crowded", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_program_for_any_size_draws_the_points_of_one_for_its_size(crowded, programs):
     """Of terrains and pictures of two sizes, and of two numbers of points: of one chunk, and of three."""
     given = [scene(*size, crowded) for size in SIZES]

@@ -79,7 +79,7 @@ def test_one_picture_tells_slopes_from_an_albedo_that_hangs_together():
     assert np.corrcoef(np.log(np.asarray(found.albedo)).ravel(), np.log(painted(1)).ravel())[0, 1] > 0.85
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_factors_each_for_itself_explain_the_picture_by_paint():
     found, off = found_with(jaxhf.Unknown(albedo="map", albedo_std=STD))
     assert off > 1

@@ -168,6 +168,6 @@ def test_errors_of_a_map_are_asked_of_the_pictures(monkeypatch):
     assert asked < 0.8 * fitted_to_a_map(None)
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_a_map_is_as_good_without_the_length_of_its_errors():
     assert fitted_to_a_map(None) < 1.1 * fitted_to_a_map(2.1)

@@ -75,7 +75,7 @@ PAINTED = jaxhf.ImageTexture(TEXELS, at_vertices=True)
     [
         ("perspective", PAINTED, 1),
         pytest.param("perspective", PAINTED, 3, marks=pytest.mark.slow),
-        pytest.param("orthographic", 0.7, 3, marks=pytest.mark.deep),
+        pytest.param("orthographic", 0.7, 3, marks=pytest.mark.slow),
     ],
 )
 def test_a_part_of_a_picture_shows_the_window_in_its_surroundings(name, albedo, count):

@@ -53,7 +53,7 @@ def of_two(shape: tuple[int, int]) -> jaxhf.Scene:
     )
 
 
-@pytest.mark.deep
+@pytest.mark.slow
 def test_a_terrain_with_a_seam_has_no_room_of_another_of_its_size():
     """So what lies far below it changes nothing: neither its normals at the seam nor the horizons of both its parts."""
     x, y = np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-1, 1, 16))
@@ -67,7 +67,7 @@ def test_a_terrain_with_a_seam_has_no_room_of_another_of_its_size():
     np.testing.assert_allclose(jaxhf.render(jaxhf.Scene([*surface, below], camera, lights), SETTINGS), expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("make", [scene, pytest.param(solid, marks=pytest.mark.deep)])
+@pytest.mark.parametrize("make", [scene, pytest.param(solid, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("pixels", [72, 24])  # by the program for any size, by one for this
 def test_another_terrain_needs_no_other_program(make, pixels, traced):
     settings = dataclasses.replace(SETTINGS, max_depth=1000 + pixels)  # programs of this test alone
@@ -92,7 +92,7 @@ def test_another_terrain_needs_no_other_program(make, pixels, traced):
     ("make", "shapes"),
     [
         (scene, [SIZES[1], (17, 40)]),
-        pytest.param(holed, SIZES[1:2], marks=pytest.mark.deep),
+        pytest.param(holed, SIZES[1:2], marks=pytest.mark.slow),
         pytest.param(of_two, [(17, 40)], marks=pytest.mark.slow),
     ],
 )

@@ -202,8 +202,7 @@ def test_the_seam_bounds_nothing(shading):
     assert points(unmarked(fine), unmarked(around)) > 0
 
 
-@pytest.mark.deep
-@pytest.mark.parametrize("points", [0, 20_000])
+@pytest.mark.parametrize("points", [pytest.param(0, marks=pytest.mark.deep), pytest.param(20_000, marks=pytest.mark.slow)])
 def test_the_derivative_is_that_of_one_grid(points):
     *_, fine, around, whole = terrains()
     change = np.random.default_rng(0).normal(size=fine.heights.shape)

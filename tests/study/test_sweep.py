@@ -246,7 +246,7 @@ def test_short_runs_are_repeated(monkeypatch):
         assert len(runs) == count
 
 
-@pytest.mark.deep  # each part of it is in the tests above
+@pytest.mark.slow  # each part of it is in the tests above
 def test_a_real_sweep(tmp_path, sweep):
     words = [sys.executable, "-m", "jaxhf", *command(sweep, "precision", "--repeats", "3", "--markdown")]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)

@@ -61,7 +61,7 @@ def check(ground: aimed.Ground, seed: int) -> np.ndarray:
 @pytest.mark.optimised
 @pytest.mark.parametrize(
     "shapes",
-    [SHAPES[1:4:2], pytest.param(SHAPES[:3:2], marks=pytest.mark.deep), pytest.param(SHAPES[4:], marks=pytest.mark.deep)],
+    [SHAPES[1:4:2], pytest.param(SHAPES[:3:2], marks=pytest.mark.deep), pytest.param(SHAPES[4:], marks=pytest.mark.slow)],
     ids=["small", "narrow", "large"],
 )
 def test_no_leak(shapes):
