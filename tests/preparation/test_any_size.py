@@ -92,7 +92,7 @@ def test_another_terrain_needs_no_other_program(make, pixels, traced):
     ("make", "shapes"),
     [
         (scene, [SIZES[1], (17, 40)]),
-        pytest.param(holed, SIZES[1:2], marks=pytest.mark.slow),
+        pytest.param(holed, SIZES[1:2], marks=pytest.mark.deep),
         pytest.param(of_two, [(17, 40)], marks=pytest.mark.slow),
     ],
 )
