@@ -309,7 +309,7 @@ def test_a_height_that_is_held_tells_of_those_beside_it(targets):
         jaxhf.Prior(0.1, 0.02, 0.25, "held.tif")
 
 
-@pytest.mark.slow  # test_expansion has its products
+@pytest.mark.deep
 def test_a_mirror_beside_the_terrain_goes_the_same_way(targets):
     """Whose samples depend on more than one triangle: then pictures are rendered again for each product."""
     mirror = jaxhf.Object(jaxhf.Heightfield(np.full((2, 2), 0.5), dx=0.1, x0=0.2, y0=0.4), jaxhf.Mirror(0.9))

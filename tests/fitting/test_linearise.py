@@ -117,11 +117,11 @@ def test_the_sky_that_a_terrain_hides_is_what_render_takes(programs):
         programs.clear()
         here = expanded([hidden], [np.zeros((side, side))], settings=settings, noise=0.1)
         assert {name for name, _ in programs} & shared == shared - others
-    shown = [np.asarray(jaxhf.render(scene.with_heights(here.heights), settings))[..., 0] for scene in (hidden, whole)]
-    (known,) = here.linearised
-    assert known is not None
-    assert known.edges is not None
-    once = np.isin(np.arange(side * side).reshape(side, side), known.edges.resampled, invert=True)
-    assert 20 < once.sum() < once.size
-    np.testing.assert_allclose(here.pictures()[0][0, ..., 0][once], shown[0][once], atol=1e-5)
-    assert np.abs(shown[1] - shown[0]).max() > 0.1
+        shown = [np.asarray(jaxhf.render(scene.with_heights(here.heights), settings))[..., 0] for scene in (hidden, whole)]
+        (known,) = here.linearised
+        assert known is not None
+        assert known.edges is not None
+        once = np.isin(np.arange(side * side).reshape(side, side), known.edges.resampled, invert=True)
+        assert 20 < once.sum() < once.size
+        np.testing.assert_allclose(here.pictures()[0][0, ..., 0][once], shown[0][once], atol=1e-5)
+        assert np.abs(shown[1] - shown[0]).max() > 0.1

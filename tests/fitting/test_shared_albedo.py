@@ -38,9 +38,10 @@ def found(kind: str, seed: int, shared: bool, **options: Any) -> jaxhf.Fit:
     return jaxhf.fit(scenes(albedo=albedo), targets, unknown=unknown, settings=SETTINGS, noise=NOISE, prior=PRIOR, **options)
 
 
-DEEP, SLOW = pytest.mark.deep, pytest.mark.slow  # test_expansion.py has their derivatives
+DEEP, SLOW = pytest.mark.deep, pytest.mark.slow
 
 
+# test_expansion.py has their derivatives.
 @pytest.mark.parametrize("kind", [pytest.param(kind, marks=DEEP if kind == "texels" else SLOW) for kind in KINDS])
 def test_factors_that_channels_share_are_found(kind):
     """Three times as many values tell each: where it stands for itself it is √3 times nearer; the heights are no worse.

@@ -53,7 +53,7 @@ def of_two(shape: tuple[int, int]) -> jaxhf.Scene:
     )
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 def test_a_terrain_with_a_seam_has_no_room_of_another_of_its_size():
     """So what lies far below it changes nothing: neither its normals at the seam nor the horizons of both its parts."""
     x, y = np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-1, 1, 16))

@@ -175,7 +175,7 @@ def test_derivatives_agree(found, name):
     assert np.abs(slope).max() > 1e-5
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 def test_derivatives_of_boundaries_agree_over_devices(found):
     """In single precision a sample of a boundary may go to the next edge."""
     (one,), (four,) = found("more on one"), found("more on four")

@@ -249,7 +249,7 @@ def test_hapkes_roughness_has_a_corner_where_light_and_eye_are_as_high(roughness
     np.testing.assert_allclose(sides[1] / sides[0] - 1, corner, atol=0.005)
 
 
-@pytest.mark.slow  # two of the largest programs
+@pytest.mark.deep  # two of the largest programs
 def test_what_rays_met_has_its_derivative_beside_points_on_edges():
     terrain = parallel()
     scene = in_precision(jaxhf.Scene(terrain.objects[:1], terrain.camera, terrain.lights), np.float32)  # without the skirt
