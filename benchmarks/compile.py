@@ -28,7 +28,7 @@ PROGRAMS = {
     "inside": "the same within a `jax.jit`",
     "gradient": "a picture, 4 samples, and the gradient of a loss in the heights",
     "edges": "the same with 1e4 points on edges",
-    "linearise": "a fit's picture with its derivative, with points on edges",
+    "linearise": "a fit's picture with its derivative, without points on edges",
     "step": "a step of a fit, from that",
 }
 FIT = """
@@ -141,10 +141,11 @@ def program(name: str, size: int) -> tuple[Any, tuple[Any, ...]]:
 
     heights = fractal([size, size], seed=3, exponent=2.4, range=(0.0, 0.15)).astype(np.float32)
     if name in ("linearise", "step"):
-        from jaxhf.fitting.model import expansion
+        from jaxhf.fitting.model import sample_rows
         from jaxhf.fitting.solve import steps
 
-        return in_fit(expansion, "_linearised", heights) if name == "linearise" else in_fit(steps, "_advance", heights)
+        module, function = (sample_rows, "_rows_of_samples") if name == "linearise" else (steps, "_advance")
+        return in_fit(module, function, heights)
     if name == "frame":
         from jaxhf.preparation.localise import localise
         from jaxhf.preparation.world import make_world, resolve_settings

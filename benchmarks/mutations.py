@@ -64,7 +64,7 @@ io: io/terrain/meshes.py -> io/test_meshes.py
 io: io/gdal.py io/terrain/g*.py -> io/test_grids.py io/test_terrain.py io/test_rasters.py
 io: io/terrain/[lrst]*.py -> io/test_terrain.py io/test_grids.py io/test_rasters.py
 boundary: boundary/*.py -> boundary
-fitting: fitting/model/linearise.py -> fitting/test_linearise.py
+fitting: fitting/model/linearise.py fitting/model/sample_rows.py -> fitting/test_linearise.py fitting/test_expansion.py
 fitting: fitting/solve/sta*.py -> fitting/test_fit_parts.py fitting/test_fit_stops.py fitting/test_linearise.py
 fitting: fitting/model/n*.py fitting/solve/noise.py -> fitting/test_normal_matrix.py fitting/test_noise.py
 fitting: fitting/model/rows.py -> fitting/test_normal_matrix.py fitting/test_noise.py

@@ -65,9 +65,9 @@ def test_imports_follow_the_flow():
 
 
 MAPS_OVER_RAYS = {
-    "rendering/tiles", "rendering/samples", "rendering/render", "rendering/cast", "rendering/chunks", "boundary/term",
+    "rendering/tiles", "rendering/render", "rendering/cast", "rendering/chunks", "boundary/term",
     "boundary/points",
-    "fitting/model/linearise", "fitting/model/expansion", "maps/viewshed", "mujoco/geoms", "mujoco/primitives",
+    "fitting/model/sample_rows", "fitting/model/expansion", "maps/viewshed", "mujoco/geoms", "mujoco/primitives",
     "mujoco/scan", "mujoco/sensors", "preparation/sky", "xla/insides", "xla/kernel", "xla/program_calls",
 }  # fmt: skip
 RULES = {"xla/masked", "trace/search"}  # of what `vmap` makes of a call

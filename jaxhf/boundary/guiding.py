@@ -28,6 +28,9 @@ _TOTAL_WEIGHT = 2**30
 _RUN = 32
 # The binary logarithm of vertices along the side of the blocks over which a first round of draws is averaged.
 _BLOCK = 3
+# Pixels from the picture's border, within which an edge bounds nothing of it: else rounding would decide where a terrain fills
+# the picture.
+_BORDER = 0.01
 
 
 class EdgeSet(NamedTuple):
@@ -103,7 +106,7 @@ def boundary_length(world: World, camera: Camera) -> Scalar:
     """
     total = jnp.zeros((), camera.world_from_camera.dtype)
     for _, grid, _ in world.grids:
-        lengths = seen_lengths(grid, camera)
+        lengths = seen_lengths(grid, camera, _BORDER)
         total = total + jnp.sum(jnp.where(silhouettes(grid, camera.viewpoint()), lengths, 0))
         for _, light in sharp_lights(world) if world.settings.shadows else ():
             total = total + jnp.sum(jnp.where(folds(grid, _viewpoint(light)), lengths, 0))

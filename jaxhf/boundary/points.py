@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any, Generic, TypeVar
 
 import equinox as eqx
@@ -79,7 +79,7 @@ class Packed(eqx.Module, Generic[Tree]):
             real, size = jnp.issubdtype(dtype, jnp.floating), math.prod(shape)
             first = taken[real]
             taken[real] += size
-            part = jnp.moveaxis((self.whole, self.real)[real][..., first : first + size, :], -2, -1)
+            part = (self.whole, self.real)[real][..., first : first + size, :].swapaxes(-2, -1)
             leaves.append(part.reshape(*part.shape[:-1], *shape).astype(dtype))
         return jax.tree.unflatten(structure, leaves)
 
@@ -226,32 +226,42 @@ def require_edges_followed(shapes: Iterable[Any], edge_samples: int) -> None:
         raise ArgumentError("Settings", "edge_samples", rule)
 
 
-def draw_points(
-    world: World, camera: Camera, mesh: Mesh, edge_samples: int, still: bool, begin: Callable[[], None] = lambda: None
-) -> Points:
-    """As `draw_edges`, by a program for terrains and pictures of any size; NumPy's arrays.
+def draw_points(world: World, camera: Camera, mesh: Mesh, edge_samples: int, still: bool) -> Points:
+    """As `draw_edges`, by a program for terrains and pictures of any size, with room behind the points, see `asked_for`.
 
     Args:
       world, camera, mesh: as for `render`.
       edge_samples: how many points are drawn.
       still: whether only the edges of the first heightfield move in the picture; of the others then only shadows do.
-      begin: called while the program is being compiled, if it must be, and before it is called.
     """
+    return _draw_for_any_size(*_arguments(world, camera, mesh, edge_samples, still))
+
+
+def compile_points_ahead(world: World, camera: Camera, mesh: Mesh, edge_samples: int, still: bool) -> Points:
+    """The program of `draw_points`; `jax.ShapeDtypeStruct`s in place of what that returns."""
+    _draw_for_any_size.compile_ahead(*_arguments(world, camera, mesh, edge_samples, still))
+    most, size = _room_for(world.settings, edge_samples)
+    return _form_of_points(((_ROUNDS - 1) * most,), size, camera.world_from_camera.dtype)
+
+
+def asked_for(edge_samples: int, settings: Settings) -> tuple[int, int]:
+    """How many of the chunks of what `draw_points` returns count, and how many points of each."""
+    chunks, draws = _share(edge_samples, _draws_of_chunk(settings))
+    return (_ROUNDS - 1) * chunks, _in_parts(draws)
+
+
+def _arguments(world: World, camera: Camera, mesh: Mesh, edge_samples: int, still: bool) -> tuple[Any, ...]:
     known = [math.prod(grid.known_shape) for _, grid, _ in world.grids if grid.known_shape is not None]
     vertices = _VERTICES << (math.ceil(max(known) / _VERTICES) - 1).bit_length()
-    (chunks, draws), size = _share(edge_samples, _draws_of_chunk(world.settings)), _in_parts(_draws_of_chunk(world.settings))
-    share, most = (np.asarray(chunks, np.int32), np.asarray(draws, np.int32)), max(next_power_of_two(chunks), _CHUNKS)
-    given = of_any_terrain(world), of_any_size(camera), mesh, share, vertices, most, size, still
-    _draw_for_any_size.compile_ahead(*given)
-    begin()
-    points = _draw_for_any_size(*given)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[: (_ROUNDS - 1) * chunks, :, : _in_parts(draws)], points)
+    share = tuple(np.asarray(number, np.int32) for number in _share(edge_samples, _draws_of_chunk(world.settings)))
+    room = _room_for(world.settings, edge_samples)
+    return of_any_terrain(world), of_any_size(camera), mesh, share, vertices, *room, still
 
 
-def form_of_points(edge_samples: int, settings: Settings, dtype: Any) -> Points:
-    """`jax.ShapeDtypeStruct`s in place of what `draw_points` returns."""
-    chunks, draws = _share(edge_samples, _draws_of_chunk(settings))
-    return _form_of_points(((_ROUNDS - 1) * chunks,), _in_parts(draws), dtype)
+def _room_for(settings: Settings, edge_samples: int) -> tuple[int, int]:
+    """For how many chunks a round of a program for any number of points has room, and a chunk for how many draws."""
+    chunks, _ = _share(edge_samples, _draws_of_chunk(settings))
+    return max(next_power_of_two(chunks), _CHUNKS), _in_parts(_draws_of_chunk(settings))
 
 
 def _draws_of_chunk(settings: Settings) -> int:

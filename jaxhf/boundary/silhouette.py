@@ -121,8 +121,11 @@ def _heights(grid: Grid) -> tuple[Float[jax.Array, " vertices"], EdgeWeights]:
     return z, materialise(_at_second_vertices(grid, z))
 
 
-def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
-    """The length in the picture, in pixels, of the part of every edge that lies in its frame; hidden or not."""
+def seen_lengths(grid: Grid, camera: Camera, margin: float = 0.0) -> EdgeWeights:
+    """The length in the picture, in pixels, of the part of every edge that lies in its frame; hidden or not.
+
+    `margin`: by how much the frame is narrower than the picture, pixels.
+    """
     film, z = camera.film_from_world().of(grid.world_from_grid), jnp.where(jnp.isfinite(grid.rows), grid.rows, 0)
     width, height = size_of(camera)
     (x, y), across = _places(grid), jnp.asarray(width + height, z.dtype)
@@ -135,7 +138,7 @@ def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
     def of_kind(step: tuple[jax.Array, jax.Array]) -> jax.Array:
         dx, dy = step
         b = seen(x + dx.astype(z.dtype), y + dy.astype(z.dtype), _further(grid, z, dx, dy))
-        first, last = framed_part(camera, a, b)
+        first, last = framed_part(camera, a, b, margin)
         w = [a[2] + s * (b[2] - a[2]) for s in (first, last)]
         ends = [
             tuple((a[k] + s * (b[k] - a[k])) / jnp.where(w > 0, w, 1) for k in (0, 1))
@@ -148,7 +151,7 @@ def seen_lengths(grid: Grid, camera: Camera) -> EdgeWeights:
     return lax.map(of_kind, tuple(jnp.array(STEPS, jnp.int32).T))
 
 
-def framed_part(camera: Camera, a: Any, b: Any) -> tuple[jax.Array, jax.Array]:
+def framed_part(camera: Camera, a: Any, b: Any, margin: float = 0.0) -> tuple[jax.Array, jax.Array]:
     """Between which s the points a + s (b - a) lie in the picture's frame and before the camera; first > last: nowhere.
 
     Clipping in homogeneous coordinates (Liang and Barsky, ACM TOG 3(1), 1984; Blinn and Newell 1978).
@@ -156,9 +159,10 @@ def framed_part(camera: Camera, a: Any, b: Any) -> tuple[jax.Array, jax.Array]:
     Args:
       camera: whose frame it is.
       a, b: the coordinates of `Projection`, scalars or arrays.
+      margin: by how much the frame is narrower than the picture, pixels.
     """
     first, last = jnp.zeros_like(a[0]), jnp.ones_like(a[0])
-    for at_a, at_b in zip(_inside(camera, a), _inside(camera, b), strict=True):
+    for at_a, at_b in zip(_inside(camera, a, margin), _inside(camera, b, margin), strict=True):
         cut = at_a / jnp.where(at_a == at_b, 1, at_a - at_b)
         first = jnp.where((at_a < 0) & (at_b > 0), jnp.maximum(first, cut), first)
         last = jnp.where((at_a > 0) & (at_b < 0), jnp.minimum(last, cut), last)
@@ -166,10 +170,11 @@ def framed_part(camera: Camera, a: Any, b: Any) -> tuple[jax.Array, jax.Array]:
     return first, last
 
 
-def _inside(camera: Camera, at: Any) -> tuple[jax.Array, ...]:
+def _inside(camera: Camera, at: Any, margin: float) -> tuple[jax.Array, ...]:
     """Positive within each border of the frame, and before the camera."""
     (x, y, w, depth), (width, height) = (at[k] for k in range(4)), size_of(camera)
-    return x, width * w - x, y, height * w - y, depth
+    borders = x, width * w - x, y, height * w - y
+    return *(at - margin * w if margin else at for at in borders), depth
 
 
 def lit_lengths(grid: Grid, light: Viewpoint) -> EdgeWeights:

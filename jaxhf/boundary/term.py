@@ -40,11 +40,11 @@ class Boundaries(eqx.Module):
     resampled: Int[jax.Array, " pixels"]
 
 
-def choose_resampled(points: Points, camera: Camera, settings: Settings, resampled: int | None = None) -> Boundaries:
-    """Points with the pixels that change most; so many, or, if that is None, as many as take `edge_samples` samples."""
+def choose_resampled(points: Points, camera: Camera, settings: Settings) -> Boundaries:
+    """Points with the pixels that change most, as many as take `edge_samples` samples."""
     pixel, _, sizes, _ = (values.ravel() for values in points.seen.unpacked())
     all_pixels = camera.width * camera.height
-    count = math.ceil((settings.edge_samples or 0) / resampled_side(settings) ** 2) if resampled is None else resampled
+    count = math.ceil((settings.edge_samples or 0) / resampled_side(settings) ** 2)
     # They are chosen by the boundaries alone: a choice by the picture's own samples would keep what these happen to miss.
     _, chosen = lax.top_k(jnp.zeros(all_pixels, sizes.dtype).at[pixel].add(sizes), min(count, all_pixels))
     return Boundaries(points.contributions, pixel, chosen.astype(jnp.int32))

@@ -35,9 +35,6 @@ from .sky import visible_sky
 Ceilings = tuple[tuple[Ceiling | None, ...], ...]
 """For each light and each object."""
 
-VisibleSky = tuple[Float[jax.Array, "_ 3"] | None, ...]
-"""For each object."""
-
 
 class World(eqx.Module):
     """A scene made ready for tracing, with the settings for which it was made.
@@ -58,7 +55,7 @@ class World(eqx.Module):
     materials: tuple[Material | Mirror, ...]
     lights: tuple[Light, ...]
     ceilings: Ceilings
-    sky: VisibleSky
+    sky: tuple[Float[jax.Array, "_ 3"] | None, ...]
     settings: Settings = eqx.field(static=True)
     has_room: bool = eqx.field(static=True, default=False)
 
@@ -81,13 +78,8 @@ def resolve_settings(settings: Settings, scene: Scene) -> Settings:
     return dataclasses.replace(settings, samples=side**2, edge_samples=settings.edge_samples or 0)
 
 
-def make_world(
-    scene: Scene, settings: Settings, sizes: Sequence[Size | None] | None = None, sky: VisibleSky | None = None
-) -> World:
-    """Prepares what does not depend on the ray; `scene` must be `localise`d.
-
-    `sizes`: of objects whose size is data. `sky`: that of `World`, where it is known.
-    """
+def make_world(scene: Scene, settings: Settings, sizes: Sequence[Size | None] | None = None) -> World:
+    """Prepares what does not depend on the ray; `scene` must be `localise`d. `sizes`: of objects whose size is data."""
     settings = resolve_settings(settings, scene)
     sizes = sizes or [None] * len(scene.objects)
     surfaces = tuple(
@@ -98,12 +90,12 @@ def make_world(
         materials=tuple(obj.material for obj in scene.objects),
         lights=scene.lights,
         ceilings=make_ceilings(surfaces, scene.lights, settings),
-        sky=_hidden_sky(surfaces, scene.sky_occlusion) if sky is None else sky,
+        sky=_hidden_sky(surfaces, scene.sky_occlusion),
         settings=settings,
     )
 
 
-def _hidden_sky(surfaces: tuple[Surface, ...], azimuths: int | None) -> VisibleSky:
+def _hidden_sky(surfaces: tuple[Surface, ...], azimuths: int | None) -> tuple[Float[jax.Array, "_ 3"] | None, ...]:
     return tuple(
         visible_sky(surface, azimuths, _joined_to(surface, surfaces)) if azimuths and isinstance(surface, Grid) else None
         for surface in surfaces

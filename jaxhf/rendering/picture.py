@@ -22,8 +22,9 @@ from ..preparation.any_size import of_any_terrain
 from ..preparation.world import World
 from ..scene.camera import Camera, of_any_size
 from ..xla.compilation import compiled, is_part_of_more
-from ..xla.devices import by_device, everywhere, map_over, on_every_device
+from ..xla.devices import everywhere, map_over, on_every_device
 from ..xla.kernel import in_turn, one_kernel
+from ..xla.parts import by_item, in_parts
 from .samples import PictureSamples
 from .tiles import Tiling, light_along, tile_side, trace_tiles
 
@@ -41,7 +42,7 @@ def picture(world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, key
         return trace_picture(*_at_its_size(world, camera, aovs, mesh, key, is_part))
     if mesh.devices.size > 1:  # of whose parts XLA makes many copies, on each device
         return everywhere(trace_in_parts(world, camera, aovs, mesh, None), mesh)
-    parts = [part for _, part in _parts(world, camera, aovs, mesh, _at_once(world.settings, mesh))]
+    parts = [part for *_, part in _parts(world, camera, aovs, mesh, _at_once(world.settings, mesh))]
     return _assembled(parts, camera.width, camera.height, world.settings)
 
 
@@ -127,15 +128,13 @@ def trace_in_parts(
             progress(pixels, pixels)
         return found
     size = most if progress is None else min(most, max(math.ceil(tiling.count / 64), most // tiling.samples))
-    whole, devices = (tiling.rows * tiling.side, tiling.columns * tiling.side), mesh.devices.size
-    for first, part in _parts(world, camera, aovs, mesh, size):
-        done = min(first + size, tiling.count)
-        for name, values in part.items():
-            for device, tiles in enumerate(by_device(values, devices)):
-                numbers = np.arange(first + device, done, devices)
+    whole = tiling.rows * tiling.side, tiling.columns * tiling.side
+    for first, done, part in _parts(world, camera, aovs, mesh, size):
+        for numbers, tiles in by_item(part, first, done, mesh.devices.size):
+            for name, values in tiles.items():
                 if name not in found:
-                    found[name] = room((*whole, *tiles.shape[2:]), tiles.dtype)
-                tiling.place(tiles[: len(numbers)], numbers, found[name])
+                    found[name] = room((*whole, *values.shape[2:]), values.dtype)
+                tiling.place(values, np.arange(tiling.count)[numbers], found[name])
         if progress is not None:
             progress(min(pixels, done * pixels // tiling.count), pixels)
     return {name: values[: tiling.height, : tiling.width] for name, values in found.items()}
@@ -143,19 +142,15 @@ def trace_in_parts(
 
 def _parts(
     world: World, camera: Camera, aovs: tuple[str, ...], mesh: Mesh, size: int
-) -> Iterator[tuple[int, dict[str, jax.Array]]]:
-    """So many tiles after the other, as `map_first` leaves them, with the number of the first; while one part is taken the next
-    is being traced."""
-    most = _at_once(world.settings, mesh)
+) -> Iterator[tuple[int, int, dict[str, jax.Array]]]:
+    """(first, end, tiles) of so many tiles after the others, as `map_first` leaves them."""
+    seen = of_any_terrain(world), of_any_size(camera)
+
+    def traced(corners: np.ndarray, count: np.int32) -> dict[str, jax.Array]:
+        return _trace_tiles(mesh, *seen, aovs, corners, count)
+
     corners = Tiling(camera.width, camera.height, world.settings).corners()
-    seen, traced = (of_any_terrain(world), of_any_size(camera)), []
-    for first in range(0, len(corners), size):
-        some = corners[first : first + size]
-        padded = np.concatenate([some, np.zeros((most - len(some), 2), np.int32)])
-        traced.append((first, _trace_tiles(mesh, *seen, aovs, padded, np.int32(len(some)))))
-        if len(traced) > 1:
-            yield traced.pop(0)
-    yield from traced
+    return in_parts(traced, corners, size, _at_once(world.settings, mesh))
 
 
 @functools.partial(compiled, newer=True, static_argnames=("width", "height", "settings"))

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from ..core.autodiff import recomputed
 from ..core.settings import Settings
-from ..core.types import Index, Scalar, Vector
+from ..core.types import AnyArray, Index, Scalar, Vector
 from ..preparation.world import World, first_hit
 from ..scene.camera import Camera
 from ..shade.radiance import radiance, radiance_and_hit
@@ -87,12 +87,12 @@ def trace_tiles(
     return map_first(mesh, traced, (world, camera), corners, count)
 
 
-def sample_offset(k: Int[jax.Array, "*n"], side: int, dtype: Any) -> tuple[Float[jax.Array, "*n"], Float[jax.Array, "*n"]]:
+def sample_offset(k: Int[AnyArray, "*n"], side: int, dtype: Any) -> tuple[Float[AnyArray, "*n"], Float[AnyArray, "*n"]]:
     """The k-th sample's position in its pixel, 0..1 each way: the centres of a regular grid.
 
     With the box filter of a pixel's width, the pixel is the mean of its samples.
     """
-    return ((k % side).astype(dtype) + 0.5) / side, ((k // side).astype(dtype) + jnp.asarray(0.5, dtype)) / side
+    return ((k % side).astype(dtype) + 0.5) / side, ((k // side).astype(dtype) + np.asarray(0.5, dtype)) / side
 
 
 @recomputed

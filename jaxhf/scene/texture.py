@@ -52,14 +52,18 @@ class ImageTexture(eqx.Module):
             )
 
     def __call__(self, uv: Point2) -> Vector:
-        texels = jnp.asarray(self.texels)
-        return _mixed(self._between(uv), lambda row, column: texels[row, column])
+        return _mixed(self._between(uv), self.at)
 
-    def corners(self, uv: Point2) -> tuple[Int[jax.Array, "4"], Int[jax.Array, "4"], Float[jax.Array, "4"]]:
-        """The rows and columns of the four texels between which a colour is looked up, and their weights."""
-        (low, high, fy), (left, right, fx) = self._between(uv)
-        rows, columns = jnp.stack([low, low, high, high]), jnp.stack([left, right, left, right])
-        return rows, columns, jnp.stack([(1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx])
+    def at(self, row: Int[AnyArray, "*n"], column: Int[AnyArray, "*n"]) -> Float[jax.Array, "*n 3"]:
+        """The colour of a texel, or of each of some."""
+        return jnp.asarray(self.texels)[row, column]
+
+    @property
+    def columns(self) -> int:
+        return self.texels.shape[1]
+
+    def corners(self, uv: Point2) -> "Corners":
+        return _corners(self._between(uv))
 
     def _between(self, uv: Point2) -> "tuple[_Between, _Between]":
         h, w, _ = self.texels.shape
@@ -87,12 +91,34 @@ class FlatTexture(eqx.Module):
         return cls(texels, size[0], size[1], image.at_vertices, image.wrap)
 
     def __call__(self, uv: Point2) -> Vector:
-        between = _between(uv, jnp.asarray(self.h), jnp.asarray(self.w), self.at_vertices, self.wrap)
-        return _mixed(between, lambda row, column: self.texels[row * self.w + column])
+        return _mixed(self._between(uv), self.at)
+
+    def at(self, row: Int[AnyArray, "*n"], column: Int[AnyArray, "*n"]) -> Float[jax.Array, "*n 3"]:
+        """As of `ImageTexture`."""
+        return jnp.asarray(self.texels)[row * self.w + column]
+
+    @property
+    def columns(self) -> Index:
+        return jnp.asarray(self.w)
+
+    def corners(self, uv: Point2) -> "Corners":
+        return _corners(self._between(uv))
+
+    def _between(self, uv: Point2) -> "tuple[_Between, _Between]":
+        return _between(uv, jnp.asarray(self.h), jnp.asarray(self.w), self.at_vertices, self.wrap)
 
 
 _Between = tuple[Index, Index, Scalar]
 """Two rows or columns of an image, and the share of the way from the first to the second."""
+
+Corners = tuple[Int[jax.Array, "4"], Int[jax.Array, "4"], Float[jax.Array, "4"]]
+"""The rows and columns of the four texels between which a colour is looked up, and their weights."""
+
+
+def _corners(between: tuple[_Between, _Between]) -> Corners:
+    (low, high, fy), (left, right, fx) = between
+    rows, columns = jnp.stack([low, low, high, high]), jnp.stack([left, right, left, right])
+    return rows, columns, jnp.stack([(1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx])
 
 
 def _between(uv: Point2, h: Index, w: Index, at_vertices: bool, wrap: Wrap) -> tuple[_Between, _Between]:

@@ -118,12 +118,18 @@ def on_every_device(tree: Any, mesh: Mesh) -> Any:
     same values.
     """
 
+    return tree if _at_home(mesh) else _placed_each(lambda leaf, place=P(): _placed(leaf, mesh, place), tree, mesh)
+
+
+def _placed_each(place: Callable[..., Any], tree: Any, mesh: Mesh) -> Any:
+    """`place(leaf)` of each, and `place(leaf, its place)` of what is `Spread`."""
+
     def placed(leaf: Any) -> Any:
         if isinstance(leaf, Spread):
-            return jax.tree.map(lambda part: _placed(part, mesh, P(None, mesh.axis_names)), leaf)
-        return _placed(leaf, mesh, P())
+            return jax.tree.map(lambda part: place(part, P(None, mesh.axis_names)), leaf)
+        return place(leaf)
 
-    return tree if _at_home(mesh) else jax.tree.map(placed, tree, is_leaf=lambda leaf: isinstance(leaf, Spread))
+    return jax.tree.map(placed, tree, is_leaf=lambda leaf: isinstance(leaf, Spread))
 
 
 def held_everywhere(tree: Any, mesh: Mesh) -> Any:
@@ -136,16 +142,18 @@ def held_everywhere(tree: Any, mesh: Mesh) -> Any:
 
 
 def everywhere(tree: Any, mesh: Mesh) -> Any:
-    """NumPy's arrays, the same ones in each process, on each device of a mesh; they may not be changed from then on, as CPU
-    devices take those that begin as XLA's do, see `room`, as they are."""
+    """NumPy's arrays, the same ones in each process, on each device of a mesh; what is `Spread` is divided among them. They may
+    not be changed from then on, as CPU devices take those that begin as XLA's do, see `room`, as they are."""
 
-    def copied(values: np.ndarray) -> jax.Array:
+    def copied(values: np.ndarray, place: P = P()) -> jax.Array:
         if not values.flags.c_contiguous:
             values, parts = room(values.shape, values.dtype), values
             values[...] = parts
-        return jax.make_array_from_callback(values.shape, NamedSharding(mesh, P()), lambda index: values[index])
+        if _at_home(mesh):
+            return jax.device_put(values)
+        return jax.make_array_from_callback(values.shape, NamedSharding(mesh, place), lambda index: values[index])
 
-    return jax.tree.map(copied, tree)
+    return _placed_each(copied, tree, mesh)
 
 
 def divided(tree: Any, mesh: Mesh) -> Any:
@@ -196,15 +204,6 @@ def on_host(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
-def by_device(leaf: jax.Array, devices: int) -> list[np.ndarray]:
-    """What each of so many devices has of an array whose first axis is divided among them, as `map_first` leaves it; where CPU
-    devices of one process hold it, without a copy."""
-    if devices == 1 or not leaf.is_fully_addressable:
-        return np.split(on_host(leaf), devices)
-    shards = sorted(leaf.addressable_shards, key=lambda shard: shard.index[0].start)
-    return [np.asarray(shard.data) for shard in shards]
-
-
 def where_called(owner: str, tree: Any) -> Any:
     """For what uses one device: within `jax.set_mesh` a copy of its arrays on each device, else the arrays where they are.
 
@@ -240,13 +239,40 @@ def map_over(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any
       shared: a pytree of arrays.
       items: a pytree of arrays whose leading axis counts the items.
     """
-    return map_and_spread(mesh, lambda shared, item: (fun(shared, item), ()), shared, items)[0]
+
+    def one_after_the_other(shared: Any, items: Any) -> Any:
+        return lax.map(lambda item: fun(shared, item), items)
+
+    devices, n = mesh.devices.size, jax.tree.leaves(items)[0].shape[0]
+    if devices == 1:
+        return one_after_the_other(shared, items)
+    around = jax.sharding.get_abstract_mesh()
+    if AxisType.Explicit in around.axis_types:
+        dealt_out: Any = jax.sharding.auto_axes(functools.partial(map_over, mesh, fun), out_sharding=P())
+        return dealt_out(shared, items)
+    given = mesh if around.empty else around
+    turns = _turns(n, devices)
+    over = jax.shard_map(
+        lambda shared, items: one_after_the_other(shared, jax.tree.map(lambda leaf: leaf[0], items)),
+        mesh=given,
+        in_specs=(P(), P(mesh.axis_names)),
+        out_specs=P(mesh.axis_names),
+        check_vma=False,
+    )
+
+    def in_order(values: jax.Array) -> jax.Array:
+        # Before anything is made of it, or XLA would take sums in parts, in another order than on one device.
+        values = lax.with_sharding_constraint(values, NamedSharding(given, P()))
+        tail = values.shape[1:]
+        return values.reshape(devices, -1, *tail).swapaxes(0, 1).reshape(-1, *tail)[:n]
+
+    return jax.tree.map(in_order, over(shared, jax.tree.map(lambda leaf: leaf[turns], items)))
 
 
 def map_first(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Any, count: Any) -> Any:
     """`fun(shared, item)` for the first `count` items, a number that is data, dealt out in turn to the devices of a mesh.
 
-    Results stay where they are made, those of one device after those of the other; see `by_device`. Those of further
+    Results stay where they are made, those of one device after those of the other; see `by_item`. Those of further
     items are 0. Has no reverse derivative.
     """
 
@@ -287,47 +313,6 @@ def _turns(n: int, devices: int) -> np.ndarray:
     """Which items each device has; the last one is given out again, until each has as many."""
     count = math.ceil(n / devices)
     return np.minimum(np.arange(count * devices), n - 1).reshape(count, devices).T
-
-
-def in_order(devices: int, values: Any) -> Any:
-    """Results in the order of the items that were dealt out in turn to so many devices, and those of the last one again."""
-    tail = values.shape[1:]
-    return values.reshape(devices, -1, *tail).swapaxes(0, 1).reshape(-1, *tail)
-
-
-def map_and_spread(mesh: Mesh, fun: Callable[[Any, Any], tuple[Any, Any]], shared: Any, items: Any) -> tuple[Any, Any]:
-    """`map_over` for the first of two results of `fun`. The second ones stay divided among the devices: in a row, to which so
-    many more of the last are added that each device has as many."""
-
-    def one_after_the_other(shared: Any, items: Any) -> Any:
-        return lax.map(lambda item: fun(shared, item), items)
-
-    devices, n = mesh.devices.size, jax.tree.leaves(items)[0].shape[0]
-    if devices == 1:
-        return one_after_the_other(shared, items)
-    around = jax.sharding.get_abstract_mesh()
-    if AxisType.Explicit in around.axis_types:
-        dealt_out: Any = jax.sharding.auto_axes(functools.partial(map_and_spread, mesh, fun), out_sharding=P())
-        return dealt_out(shared, items)
-    given = mesh if around.empty else around
-    turns = _turns(n, devices)
-    over = jax.shard_map(
-        lambda shared, items: one_after_the_other(shared, jax.tree.map(lambda leaf: leaf[0], items)),
-        mesh=given,
-        in_specs=(P(), P(mesh.axis_names)),
-        out_specs=P(mesh.axis_names),
-        check_vma=False,
-    )
-
-    def gathered(values: jax.Array) -> jax.Array:
-        # Before anything is made of it, or XLA would take sums in parts, in another order than on one device.
-        return in_order(devices, lax.with_sharding_constraint(values, NamedSharding(given, P())))[:n]
-
-    def spread(values: jax.Array) -> jax.Array:
-        return lax.with_sharding_constraint(in_order(devices, values), NamedSharding(given, P(mesh.axis_names)))
-
-    first, second = over(shared, jax.tree.map(lambda leaf: leaf[turns], items))
-    return jax.tree.map(gathered, first), jax.tree.map(spread, second)
 
 
 def over_spread(mesh: Mesh, fun: Callable[[Any, Any], Any], shared: Any, items: Spread) -> Any:

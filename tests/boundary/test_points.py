@@ -10,7 +10,7 @@ import pytest
 
 import jaxhf
 from jaxhf.boundary.guiding import initial_weights, make_distribution, refined_weights
-from jaxhf.boundary.points import Points, draw_edges, draw_points
+from jaxhf.boundary.points import Points, asked_for, draw_edges, draw_points
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import make_world, resolve_settings
 from jaxhf.rendering.render import prepared_world
@@ -38,9 +38,13 @@ def scene(ny: int, nx: int, width: int, height: int, crowded: bool, dtype: Any =
 
 
 def by_any(given: jaxhf.Scene, edge_samples: int) -> Points:
-    """With 64 draws a chunk, so that there may be several."""
+    """With 64 draws a chunk, so that there may be several; without what it has but room for."""
     settings = dataclasses.replace(resolve_settings(PLAIN, given), chunk=128)
-    return draw_points(prepared_world(given, settings), given.camera, ONE, edge_samples, still=False)
+    points = draw_points(prepared_world(given, settings), given.camera, ONE, edge_samples, still=False)
+    chunks, draws = asked_for(edge_samples, settings)
+    beyond = points.contributions.unpacked()[0].valid.at[:chunks, :draws].set(False)
+    assert not beyond.any()
+    return jax.tree.map(lambda leaf: leaf[:chunks, :, :draws], points)
 
 
 def by_its_own(given: jaxhf.Scene, edge_samples: int) -> Points:

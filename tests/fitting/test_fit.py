@@ -51,7 +51,7 @@ def test_what_follows_the_pictures_is_compiled_beside_them(targets, programs):
     jaxhf.fit(scenes(), targets, **OPTIONS)
     names, beside = [name for name, _ in programs], {name for name, other in programs if other}
     assert len(names) == len(set(names))
-    assert beside == {"_linearised", "_advance", "_pull", "_pictures"}
+    assert beside == {"_made_world", "_rows_of_samples", "_advance", "_pull"}
 
 
 def test_another_fit_of_the_same_size_compiles_nothing(targets, compilations):

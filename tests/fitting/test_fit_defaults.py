@@ -10,7 +10,6 @@ from small_fits import CAMERA, SETTINGS, TRUTH, expanded, given, off_in_shape, p
 
 import jaxhf
 from jaxhf.fitting.given import Draws
-from jaxhf.fitting.model import pictures as _pictures
 from jaxhf.fitting.model.normal_matrix import NormalMatrix, in_row
 from jaxhf.fitting.model.pictures import choose_edge_samples, choose_samples
 from jaxhf.fitting.solve.noise import spreads
@@ -87,13 +86,26 @@ def test_edges_take_part_where_boundaries_are_in_sight():
     assert choose_samples([flat], jaxhf.Settings(samples=1)).samples == 1
 
 
-def test_the_length_of_boundaries_is_one_program(monkeypatch):
-    """Whether edges are to be chosen for the first time, or once more beside those of the start."""
-    asked = []
-    monkeypatch.setattr(_pictures, "_boundary_length", lambda _, settings: asked.append(settings) or 0.0)
-    for edge_samples in (None, 2048):
-        choose_edge_samples([localise(scenes()[0])], jaxhf.Settings(samples=4, edge_samples=edge_samples))
-    assert asked[0] == asked[1]
+def test_the_length_of_boundaries_is_one_program(programs):
+    """At the start and later, of terrains and pictures of any size."""
+    for side, edge_samples in ((12, None), (12, 2048), (15, None)):
+        camera = dataclasses.replace(scenes()[0].camera, width=side)
+        scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(np.zeros((side, side), np.float32)))], camera, [jaxhf.Sky(0.3)])
+        choose_edge_samples([localise(scene)], jaxhf.Settings(samples=4, edge_samples=edge_samples))
+    assert [name for name, _ in programs].count("boundary_length") == 1
+
+
+@pytest.mark.parametrize("side", [24, 100])
+def test_a_border_that_stands_at_the_pictures_own_is_no_boundary(side):
+    """Where a terrain fills its picture rounding says now and then that some of the border is within."""
+    field, half = jaxhf.Heightfield(np.zeros((side, side), np.float32), dx=1.0), (side - 1) / 2
+
+    def points(extent: float) -> int:
+        eye, target = (half, half, 50.0), (half, half, 0.0)
+        camera = jaxhf.Orthographic.look_at(eye, target, up=(0, 1, 0), extent=extent, width=side, height=side)
+        return choose_edge_samples([localise(jaxhf.Scene([jaxhf.Object(field)], camera, [jaxhf.Sky(1.0)]))], jaxhf.Settings())
+
+    assert points(side - 1.0) == 0 < points(side - 0.9)
 
 
 def test_edges_take_part_where_the_measured_pictures_show_shadows():

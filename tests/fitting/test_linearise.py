@@ -10,7 +10,7 @@ from test_expansion import CAMERAS, SUN, scene_of, waves
 
 import jaxhf
 from jaxhf.boundary.sample import BoundarySample, deciding_vertices, picture_point
-from jaxhf.fitting.model.linearise import _sampling_error
+from jaxhf.fitting.model.linearise import _errors_of, _sampling_error
 from jaxhf.fitting.model.pictures import can_be_linearised
 from jaxhf.preparation.localise import localise
 from jaxhf.preparation.world import make_world
@@ -67,9 +67,6 @@ def test_what_a_mirror_or_a_sun_with_a_size_shows_has_no_such_matrix():
     assert can_be_linearised(world(jaxhf.Mirror(0.5), SUN), jaxhf.Settings(max_depth=0))
 
 
-sampling_error = jax.jit(_sampling_error, static_argnums=1)
-
-
 def samples_of(picture, side: int, pixels: int = 24) -> np.ndarray:
     """A picture's regular samples, row by row; x to the right, y down, a pixel is 1 wide."""
     y, x = (np.mgrid[0 : pixels * side, 0 : pixels * side] + 0.5) / side
@@ -87,7 +84,7 @@ def samples_of(picture, side: int, pixels: int = 24) -> np.ndarray:
 )
 def test_errors_of_few_samples_are_known(picture, least, most, side):
     """The root mean squares of errors and of what is expected of them, against 64 x 64 samples, where they are not 0."""
-    known = np.asarray(sampling_error(jnp.asarray(samples_of(picture, side)), side))[..., 0]
+    known = _sampling_error(samples_of(picture, side), side)[..., 0]
     fine, few = (samples_of(picture, n).reshape(24, n, 24, n).mean((1, 3)) for n in (64, side))
     told = known > 0
     assert least < rms((few - fine)[told]) / rms(known[told]) < most
@@ -96,17 +93,32 @@ def test_errors_of_few_samples_are_known(picture, least, most, side):
 
 def test_slopes_and_boundaries_between_pixels_make_no_error():
     tilted = samples_of(lambda x, y: 3 * x - 2 * y, 4)
-    np.testing.assert_allclose(sampling_error(jnp.asarray(tilted), 4)[1:-1, 1:-1], 0, atol=1e-5)
+    np.testing.assert_allclose(_sampling_error(tilted, 4)[1:-1, 1:-1], 0, atol=1e-5)
     step = samples_of(lambda x, y: np.where(x < 11, 1.0, 0.0), 2)
-    np.testing.assert_array_equal(sampling_error(jnp.asarray(step), 2), 0)
+    np.testing.assert_array_equal(_sampling_error(step, 2), 0)
     within = samples_of(lambda x, y: np.where(x < 11.5, 1.0, 0.0), 2)
-    assert (np.asarray(sampling_error(jnp.asarray(within), 2))[:, 11] > 0.1).all()
+    assert (_sampling_error(within, 2)[:, 11] > 0.1).all()
+
+
+def test_pixels_that_are_sampled_once_more_have_the_errors_of_squares_alone():
+    pixels = np.random.default_rng(0).uniform(size=(5, 64, 3)).astype(np.float32)
+    alone = [_sampling_error(pixel.reshape(8, 8, 3), 8)[0, 0] for pixel in pixels]
+    np.testing.assert_allclose(_errors_of(pixels), alone, rtol=1e-6)
+
+
+def test_pictures_that_are_not_finite_end_no_process():
+    """Under filters that make errors of NumPy's warnings."""
+    lights = [jaxhf.Directional((1, 2, 1), irradiance=1e25)]
+    scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(waves(9, 8, 0.05)))], CAMERAS[0], lights)
+    height, width = CAMERAS[0].height, CAMERAS[0].width
+    here = expanded([scene], [np.zeros((height, width), np.float32)], noise=0.1)
+    assert here.pictures()[0].max() > 1e20
 
 
 @pytest.mark.deep
 def test_the_sky_that_a_terrain_hides_is_what_render_takes(programs):
-    """It is looked for once, with the points on edges; of terrains of two sizes by the same programs."""
-    sun, shared = jaxhf.Directional((1, 2, 1)), {"_draw_edges_of_any", "_made_world"}
+    """It is looked for once; terrains and pictures of two sizes, and other numbers of points, have the same programs."""
+    sun, shared = jaxhf.Directional((1, 2, 1)), {"_draw_edges_of_any", "_made_world", "_rows_of_samples", "_rows_of_points"}
     for side, others in ((12, set()), (15, shared)):
         settings = jaxhf.Settings(samples=4, edge_samples=150 + 5 * side)
         heights = np.random.default_rng(side).uniform(0, 4, (side, side)).astype(np.float32)

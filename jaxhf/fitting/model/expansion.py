@@ -26,13 +26,13 @@ from ...rendering.samples import PictureSamples
 from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, over_spread
-from .edge_points import EdgePoints, EdgePointsEach, draw_edge_points, forms_of_edge_points
-from .linearise import Linearised, LinearisedEdges, SampleRows, changing_pixels, linearise_each
-from .pictures import Group, can_be_linearised, vertex_values, with_albedo, with_material
+from .linearise import Linearised, LinearisedEach, LinearisedEdges, changing_pixels, linearise
+from .pictures import Group, vertex_values, with_albedo, with_material
 from .problem import Problem, surface_of
+from .sample_rows import SampleRows
 from .unknowns import KNOWN, Unknowns, View, moved_each
 
-Rows = list[Float[Array, "_ _ _ _"]]
+Rows = list[Float[AnyArray, "_ _ _ _"]]
 """A number for each value of each picture, group by group, shape (n, h, w, c); groups differ in it."""
 Surface = tuple[Float[Array, "my mx"], Unknowns]
 """A number for each height of the padded surface, and the other unknowns, without `coefficients`."""
@@ -48,7 +48,7 @@ class Expansion(eqx.Module):
 
     problem: Problem
     unknowns: Unknowns
-    linearised: tuple[Linearised | None, ...]
+    linearised: LinearisedEach
 
     @property
     def heights(self) -> Float[Array, "ny nx"]:
@@ -70,7 +70,12 @@ class Expansion(eqx.Module):
 
     def pictures(self) -> Rows:
         """As they would be measured."""
-        return _pictures(on_every_device(self, self.problem.mesh))
+        if not self.is_linearised:
+            return _pictures(on_every_device(self, self.problem.mesh))
+        images: Any = [np.asarray(known.image) for known in self.linearised if known is not None]  # which need no program
+        exposures, offsets = jax.tree.map(np.asarray, (self.unknowns.exposures, self.unknowns.offsets))
+        with np.errstate(all="ignore"):  # of a fit that ends as not finite
+            return _as_measured(images, exposures, offsets, np.asarray(self.problem.bright), self.problem.groups)
 
     def left(self) -> list[Float[np.ndarray, "n h w c"]]:
         """(picture - target) / noise, by NumPy: each operation of JAX's would be a program to compile."""
@@ -110,22 +115,21 @@ class Expansion(eqx.Module):
 
 
 def expand(unknowns: Unknowns, problem: Problem, then: Callable[[Expansion], None] = lambda about: None) -> Expansion:
-    """The problem about these unknowns: points on edges are drawn here, and the pictures rendered, by one program.
+    """The problem about these unknowns, where points on edges are drawn and the pictures traced.
 
-    If that must be compiled first, others are meanwhile, and `then` is called with an expansion of forms alone.
-    """
+    While programs are compiled for that, `then` is called with an expansion of forms alone, to compile others meanwhile."""
     # What enters a compiled program must lie in the same places each time, or it is compiled again for the other ones.
     unknowns, problem = on_every_device((unknowns, problem), problem.mesh)
 
-    def begin() -> None:
-        known = _linearised.compile_ahead(unknowns, problem, forms_of_edge_points(problem))
+    def begin(forms: LinearisedEach) -> None:
         with contextlib.suppress(Exception):  # which the user is told of by what is called then
-            if known is not None:  # it is compiled now
-                then(about := on_every_device(Expansion(problem, unknowns, known), problem.mesh))
-                _pull.compile_ahead(about, [group.targets for group in problem.groups])
+            about = on_every_device(Expansion(problem, unknowns, forms), problem.mesh)
+            then(about)
+            _pull.compile_ahead(about, [group.targets for group in problem.groups])
+            if not about.is_linearised:
                 _pictures.compile_ahead(about)
 
-    return Expansion(problem, unknowns, _linearised(unknowns, problem, draw_edge_points(unknowns, problem, begin)))
+    return Expansion(problem, unknowns, linearise(unknowns, problem, begin))
 
 
 def residuals(unknowns: Unknowns, about: Expansion) -> tuple[Any, None]:
@@ -144,15 +148,6 @@ def prior_residuals(unknowns: Unknowns, problem: Problem) -> list[Array]:
     """How far the unknowns are from what is known of them without the pictures, in standard deviations."""
     surface = problem.terms.surface.of_surface(unknowns.coefficients, problem.basis)
     return [surface, *(term.residual(values) for term, values in problem.terms.others(unknowns))]
-
-
-@functools.partial(compiled, jit=eqx.filter_jit)
-def _linearised(unknowns: Unknowns, problem: Problem, drawn: EdgePointsEach) -> tuple[Linearised | None, ...]:
-    def of(group: Group, drawn: EdgePoints | None) -> Linearised | None:
-        known = can_be_linearised(group.scenes, problem.settings)
-        return linearise_each(group, unknowns, problem, drawn) if known else None
-
-    return on_every_device(tuple(map(of, problem.groups, drawn)), problem.mesh)
 
 
 @functools.partial(compiled, jit=eqx.filter_jit, newer=None)
@@ -197,11 +192,16 @@ def _simulate(unknowns: Unknowns, about: Expansion, heights: Float[Array, "ny nx
             image = render_each(views, complete, problem.settings, problem.mesh)
             if group.targets.shape[-1] == 1:
                 image = jnp.mean(image, axis=-1, keepdims=True)
-        if unknowns.exposures is not None:
-            image = image * group.each(unknowns.exposures)
-        if unknowns.offsets is not None:
-            image = image + problem.bright * group.each(unknowns.offsets)
         images.append(image)
+    return _as_measured(images, unknowns.exposures, unknowns.offsets, problem.bright, problem.groups)
+
+
+def _as_measured(images: Rows, exposures: Any, offsets: Any, bright: Any, groups: Sequence[Group]) -> Rows:
+    """The pictures of each group with the exposures and offsets that are sought; by JAX, or by NumPy."""
+    if exposures is not None:
+        images = [image * group.each(exposures) for image, group in zip(images, groups, strict=True)]
+    if offsets is not None:
+        images = [image + bright * group.each(offsets) for image, group in zip(images, groups, strict=True)]
     return images
 
 
@@ -209,7 +209,7 @@ def _picture_each(
     known: Linearised, group: Group, heights: Float[jax.Array, "ny nx"], unknowns: Unknowns, problem: Problem
 ) -> Float[jax.Array, "n h w c"]:
     """The pictures that are known, with their derivatives in the heights, in what moves lights and cameras, and in the albedo's
-    factors; all of these must have the values at which `linearise_each` was called."""
+    factors; all of these must have the values at which `linearise` was called."""
     settings, mesh, view, factors = problem.settings, problem.mesh, problem.moves(unknowns, group), problem.factors(unknowns)
 
     def values(scene: Scene) -> Float[jax.Array, "vertices n"]:

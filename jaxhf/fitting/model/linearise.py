@@ -9,38 +9,28 @@ shading again. A sample of a moving boundary depends on five heights at most, an
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.sharding import Mesh
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from ...boundary.points import Packed, Points
-from ...boundary.sample import BoundarySample, deciding_vertices, picture_point
-from ...boundary.term import choose_resampled
+from ...boundary.points import Points, asked_for, compile_points_ahead, draw_points, require_edges_followed
 from ...core.settings import Settings
-from ...core.types import AnyArray
-from ...preparation.world import VisibleSky, World, make_world
+from ...core.types import AnyArray, room
+from ...preparation.world import World, resolve_settings
+from ...rendering.render import prepared_world
 from ...rendering.samples import PictureSamples
-from ...scene.camera import Camera
-from ...scene.light import Light
-from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
-from ...scene.texture import ImageTexture
-from ...shade.radiance import direct
-from ...trace.hit import Hit
-from ...trace.triangle import Corners, triangle_vertices
-from ...xla.devices import Spread, map_and_spread, map_over, on_every_device
-from ...xla.kernel import one_kernel
-from ...xla.materialise import materialise
-from .edge_points import EdgePoints
-from .pictures import Group, albedo_of
-from .problem import Problem
-from .unknowns import KNOWN, Unknowns, View, moved, with_numbers
+from ...xla.compilation import compiled
+from ...xla.devices import Spread, everywhere, held_everywhere
+from .pictures import can_be_linearised, with_material
+from .problem import Problem, surface_of
+from .sample_rows import AlbedoRows, Kind, SampleRows, Seen, compile_rows_ahead, rows_of_points, rows_of_samples
+from .unknowns import KNOWN, Unknowns, View, moved, numbers_of
 
 # Points on edges for each pixel that is resampled: about as many as a pixel on a boundary has.
 _POINTS_PER_PIXEL = 4
@@ -68,30 +58,6 @@ class Linearised(eqx.Module):
     edges: "LinearisedEdges | None"
 
 
-class SampleRows(NamedTuple):
-    """The derivatives of the samples of a picture, chunk by chunk; the last chunk may be there several times.
-
-    Attributes:
-      slopes: k = 3 or 12 of each sample: in the heights of three vertices, then, vertex by vertex, in the normals.
-      vertices: the numbers of those vertices.
-      view: in the numbers of the light and of the camera that are sought, see `moved`, (chunks, c, 2 or 6, samples).
-      albedo: in the factors of the albedo that are sought; None where it is known.
-    """
-
-    slopes: Float[jax.Array, "*n chunks c k samples"]
-    vertices: Int[jax.Array, "*n chunks 3 samples"]
-    view: View
-    albedo: "AlbedoRows | None"
-
-
-class AlbedoRows(NamedTuple):
-    """Derivatives of each sample in the relative changes of an albedo's factors at four texels, channel by channel of these or,
-    where the picture's share them, of the picture; and the texels' numbers, row by row."""
-
-    slopes: Float[jax.Array, "*n chunks k 4 samples"]
-    texels: Int[jax.Array, "*n chunks 4 samples"]
-
-
 class LinearisedEdges(eqx.Module):
     """The boundary term's part of a linearised picture.
 
@@ -103,11 +69,11 @@ class LinearisedEdges(eqx.Module):
       view: as that of `SampleRows`, (chunks, c, 2 or 6, size).
     """
 
-    slopes: Float[jax.Array, "*n chunks c 5 size"]
-    vertices: Int[jax.Array, "*n chunks 5 size"]
-    pixel: Int[jax.Array, "*n points"]
-    kind: Int[jax.Array, "*n points"]
-    resampled: Int[jax.Array, "*n pixels"]
+    slopes: Float[AnyArray, "*n chunks c 5 size"]
+    vertices: Int[AnyArray, "*n chunks 5 size"]
+    pixel: Int[AnyArray, "*n points"]
+    kind: Int[AnyArray, "*n points"]
+    resampled: Int[AnyArray, "*n pixels"]
     view: View = KNOWN
 
 
@@ -121,85 +87,164 @@ def changing_pixels(known: Linearised) -> Bool[np.ndarray, "n h w"]:
     return found
 
 
-def linearise_each(group: Group, unknowns: Unknowns, problem: Problem, drawn: EdgePoints | None) -> Linearised:
-    """The pictures of a group whose scenes `can_be_linearised`, one after the other, and their derivatives in the heights and
-    in what else is sought; leaves have a leading axis of n pictures. `drawn`: see `draw_edge_points`."""
-    heights, factors = problem.basis.heights(unknowns.coefficients), problem.factors(unknowns)
-
-    def one(seen: tuple[Scene, View, EdgePoints | None]) -> Linearised:
-        scene, view, drawn = on_every_device((group.complete(seen[0], heights, factors), *seen[1:]), problem.mesh)
-        about = _Seen.of(scene, view, problem.settings, None if drawn is None else drawn.sky)
-        points = None if drawn is None else drawn.points
-        return _linearise(about, points, problem.mesh, group.targets.shape[-1], factors)
-
-    return lax.map(one, (group.scenes, problem.moves(unknowns, group), drawn))
+OnHost = Any
+"""A `Linearised`, or a part of one, of NumPy's arrays."""
 
 
-class _Seen(NamedTuple):
-    """What a picture shows, under the light, from the camera and of the material as they are moved; these as they were given,
-    and by what."""
+def _form(unknowns: Unknowns, problem: Problem, number: int) -> Linearised | None:
+    """`jax.ShapeDtypeStruct`s in place of the pictures of a group; no operation of JAX's, as each would be compiled."""
+    group, dtype = problem.groups[number], problem.field.heights.dtype
+    if not can_be_linearised(group.scenes, problem.settings):
+        return None
+    (n, h, w, c), kind = group.targets.shape, _kind(unknowns, problem, number)
+    settings, count = resolve_settings(problem.settings, group.scenes), _resampled(problem.settings, h * w)
+    none: Any = np.zeros(count, np.int32) if count else None
+    samples = PictureSamples(group.scenes.camera, settings, none)
+    size, devices = samples.size, problem.mesh.devices.size
+    chunks = math.ceil(samples.chunks / devices) * devices  # each device has as many
 
-    world: World
-    camera: Camera
-    given: tuple[tuple[Light, ...], Camera, Material | Mirror]
-    view: View
+    def form(*shape: int, dtype: Any = dtype) -> Any:
+        return np.broadcast_to(np.zeros((), dtype), (n, *shape))  # no `ShapeDtypeStruct` yet: annotations ask for arrays
 
-    @classmethod
-    def of(cls, scene: Scene, view: View, settings: Settings, sky: VisibleSky | None) -> "_Seen":
-        lights, camera = moved(scene.lights, scene.camera, view)
-        world = make_world(scene.with_lights(lights), settings, sky=sky)
-        material = scene.objects[scene.first_heightfield].material
-        return cls(_with_material(world, material, view), camera, (scene.lights, scene.camera, material), view)
+    def view(chunks: int, size: int) -> View:
+        return jax.tree.map(lambda leaf: form(chunks, c, leaf.shape[-1], size), unknowns.view)
 
-    def moved(self, view: View) -> tuple[World, Camera]:
-        """The world and its camera with other such numbers."""
-        lights, camera, material = self.given
-        lights, camera = moved(lights, camera, view)
-        return _with_material(dataclasses.replace(self.world, lights=lights), material, view), camera
-
-    def view_for(self, count: int) -> View:
-        """The same numbers for each of so many samples, which come last."""
-        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:, None], (*leaf.shape, count)), self.view)
-
-
-def _with_material(world: World, material: Material | Mirror, view: View) -> World:
-    """The world with the first heightfield's material, its numbers moved."""
-    number, *_ = world.grids[0]
-    materials = (with_numbers(material, view) if k == number else other for k, other in enumerate(world.materials))
-    return dataclasses.replace(world, materials=tuple(materials)) if view.names else world
+    albedo, edges = None, None
+    if kind.factors is not None:
+        k = 3 if 3 in (c, kind.factors[1]) else 1
+        albedo = AlbedoRows(form(chunks, k, 4, size), form(chunks, 4, size, dtype=np.int32))
+    numbers = 12 if settings.shading == "smooth" else 3
+    rows = SampleRows(form(chunks, c, numbers, size), form(chunks, 3, size, dtype=np.int32), view(chunks, size), albedo)
+    if count:
+        of, draws = asked_for(problem.settings.edge_samples or 0, settings)
+        vertices, pixel, resampled = (form(*shape, dtype=np.int32) for shape in ((of, 5, draws), (of * draws,), (count,)))
+        edges = LinearisedEdges(form(of, c, 5, draws), vertices, pixel, pixel, resampled, view(of, draws))
+    known = Linearised(form(h, w, c), form(h, w, dtype=np.bool_), form(h, w), Spread(rows), edges)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), known)
 
 
-def _linearise(
-    seen: _Seen, points: Points | None, mesh: Mesh, channels: int, factors: Float[jax.Array, "ty tx k"] | None
-) -> Linearised:
-    world, camera, drawn = seen.world, seen.camera, None
-    if points is not None:
-        resampled = math.ceil((world.settings.edge_samples or 0) / _POINTS_PER_PIXEL)
-        drawn = choose_resampled(points, camera, world.settings, resampled)
-    samples = PictureSamples(camera, world.settings, None if drawn is None else drawn.resampled)
-    sampled = functools.partial(_samples, channels, None if factors is None else factors.shape)
-    (light, moving), rows = map_and_spread(mesh, lambda *args: one_kernel(sampled, *args), seen, samples.positions())
-    image, edges = samples.in_pixels(light), None
-    sampling = _sampling_error(samples.in_rows(light), math.isqrt(world.settings.samples or 1))
-    if drawn is not None:
-        followed = functools.partial(_boundary_samples, channels)
-        edge_slopes, edge_vertices, edge_view = map_over(mesh, followed, seen, drawn.contributions)
-        found, _ = drawn.contributions.unpacked()
-        kind = jnp.where(found.valid, jnp.where(found.light < 0, 1, 2), 0).ravel().astype(jnp.int32)
-        edges = LinearisedEdges(edge_slopes, edge_vertices, drawn.pixel, kind, drawn.resampled, edge_view)
-        finer = samples.of_resampled(light)
-        side = math.isqrt(finer.shape[1])
-        error = jax.vmap(lambda pixel: _sampling_error(pixel.reshape(side, side, channels), side)[0, 0])(finer)
-        image, sampling = (
-            known.reshape(-1, channels).at[drawn.resampled].set(new, unique_indices=True).reshape(image.shape)
-            for known, new in ((image, finer.mean(1)), (sampling, error))
-        )
-    depends = samples.in_pixels(moving)[..., 0] > 0
-    sampling = jnp.sqrt(jnp.mean(sampling * sampling, axis=-1))
-    return Linearised(image, depends, sampling, Spread(rows), edges)
+def _kind(unknowns: Unknowns, problem: Problem, number: int) -> Kind:
+    factors = problem.albedo_shape if unknowns.albedo is not None else None
+    told = None if factors is None else (factors[:2] != (1, 1), factors[2])
+    return Kind(problem.groups[number].targets.shape[-1], told)
 
 
-def _sampling_error(samples: Float[jax.Array, "rows columns c"], side: int) -> Float[jax.Array, "h w c"]:
+def _resampled(settings: Settings, pixels: int) -> int:
+    """How many pixels of a picture are resampled."""
+    return min(math.ceil((settings.edge_samples or 0) / _POINTS_PER_PIXEL), pixels)
+
+
+LinearisedEach = tuple[Linearised | None, ...]
+"""For each group; None where its scenes cannot be linearised."""
+
+
+def linearise(unknowns: Unknowns, problem: Problem, begin: Callable[[LinearisedEach], None]) -> LinearisedEach:
+    """The pictures of each group whose scenes `can_be_linearised`, and their derivatives in the heights and in what else is
+    sought; leaves have a leading axis of the group's pictures.
+
+    Args:
+      unknowns, problem: where; on each device of the problem's mesh.
+      begin: called once, while programs may be compiled for that, with `jax.ShapeDtypeStruct`s in place of what is returned.
+    """
+    forms = tuple(_form(unknowns, problem, number) for number in range(len(problem.groups)))
+    begin_once = functools.cache(lambda: begin(forms))
+    surface = surface_of(unknowns, problem.basis)
+
+    def of_group(number: int, form: Linearised) -> Linearised:
+        into = jax.tree.map(lambda leaf: room(leaf.shape, np.dtype(leaf.dtype)), form)
+        for k in range(len(problem.groups[number].indices)):
+            scene, about = _picture_seen(unknowns, problem, surface, number, np.asarray(k, np.int32))
+            one = jax.tree.map(lambda leaf, k=k: leaf[k], into)
+            _fill(one, scene, about, _kind(unknowns, problem, number), problem, begin_once if k == 0 else None)
+        return everywhere(into, problem.mesh)
+
+    found = tuple(None if form is None else of_group(number, form) for number, form in enumerate(forms))
+    begin_once()
+    return found
+
+
+@functools.partial(compiled, jit=eqx.filter_jit)
+def _picture_seen(
+    unknowns: Unknowns, problem: Problem, surface: Float[Array, "my mx"], number: int, k: Array
+) -> tuple[Scene, tuple[Any, View]]:
+    """What the k-th picture of a group shows, and what `Seen` has beside a world; `surface`: the heights with their padding."""
+    group = problem.groups[number]
+    scene, view = jax.tree.map(lambda leaf: leaf[k], (group.scenes, problem.moves(unknowns, group)))
+    scene = group.complete(scene, problem.basis.crop(surface), problem.factors(unknowns))
+    lights, camera = moved(scene.lights, scene.camera, view)
+    given = scene.lights, scene.camera, numbers_of(scene.objects[scene.first_heightfield].material, view)
+    return with_material(scene.with_lights(lights).with_camera(camera), view), (given, view)
+
+
+def _fill(
+    into: OnHost, scene: Scene, about: tuple[Any, View], kind: Kind, problem: Problem, begin: Callable[[], None] | None
+) -> None:
+    """Traces a picture into arrays of NumPy's; `begin`: as of `linearise`, None where programs have been compiled."""
+    settings, mesh, camera, edges = resolve_settings(problem.settings, scene), problem.mesh, scene.camera, into.edges
+    vertices, drawing = scene.heightfields[0].heights.size, (settings.edge_samples or 0, about[1].camera is None)
+    if edges is not None:
+        require_edges_followed((obj.shape for obj in scene.objects), drawing[0])
+
+    def ahead(world: World) -> None:
+        if begin is None:
+            return
+        seen, drawn = Seen(world, camera, *about).of_any_size(), None
+        if edges is not None:
+            drawn = compile_points_ahead(world, camera, mesh, *drawing).contributions
+        compile_rows_ahead(seen, PictureSamples(camera, settings).size, kind, drawn, mesh)
+        begin()
+
+    # Those for which other programs, too, make a world: how many samples and points there are is data.
+    world = prepared_world(scene, dataclasses.replace(settings, samples=1, edge_samples=0), mesh, ahead)
+    world = held_everywhere(world, mesh)
+    ahead(world)
+    seen = Seen(world, camera, *about).of_any_size()
+    if edges is not None:
+        points = jax.tree.map(np.asarray, draw_points(world, camera, mesh, *drawing))
+        _fill_edges(edges, seen, points, into.depends.size, kind, mesh)
+        np.minimum(edges.vertices, vertices, out=edges.vertices)
+    samples: Any = PictureSamples(camera, settings, None if edges is None else edges.resampled)
+    rows, positions = into.samples.values, samples.positions(np)
+    chunks, *_, size = rows.slopes.shape
+    light, moving = (np.empty((chunks, size, count), rows.slopes.dtype) for count in (kind.channels, 1))
+    if chunks > samples.chunks:
+        positions = jax.tree.map(lambda at: np.pad(at, ((0, chunks - len(at)), (0, 0)), mode="edge"), positions)
+    for places, values in rows_of_samples(seen, positions, kind, mesh):
+        _write(((light, moving), rows), places, values)
+    np.minimum(rows.vertices, vertices, out=rows.vertices)
+    with np.errstate(all="ignore"):  # of a picture that is not finite
+        sampling = np.ascontiguousarray(_sampling_error(samples.in_rows(light), math.isqrt(settings.samples or 1)))
+        into.image[...], into.depends[...] = samples.in_pixels(light), samples.in_pixels(moving)[..., 0] > 0
+        if edges is not None:
+            finer = samples.of_resampled(light)
+            into.image.reshape(-1, kind.channels)[edges.resampled] = finer.mean(1)
+            sampling.reshape(-1, kind.channels)[edges.resampled] = _errors_of(finer)
+        into.sampling[...] = np.sqrt(np.mean(sampling * sampling, axis=-1))
+
+
+def _fill_edges(into: OnHost, seen: Seen, points: Points, pixels: int, kind: Kind, mesh: Mesh) -> None:
+    """Follows points on edges in a picture of so many pixels into arrays of NumPy's."""
+    chunks, _, draws = into.vertices.shape
+    rows = into.slopes, into.vertices, into.view
+    for places, values in rows_of_points(seen, points.contributions, chunks, kind.channels, mesh):
+        _write(rows, places, jax.tree.map(lambda leaf: leaf[..., :draws], values))
+    counted = jax.tree.map(lambda leaf: leaf[:chunks, :, :draws], points)
+    found, _ = counted.contributions.unpacked()
+    pixel, _, sizes, _ = (values.ravel() for values in counted.seen.unpacked())
+    into.pixel[...], into.kind[...] = pixel, np.where(found.valid, np.where(found.light < 0, 1, 2), 0).ravel()
+    # They are chosen by the boundaries alone: a choice by the picture's own samples would keep what these happen to miss.
+    told = sizes > 0
+    changes = np.bincount(pixel[told], sizes[told], minlength=pixels)
+    into.resampled[...] = np.argsort(-changes, kind="stable")[: into.resampled.size]
+
+
+def _write(into: Any, places: slice, values: Any) -> None:
+    """Writes results of chunks where they belong."""
+    for leaf, part in zip(jax.tree.leaves(into), jax.tree.leaves(values), strict=True):
+        leaf[places] = part
+
+
+def _sampling_error(samples: Float[np.ndarray, "rows columns c"], side: int) -> Float[np.ndarray, "h w c"]:
     """The standard deviation of the means over squares of side x side samples, of rows and columns of regular samples.
 
     It is 0.25 / side times the root mean square of the second differences in such a square. Where the picture is smooth these
@@ -208,95 +253,32 @@ def _sampling_error(samples: Float[jax.Array, "rows columns c"], side: int) -> F
     pictures of 1024 samples, see docs/measurements/fits.md.
     """
     if side == 1:
-        return jnp.zeros_like(samples)
-    along_x, along_y = (_second_differences(rows, side) for rows in (samples, samples.swapaxes(0, 1)))
+        return np.zeros_like(samples)
+    along_x, along_y = (_second_differences(lines, side) for lines in (samples, samples.swapaxes(0, 1)))
     squares = along_x * along_x + (along_y * along_y).swapaxes(0, 1)
     h, w = (n // side for n in squares.shape[:2])
-    return _SAMPLING_ERROR / side * jnp.sqrt(squares.reshape(h, side, w, side, -1).mean((1, 3)))
+    return _SAMPLING_ERROR / side * np.sqrt(squares.reshape(h, side, w, side, -1).mean((1, 3)))
 
 
-def _second_differences(samples: Float[jax.Array, "rows columns c"], side: int) -> Float[jax.Array, "rows columns c"]:
+def _errors_of(pixels: Float[np.ndarray, "pixels samples c"]) -> Float[np.ndarray, "pixels c"]:
+    """The same for each of some pixels of squares of samples."""
+    count, each, channels = pixels.shape
+    side = math.isqrt(each)
+    squares = pixels.reshape(count, side, side, channels)
+    # One above the other, and side by side.
+    along_x = _second_differences(squares.reshape(-1, side, channels), side).reshape(squares.shape)
+    along_y = _second_differences(squares.swapaxes(1, 2).reshape(-1, side, channels), side).reshape(squares.shape)
+    square = along_x * along_x + (along_y * along_y).swapaxes(1, 2)
+    return _SAMPLING_ERROR / side * np.sqrt(square.mean((1, 2)))
+
+
+def _second_differences(samples: Float[np.ndarray, "rows columns c"], side: int) -> Float[np.ndarray, "rows columns c"]:
     """Sizes of second differences along the rows; the first and last of a square as large as its neighbour's there at most.
 
     So a boundary between two squares counts for neither.
     """
-    padded = jnp.pad(samples, ((0, 0), (1, 1), (0, 0)), mode="edge")
-    size = jnp.abs(padded[:, 2:] + padded[:, :-2] - 2 * samples).reshape(samples.shape[0], -1, side, samples.shape[2])
-    first, last = (jnp.minimum(size[:, :, a], size[:, :, b])[:, :, None] for a, b in ((0, 1), (-1, -2)))
-    return jnp.concatenate([first, size[:, :, 1:-1], last], axis=2).reshape(samples.shape)
-
-
-def _channels(light: Float[jax.Array, "*rest 3"], channels: int) -> Float[jax.Array, "*rest c"]:
-    return light if channels == 3 else jnp.mean(light, axis=-1, keepdims=True)
-
-
-def _samples(channels: int, factors: tuple[int, ...] | None, seen: _Seen, points: tuple[jax.Array, ...]):
-    """Radiance at points of the picture, (n, c), whether it changes with the sought heights, (n, 1), and its `SampleRows`;
-    `factors` is the shape of those that are sought."""
-    (x, y), world = points, seen.world
-    (number, sought, _), smooth = world.grids[0], world.settings.shading == "smooth"
-
-    def one(x: jax.Array, y: jax.Array, perturbation: jax.Array, view: View) -> tuple[jax.Array, Any]:
-        corners = Corners(perturbation[:3], perturbation[3:].reshape(3, 3) if smooth else None)
-        surfaces = list(world.surfaces)
-        surfaces[number] = dataclasses.replace(sought, perturbation=corners)
-        there, eye = seen.moved(view)
-        light, _, hit = direct(dataclasses.replace(there, surfaces=tuple(surfaces)), materialise(eye.ray(x, y)))
-        albedo = None if factors is None else _texels(world, hit, lax.stop_gradient(light), channels, factors)
-        return _channels(light, channels), (_vertices(world, hit), albedo)
-
-    def shade(perturbations: jax.Array, view: View) -> tuple[jax.Array, Any]:
-        return jax.vmap(one, in_axes=(0, 0, 1, 1), out_axes=(0, -1))(x, y, perturbations, view)
-
-    none = jnp.zeros((12 if smooth else 3, x.shape[0]), x.dtype)
-    light, pull_back, (vertices, albedo) = jax.vjp(shade, none, seen.view_for(x.shape[0]), has_aux=True)
-    each = jnp.broadcast_to(jnp.eye(channels, dtype=x.dtype)[:, None], (channels, *light.shape))
-    if channels == 1:
-        slopes, view = jax.tree.map(lambda leaf: leaf[None], pull_back(each[0]))
-    else:
-        slopes, view = jax.vmap(pull_back)(each)
-    moving = (slopes != 0).any(axis=(0, 1))
-    return (light, moving.astype(light.dtype)[:, None]), SampleRows(slopes, vertices, view, albedo)
-
-
-def _texels(world: World, hit: Hit, light: jax.Array, channels: int, factors: tuple[int, ...]) -> AlbedoRows:
-    """How the light from a hit goes with the factors of the first heightfield's albedo."""
-    number = world.grids[0][0]
-    places, shares = jnp.zeros(4, jnp.int32), jnp.zeros((3, 4), light.dtype).at[:, 0].set(1)
-    if isinstance(texture := albedo_of(world.materials[number]), ImageTexture):
-        rows, columns, weights = texture.corners(hit.uv)
-        parts = weights[None] * jnp.asarray(texture.texels)[rows, columns].T
-        total = jnp.sum(parts, axis=1, keepdims=True)
-        shares = jnp.where(total == 0, 0, parts / jnp.where(total == 0, 1, total))
-        if factors[:2] != (1, 1):
-            places = rows * factors[1] + columns
-    slopes = jnp.where(hit.object == number, light, 0)[:, None] * shares
-    if channels == 1:
-        slopes = slopes / 3 if factors[2] == 3 else jnp.mean(slopes, axis=0, keepdims=True)
-    return AlbedoRows(slopes, places)
-
-
-def _vertices(world: World, hit: Hit) -> Int[jax.Array, "3"]:
-    """The numbers of the vertices of the triangle that was hit; one too large where that is not of the first heightfield."""
-    number, grid, _ = world.grids[0]
-    here = triangle_vertices(grid.nx, hit.cell[0], hit.cell[1], hit.triangle == 1)
-    return jnp.where(hit.object == number, jnp.stack(here), grid.rows.shape[0])
-
-
-def _boundary_samples(channels: int, seen: _Seen, drawn: Packed[tuple[BoundarySample, jax.Array]]):
-    """Slopes, vertices and view of boundary samples, see `LinearisedEdges`."""
-    samples, flows = drawn.unpacked()
-    flows = jnp.moveaxis(_channels(jnp.moveaxis(flows, 1, -1), channels), -1, 0)
-
-    def position(sample: BoundarySample, perturbation: jax.Array, view: View) -> jax.Array:
-        return picture_point(*seen.moved(view), sample, sample.s, perturbation=perturbation)[0]
-
-    def positions(perturbations: jax.Array, view: View) -> jax.Array:
-        return jax.vmap(position, in_axes=(0, 1, 1))(samples, perturbations, view)
-
-    count = flows.shape[1]
-    _, pull_back = jax.vjp(positions, jnp.zeros((5, count), flows.dtype), seen.view_for(count))
-    slopes, view = jax.vmap(pull_back)(flows)
-    vertices = jax.vmap(functools.partial(deciding_vertices, seen.world), out_axes=1)(samples)
-    beyond = seen.world.grids[0][1].rows.shape[0]
-    return jnp.where(vertices < beyond, slopes, 0), jnp.minimum(vertices, beyond), view
+    padded = np.pad(samples, ((0, 0), (1, 1), (0, 0)), mode="edge")
+    size = np.abs(padded[:, 2:] + padded[:, :-2] - 2 * samples).reshape(samples.shape[0], -1, side, samples.shape[2])
+    first, last = (np.minimum(size[:, :, a], size[:, :, b]) for a, b in ((0, 1), (-1, -2)))
+    size[:, :, 0], size[:, :, -1] = first, last
+    return size.reshape(samples.shape)

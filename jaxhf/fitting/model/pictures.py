@@ -18,13 +18,16 @@ from ...core.errors import ArgumentError
 from ...core.precision import numbers
 from ...core.settings import Settings
 from ...core.types import AnyArray, Scalar
+from ...preparation.any_size import of_any_terrain
 from ...preparation.localise import localise
-from ...preparation.world import World, make_world, resolve_settings
-from ...scene.light import Sun
+from ...preparation.world import World, resolve_settings
+from ...rendering.render import prepared_world
+from ...scene.camera import of_any_size
+from ...scene.light import Sky, Sun
 from ...scene.material import Material, Mirror
 from ...scene.scene import Scene
 from ...scene.skirt import Skirt
-from ...scene.texture import ImageTexture
+from ...scene.texture import FlatTexture, ImageTexture
 from ...shade.radiance import has_mirrors
 from ...xla.compilation import compiled
 from ..given import Noise, has_detector, noise_of_each
@@ -158,7 +161,7 @@ def with_albedo(scene: Scene, factor: Float[Array, "ty tx c"]) -> Scene:
     return eqx.tree_at(lambda scene: scene.objects[k].material.albedo, scene, albedo)
 
 
-def albedo_of(material: Material | Mirror) -> Float[AnyArray, "..."] | ImageTexture | None:
+def albedo_of(material: Material | Mirror) -> Float[AnyArray, "..."] | ImageTexture | FlatTexture | None:
     """The albedo to which what a material scatters is proportional; None where it has none."""
     return getattr(material, "albedo", None)
 
@@ -295,7 +298,6 @@ def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: boo
     has_skirt = any(isinstance(obj.shape, Skirt) for view in views for obj in view.objects)  # with points it is refused
     if has_skirt or not all(can_be_linearised(view, settings) for view in views):
         return 0
-    settings = dataclasses.replace(settings, edge_samples=None)  # so that a second call, when some are chosen, compiles nothing
     length = max(float(_boundary_length(view, settings)) for view in views)
     least, most = EDGE_SAMPLES
     if length == 0:
@@ -303,6 +305,12 @@ def choose_edge_samples(views: Sequence[Scene], settings: Settings, shadows: boo
     return min(max(2 ** round(math.log2(_EDGE_SAMPLES_PER_PIXEL * length)), least), most)
 
 
-@functools.partial(compiled, jit=eqx.filter_jit)
 def _boundary_length(scene: Scene, settings: Settings) -> Scalar:
-    return boundary_length(make_world(scene, settings), scene.camera)
+    """By programs for terrains and pictures of any size."""
+    if scene.sky_occlusion is not None:  # which takes long to find, and bounds nothing
+        scene = scene.with_lights([light for light in scene.lights if not isinstance(light, Sky)])
+    settings = dataclasses.replace(resolve_settings(settings, scene), samples=1, edge_samples=0)
+    return _length_for_any_size(of_any_terrain(prepared_world(scene, settings)), of_any_size(scene.camera))
+
+
+_length_for_any_size = compiled(boundary_length)

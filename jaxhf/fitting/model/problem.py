@@ -98,7 +98,7 @@ class Problem(eqx.Module):
     def edge_samples_for(self, heights: Float[Array, "ny nx"], settings: Settings) -> int:
         """As many points on edges as pictures of these heights call for, if the user's settings leave that open.
 
-        Where there were some, others are taken only if it calls for four times as many: all is then compiled again.
+        Where there were some, others are taken only if it calls for four times as many: steps are then compiled again.
         """
         before = self.settings.edge_samples
         if settings.edge_samples is not None:

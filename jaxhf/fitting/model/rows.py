@@ -21,6 +21,7 @@ from ...scene.scene import Scene
 from ...xla.compilation import compiled
 from ...xla.devices import on_every_device, on_host
 from .expansion import Expansion
+from .linearise import OnHost
 from .pictures import Group, vertex_values
 from .problem import Problem
 from .unknowns import Unknowns, Window
@@ -28,8 +29,6 @@ from .unknowns import Unknowns, Window
 sp: Any = scipy.sparse  # whose stubs miss much
 Sparse = Any
 """A `scipy.sparse.csr_array`."""
-OnHost = Any
-"""A `Linearised` of NumPy's arrays."""
 
 MOST_HEIGHTS = 2**21
 """With their padding; the largest that was tried has half as many."""
@@ -171,8 +170,7 @@ def _vertices_by_heights(
 
 def _slots(samples: PictureSamples) -> Int[np.ndarray, "pixels each"]:
     """Which samples each pixel has: `PictureSamples.in_pixels` of their numbers."""
-    tiling, each = samples.tiling, samples.tiling.samples
-    size = tiling.side * tiling.side
+    tiling, each, size = samples.tiling, samples.tiling.samples, samples.size
     slots = np.moveaxis(np.arange(tiling.count * each * size).reshape(tiling.count, each, size), 1, 2)
     return tiling.assemble(slots).reshape(tiling.width * tiling.height, each)
 

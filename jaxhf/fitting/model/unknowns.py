@@ -312,13 +312,18 @@ def _brighter(sky: Sky, times: Any) -> Sky:
     return dataclasses.replace(sky, radiance=times * jnp.asarray(sky.radiance))
 
 
-def with_numbers(material: Any, view: View) -> Any:
-    """A material with the numbers that `view` seeks moved by it."""
+def with_numbers(material: Any, view: View, given: tuple[Any, ...] | None = None) -> Any:
+    """A material with the numbers that `view` seeks moved by it; `given`: from these, in the order of their names."""
     changes = () if view.material is None else view.material
-    for name, change in zip(view.names, changes, strict=True):
-        moved_number = jnp.asarray(getattr(material, name)) + change
+    for name, number, change in zip(view.names, given or numbers_of(material, view), changes, strict=True):
+        moved_number = jnp.asarray(number) + change
         material = eqx.tree_at(lambda material, name=name: getattr(material, name), material, moved_number)
     return material
+
+
+def numbers_of(material: Any, view: View) -> tuple[Any, ...]:
+    """The numbers of a material that `view` seeks."""
+    return tuple(getattr(material, name) for name in view.names)
 
 
 def differences(scene: Scene, other: Scene) -> tuple[float, float, float]:
