@@ -148,14 +148,14 @@ def linearise(unknowns: Unknowns, problem: Problem, begin: Callable[[LinearisedE
     """
     forms = tuple(_form(unknowns, problem, number) for number in range(len(problem.groups)))
     begin_once = functools.cache(lambda: begin(forms))
-    surface = surface_of(unknowns, problem.basis)
 
     def of_group(number: int, form: Linearised) -> Linearised:
+        surface, kind = surface_of(unknowns, problem.basis), _kind(unknowns, problem, number)
         into = jax.tree.map(lambda leaf: room(leaf.shape, np.dtype(leaf.dtype)), form)
         for k in range(len(problem.groups[number].indices)):
             scene, about = _picture_seen(unknowns, problem, surface, number, np.asarray(k, np.int32))
             one = jax.tree.map(lambda leaf, k=k: leaf[k], into)
-            _fill(one, scene, about, _kind(unknowns, problem, number), problem, begin_once if k == 0 else None)
+            _fill(one, scene, about, kind, problem, begin_once if k == 0 else None)
         return everywhere(into, problem.mesh)
 
     found = tuple(None if form is None else of_group(number, form) for number, form in enumerate(forms))
@@ -268,8 +268,8 @@ def _errors_of(pixels: Float[np.ndarray, "pixels samples c"]) -> Float[np.ndarra
     # One above the other, and side by side.
     along_x = _second_differences(squares.reshape(-1, side, channels), side).reshape(squares.shape)
     along_y = _second_differences(squares.swapaxes(1, 2).reshape(-1, side, channels), side).reshape(squares.shape)
-    square = along_x * along_x + (along_y * along_y).swapaxes(1, 2)
-    return _SAMPLING_ERROR / side * np.sqrt(square.mean((1, 2)))
+    # Turned or not: the mean is over the whole square.
+    return _SAMPLING_ERROR / side * np.sqrt((along_x * along_x + along_y * along_y).mean((1, 2)))
 
 
 def _second_differences(samples: Float[np.ndarray, "rows columns c"], side: int) -> Float[np.ndarray, "rows columns c"]:
