@@ -16,7 +16,7 @@ import jaxhf
 from jaxhf.fitting.fit import Pace, printed_progress
 from jaxhf.fitting.model.unknowns import Unknowns
 from jaxhf.fitting.solve.stages import first_state, why_ended
-from jaxhf.fitting.solve.steps import ConjugateGradients, LevenbergMarquardt
+from jaxhf.fitting.solve.steps import ConjugateGradients, LevenbergMarquardt, change_of_loss, conjugate_gradients
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
 # Slopes up to 3, seen from above in one picture of one light; the prior is the terrain smoothed, and says little.
@@ -128,7 +128,9 @@ def test_rejections_in_a_row_damp_ever_faster():
 
 
 def test_a_step_is_taken_at_any_damping():
-    """Also where 1 / λ is below the precision's epsilon, as it is for many pixels with little noise in single precision."""
+    """Also where 1 / λ is below the precision's epsilon, as it is for many pixels with little noise in single precision.
+
+    By how much it is to change the loss follows from its equation alone."""
     matrix, right = 1e9 * np.random.default_rng(0).standard_normal((6, 3)), np.ones(6)
     start = Unknowns(jnp.zeros((1, 3)))
     value, linear = jax.linearize(lambda u: jnp.asarray(matrix, jnp.float32) @ u.coefficients[0] - jnp.ones(6), start)
@@ -139,3 +141,25 @@ def test_a_step_is_taken_at_any_damping():
         expected = np.linalg.solve(matrix.T @ matrix + damping * np.eye(3), matrix.T @ right)
         found, _ = descent.step(jnp.asarray(1 / damping), state)
         np.testing.assert_allclose(found.coefficients[0], expected, rtol=0.01)
+        left = matrix @ expected - right
+        told = change_of_loss(found, state[1], jnp.asarray(1 / damping))
+        np.testing.assert_allclose(told, (left @ left - right @ right) / 2, rtol=0.01)
+
+
+@pytest.mark.parametrize("tolerance", [0.3, 1e-2, 1e-5])
+def test_a_linear_problem_is_solved_as_far_as_asked(tolerance):
+    """As JAX's own conjugate gradients take it, which stop as early; and what such a step is to change is told as well."""
+    rng = np.random.default_rng(3)
+    jacobian, residual, damping = rng.standard_normal((40, 20)), rng.standard_normal(40), 3.0
+    matrix = jnp.asarray(jacobian.T @ jacobian + damping * np.eye(20), jnp.float32)
+    gradient, scales = jnp.asarray(jacobian.T @ residual, jnp.float32), jnp.linspace(0.5, 2, 20)
+
+    def inverse(x: jax.Array) -> jax.Array:
+        return x / scales
+
+    found = conjugate_gradients(lambda x: matrix @ x, -gradient, inverse, jnp.float32(tolerance), jnp.int32(60))
+    expected, _ = jax.scipy.sparse.linalg.cg(lambda x: matrix @ x, -gradient, tol=tolerance, maxiter=60, M=inverse)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
+    left = residual + jacobian @ np.asarray(found, np.float64)
+    told = change_of_loss(found, gradient, jnp.float32(1 / damping))
+    np.testing.assert_allclose(told, (left @ left - residual @ residual) / 2, rtol=1e-5)

@@ -100,7 +100,8 @@ def _stepped(state: State, place: _Place, stage: Stage, begin: float) -> tuple[S
 def _step(state: State, place: _Place) -> tuple[Unknowns, _Place, Outcome]:
     here = place.expansion
     there = expand(place.position.y_eval, here.problem) if state.steps else here  # the first evaluates where the stage begins
-    unknowns, position, outcome = advance(state.unknowns, place.position, there, state.others, state.rejections)
+    told = state.others, state.rejections, state.predicted
+    unknowns, position, outcome = advance(state.unknowns, place.position, there, *told)
     return unknowns, _Place(there if outcome.accepted else here, position), outcome
 
 
@@ -199,7 +200,7 @@ def _resumed(problems: Sequence[Problem], state: State) -> _Place:
         return _Place(here, whole_step=whole_step(here))
     position = first_position(here, state.step_size)
     if state.steps:
-        _, position, _ = advance(state.unknowns, position, here, state.others, 0)
+        _, position, _ = advance(state.unknowns, position, here, state.others, 0, state.predicted)
     return _Place(here, position)
 
 

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ...core.types import AnyArray, Flag, Scalar
@@ -54,27 +55,81 @@ class ConjugateGradients(optx.AbstractDescent[Any, Any, Any]):
     others: Any
 
     def init(self, y: Unknowns, f_info_struct: Any) -> Any:
-        return _empty(f_info_struct)
+        return _empty(f_info_struct), _empty(y)
 
     def query(self, y: Unknowns, f_info: Any, state: Any) -> Any:
-        return f_info
+        """What is linear there, and its gradient."""
+        return f_info, _transposed(f_info.jac)(f_info.residual)
 
     def step(self, step_size: Scalar, state: Any) -> Any:
-        push, residual = state.jac, state.residual
-        pull = jax.linear_transpose(push.mv, push.in_structure())
+        (linear, gradient), tolerance = state, self.tolerance.astype(step_size.dtype)
+        pull = _transposed(linear.jac)
 
         def product(change: Unknowns) -> Unknowns:
-            return jax.tree.map(lambda a, b: a + b / step_size, pull(push.mv(change))[0], change)
-
-        right = jax.tree.map(jnp.negative, pull(residual)[0])
-        tolerance: Any = self.tolerance.astype(step_size.dtype)
+            return jax.tree.map(lambda a, b: a + b / step_size, pull(linear.jac.mv(change)), change)
 
         def inverse(x: Unknowns) -> Unknowns:
             others = jax.tree.map(lambda value, curvature: value / curvature, x.without_modes(), self.others)
             return others.with_modes(x.coefficients)
 
-        found, _ = jax.scipy.sparse.linalg.cg(product, right, tol=tolerance, maxiter=self.iterations, M=inverse)
-        return found, optx.RESULTS.successful
+        right = jax.tree.map(jnp.negative, gradient)
+        return conjugate_gradients(product, right, inverse, tolerance, self.iterations), optx.RESULTS.successful
+
+
+def _transposed(jac: Any) -> Callable[[Any], Unknowns]:
+    """Jᵀ, to be called with a number for each residual."""
+    pull = jax.linear_transpose(jac.mv, jac.in_structure())
+    return lambda residual: pull(residual)[0]
+
+
+def _dot(a: Any, b: Any) -> Scalar:
+    return sum(jax.tree.leaves(jax.tree.map(functools.partial(jnp.vdot, precision=lax.Precision.HIGHEST), a, b)))
+
+
+def change_of_loss(step: Any, gradient: Any, step_size: Scalar) -> Scalar:
+    """By a step, were pictures linear: g d + |J d|² / 2, of which (JᵀJ + λ) d = -g makes (g d - λ |d|²) / 2. What conjugate
+    gradients leave of that equation is orthogonal to d."""
+    return _dot(step, jax.tree.map(lambda g, d: g - d / step_size, gradient, step)) / 2
+
+
+def conjugate_gradients(
+    product: Callable[[Any], Any], right: Any, inverse: Callable[[Any], Any], tolerance: Scalar, most: Int[Array, ""]
+) -> Any:
+    """x whose `product` is `right`, to a share `tolerance` of that, in at most so many iterations from x = 0; `inverse`: the
+    preconditioner (Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm 9.1).
+
+    It gives the bits of `jax.scipy.sparse.linalg.cg`, which multiplies the first x too, though it is 0: its programs hold the
+    product twice, and it traces it five times.
+    """
+
+    def along(here: Any, step: Scalar, direction: Any) -> Any:
+        return jax.tree.map(lambda a, b: a + step * b, here, direction)
+
+    def unsolved(state: Any) -> Flag:
+        _, left, _, _, count = state
+        return (_dot(left, left) > least) & (count < most)
+
+    def iteration(state: Any) -> Any:
+        x, left, size, direction, count = state
+        change = product(direction)
+        step = size / _dot(direction, change)
+        x, left = along(x, step, direction), along(left, -step, change)
+        found = inverse(left)
+        size, before = _dot(left, found), size
+        return x, left, size, along(found, size / before, direction), count + 1
+
+    least, found = tolerance**2 * _dot(right, right), inverse(right)
+    begin = jax.tree.map(jnp.zeros_like, right), right, _dot(right, found), found, 0
+    return lax.while_loop(unsolved, iteration, begin)[0]
+
+
+class TrustRegion(optx.ClassicalTrustRegion):
+    """optimistix's own, but told how a step was predicted to change the loss, for which that makes another product with J."""
+
+    reduction: Any = 0.0
+
+    def predict_reduction(self, y_diff: Any, f_info: Any) -> Any:
+        return self.reduction
 
 
 class LevenbergMarquardt(optx.AbstractGaussNewton):
@@ -91,19 +146,29 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
     search: Any
     verbose: Callable[..., None]
 
-    def __init__(self, rejections: int, others: Any, exactly: tuple[float, int] = (_TOLERANCE, _ITERATIONS)):
+    def __init__(
+        self,
+        rejections: int,
+        others: Any,
+        predicted: float = 0.0,
+        exactly: tuple[float, int] = (_TOLERANCE, _ITERATIONS),
+    ):
         self.rtol = self.atol = 0.0  # when a fit ends, `run` decides
         self.norm = optx.rms_norm
         self.descent = ConjugateGradients(*exactly, others)
-        search = optx.ClassicalTrustRegion(
+        search = TrustRegion(
             high_cutoff=_GOOD,
             low_cutoff=_LEAST_GAIN,
             high_constant=_HIGHER if rejections == 0 else 1.0,
             low_constant=_REJECTED / 2**rejections,
+            reduction=-predicted,
         )
+
+        def told(search: TrustRegion) -> Any:
+            return search.high_constant, search.low_constant, search.reduction
+
         # As arrays, so that one program serves whatever they are; made of numbers first, which it checks by no program.
-        constants = jax.tree.map(np.asarray, (search.high_constant, search.low_constant))
-        self.search = eqx.tree_at(lambda search: (search.high_constant, search.low_constant), search, constants)
+        self.search = eqx.tree_at(told, search, jax.tree.map(np.asarray, told(search)))
         self.verbose = _silent
 
 
@@ -181,14 +246,15 @@ def _form(structure: Any, leaves: tuple[Any, ...], _: Any) -> Any:
 
 
 def advance(
-    unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int
+    unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int, predicted: float
 ) -> tuple[Unknowns, Any, Outcome]:
     """One step from the last one's unknowns and optimistix's state, with the expansion at `position.y_eval`, after so many
-    rejections in a row: new unknowns, which are the old ones if it is rejected, a new state, and what it did.
+    rejections in a row: new unknowns, which are the old ones if it is rejected, a new state, and what it did. `predicted`: the
+    last one's; of no account for the first.
 
     What the old state holds of J makes room for that of the new one: it is gone.
     """
-    new, arrays, outcome = _advance(*_arguments(unknowns, position, expansion, others, rejections))
+    new, arrays, outcome = _advance(*_arguments(unknowns, position, expansion, others, rejections, predicted))
     # What else the state holds, functions among it, stays as it is, and could not be kept with a compiled program.
     following, (leaves, structure) = iter(arrays), jax.tree.flatten(position)
     return new, jax.tree.unflatten(structure, [next(following) if eqx.is_array(leaf) else leaf for leaf in leaves]), outcome
@@ -197,13 +263,15 @@ def advance(
 def compile_steps_ahead(expansion: Expansion) -> None:
     """The program of `advance`, for an expansion whose pictures may be forms of those to come."""
     others = jax.tree.map(np.asarray, expansion.unknowns.without_modes())
-    _advance.compile_ahead(*_arguments(expansion.unknowns, _form_of(expansion), expansion, others, 0))
+    _advance.compile_ahead(*_arguments(expansion.unknowns, _form_of(expansion), expansion, others, 0, 0.0))
 
 
-def _arguments(unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int) -> tuple[Any, Any]:
+def _arguments(
+    unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int, predicted: float
+) -> tuple[Any, Any]:
     """What `_advance` takes."""
     exactly = (_TOLERANCE, _ITERATIONS) if expansion.problem.albedo is None else (_FIELD_TOLERANCE, _FIELD_ITERATIONS)
-    solver = LevenbergMarquardt(rejections, others, exactly)
+    solver = LevenbergMarquardt(rejections, others, predicted, exactly)
     of_j, rest = _of_j(position)
     mesh = expansion.problem.mesh
     return on_every_device((solver, unknowns, rest, expansion), mesh), divided(of_j, mesh)
@@ -212,7 +280,7 @@ def _arguments(unknowns: Unknowns, position: Any, expansion: Expansion, others: 
 def _of_j(position: Any) -> tuple[Any, Any]:
     """What optimistix's state holds of J, and the rest."""
     which = eqx.tree_at(
-        lambda state: (state.f_info.jac, state.descent_state.jac), jax.tree.map(lambda _: False, position), (True, True)
+        lambda state: (state.f_info.jac, state.descent_state[0].jac), jax.tree.map(lambda _: False, position), (True, True)
     )
     return eqx.partition(position, which)
 
@@ -230,7 +298,7 @@ def _advance(
     outcome = Outcome(
         loss=state.f_info.as_min(),
         accepted=state.num_accepted_steps > position.num_accepted_steps,
-        predicted=-solver.search.predict_reduction(step, state.f_info),
+        predicted=-change_of_loss(step, state.descent_state[1], state.search_state.step_size),
         step_size=state.search_state.step_size,
         change=jnp.sqrt(jnp.mean(moved * moved)),
     )
