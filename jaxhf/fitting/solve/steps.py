@@ -82,7 +82,7 @@ def _transposed(jac: Any) -> Callable[[Any], Unknowns]:
     return lambda residual: pull(residual)[0]
 
 
-def _dot(a: Any, b: Any) -> Scalar:
+def _dot(a: Any, b: Any) -> Any:
     return sum(jax.tree.leaves(jax.tree.map(functools.partial(jnp.vdot, precision=lax.Precision.HIGHEST), a, b)))
 
 
