@@ -76,7 +76,7 @@ def _central(heights, dx, dy, up):
 
 
 def _fan_mean(heights, dx, dy, fan, weight):
-    """The components stay apart until the end, see `_side_by_side`."""
+    """The components stay apart until the end: arrays whose last axis has length 3 take several times as long."""
     at = _neighbours(heights)
     here, here_present = at(0, 0)
     total_x = total_y = total_z = jnp.zeros_like(here)
@@ -104,7 +104,8 @@ def _fan_mean(heights, dx, dy, fan, weight):
 
 
 def _side_by_side(*components: Float[jax.Array, "ny nx"]) -> Float[jax.Array, "ny nx c"]:
-    """Components as the last axis, in a copy of its own: XLA would compute all of them anew, number by number, for each."""
+    """Components as the last axis, once they are computed: by XLA's older emitters of loops, which `compiled` asks for, they
+    would be number by number, in the order of the result."""
     return jnp.moveaxis(materialise(jnp.stack(components)), 0, -1)
 
 

@@ -79,7 +79,7 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int, cells
     gone = gone[:-2] & gone[1:-1] & gone[2:]
     amid_gone = (gone[:, :-2] & gone[:, 1:-1] & gone[:, 2:]) | beyond((ny - 1, nx - 1), cells)
 
-    # Both bounds at once, and each level from the finest's width on: a kernel each, where two of them had taken four.
+    # A kernel for each level: of both bounds, and from the level below as it is padded, which is computed once then.
     values = jnp.where(hole, jnp.inf, jnp.stack([z, -z]))
     pairs = jnp.maximum(values[:, :-1], values[:, 1:])
     block = jnp.where(amid_gone, -jnp.inf, jnp.maximum(pairs[..., :-1], pairs[..., 1:]) + outwards)
@@ -96,7 +96,7 @@ def make_pyramid(z: Float[jax.Array, "ny nx"], z_top: Scalar, levels: int, cells
         height=jnp.int32(height),
         log_width=jnp.int32(width.bit_length() - 1),
         largest=jnp.int32(2**levels),
-        below=jnp.int32(bounds[0].size),
+        below=jnp.int32(bounds.size // 2),
         has_levels=levels > 0,
     )
 

@@ -4,19 +4,29 @@ import dataclasses
 import math
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
 import pytest
-from small_fits import SETTINGS as SMALL, SIZE, given as given_with, posed, scenes
+from small_fits import EVERYTHING, SETTINGS as SMALL, SIZE, expanded, given as given_with, pictures, posed, scenes
 
 import jaxhf
 from jaxhf.fitting.fit import Pace, printed_progress
+from jaxhf.fitting.model.expansion import expand
 from jaxhf.fitting.model.unknowns import Unknowns
 from jaxhf.fitting.solve.stages import first_state, why_ended
-from jaxhf.fitting.solve.steps import ConjugateGradients, LevenbergMarquardt, change_of_loss, conjugate_gradients
+from jaxhf.fitting.solve.steps import (
+    ConjugateGradients,
+    LevenbergMarquardt,
+    _arguments,
+    advance,
+    change_of_loss,
+    conjugate_gradients,
+    first_position,
+)  # fmt: skip
 
 SETTINGS = jaxhf.Settings(shadows=False, samples=1, chunk=256)
 # Slopes up to 3, seen from above in one picture of one light; the prior is the terrain smoothed, and says little.
@@ -127,6 +137,26 @@ def test_rejections_in_a_row_damp_ever_faster():
     np.testing.assert_allclose([search.high_constant for search in searches], [4, 1, 1, 1])
 
 
+def test_a_step_is_judged_by_what_was_predicted_of_it():
+    """As optimistix predicts it, which multiplies by the derivative once more; step after step, whether it was accepted."""
+    here = expanded(scenes(), pictures(), unknown=EVERYTHING, settings=SMALL, noise=0.01)
+    others, step_size = jax.tree.map(jnp.ones_like, here.unknowns.without_modes()), jnp.asarray(10.0)
+    position: Any = first_position(here, step_size)
+    unknowns, predicted, rejections, accepted = here.unknowns, 0.0, 0, []
+    for number in range(8):
+        there = expand(position.y_eval, here.problem) if number else here
+        unknowns, position, outcome = advance(unknowns, position, there, others, rejections, predicted)
+        step = jax.tree.map(lambda to, at: to - at, position.y_eval, unknowns)
+        expected = eqx.filter_jit(optx.ClassicalTrustRegion().predict_reduction)(step, position.f_info)
+        predicted, rejections = float(outcome.predicted), 0 if outcome.accepted else rejections + 1
+        assert predicted == pytest.approx(-float(expected), rel=0.02)  # in single precision
+        (solver, *_), _ = _arguments(unknowns, position, there, others, rejections, predicted)
+        assert float(solver.search.predict_reduction(step, position.f_info)) == -predicted
+        accepted.append(bool(outcome.accepted))
+    assert accepted[0]
+    assert set(accepted[1:]) == {True, False}
+
+
 def test_a_step_is_taken_at_any_damping():
     """Also where 1 / λ is below the precision's epsilon, as it is for many pixels with little noise in single precision.
 
@@ -146,8 +176,8 @@ def test_a_step_is_taken_at_any_damping():
         np.testing.assert_allclose(told, (left @ left - right @ right) / 2, rtol=0.01)
 
 
-@pytest.mark.parametrize("tolerance", [0.3, 1e-2, 1e-5])
-def test_a_linear_problem_is_solved_as_far_as_asked(tolerance):
+@pytest.mark.parametrize(("tolerance", "most"), [(0.3, 60), (1e-2, 60), (1e-5, 60), (1e-5, 4)])
+def test_a_linear_problem_is_solved_as_far_as_asked(tolerance, most):
     """As JAX's own conjugate gradients take it, which stop as early; and what such a step is to change is told as well."""
     rng = np.random.default_rng(3)
     jacobian, residual, damping = rng.standard_normal((40, 20)), rng.standard_normal(40), 3.0
@@ -157,8 +187,8 @@ def test_a_linear_problem_is_solved_as_far_as_asked(tolerance):
     def inverse(x: jax.Array) -> jax.Array:
         return x / scales
 
-    found = conjugate_gradients(lambda x: matrix @ x, -gradient, inverse, jnp.float32(tolerance), jnp.int32(60))
-    expected, _ = jax.scipy.sparse.linalg.cg(lambda x: matrix @ x, -gradient, tol=tolerance, maxiter=60, M=inverse)
+    found = conjugate_gradients(lambda x: matrix @ x, -gradient, inverse, jnp.float32(tolerance), jnp.int32(most))
+    expected, _ = jax.scipy.sparse.linalg.cg(lambda x: matrix @ x, -gradient, tol=tolerance, maxiter=most, M=inverse)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
     left = residual + jacobian @ np.asarray(found, np.float64)
     told = change_of_loss(found, gradient, jnp.float32(1 / damping))

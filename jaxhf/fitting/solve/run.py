@@ -100,8 +100,8 @@ def _stepped(state: State, place: _Place, stage: Stage, begin: float) -> tuple[S
 def _step(state: State, place: _Place) -> tuple[Unknowns, _Place, Outcome]:
     here = place.expansion
     there = expand(place.position.y_eval, here.problem) if state.steps else here  # the first evaluates where the stage begins
-    told = state.others, state.rejections, state.predicted
-    unknowns, position, outcome = advance(state.unknowns, place.position, there, *told)
+    besides = state.others, state.rejections, state.predicted
+    unknowns, position, outcome = advance(state.unknowns, place.position, there, *besides)
     return unknowns, _Place(there if outcome.accepted else here, position), outcome
 
 

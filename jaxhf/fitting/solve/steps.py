@@ -88,18 +88,18 @@ def _dot(a: Any, b: Any) -> Any:
 
 def change_of_loss(step: Any, gradient: Any, step_size: Scalar) -> Scalar:
     """By a step, were pictures linear: g d + |J d|² / 2, of which (JᵀJ + λ) d = -g makes (g d - λ |d|²) / 2. What conjugate
-    gradients leave of that equation is orthogonal to d."""
+    gradients leave of that equation is orthogonal to d, but for rounding."""
     return _dot(step, jax.tree.map(lambda g, d: g - d / step_size, gradient, step)) / 2
 
 
 def conjugate_gradients(
     product: Callable[[Any], Any], right: Any, inverse: Callable[[Any], Any], tolerance: Scalar, most: Int[Array, ""]
 ) -> Any:
-    """x whose `product` is `right`, to a share `tolerance` of that, in at most so many iterations from x = 0; `inverse`: the
+    """x whose `product` is `right`, to a share `tolerance` of that, in `most` iterations at most, from x = 0; `inverse`: the
     preconditioner (Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm 9.1).
 
-    It gives the bits of `jax.scipy.sparse.linalg.cg`, which multiplies the first x too, though it is 0: its programs hold the
-    product twice, and it traces it five times.
+    It gives the bits of `jax.scipy.sparse.linalg.cg`. That multiplies the first x, too, though it is 0: its programs hold the
+    product twice, and the product is traced five times.
     """
 
     def along(here: Any, step: Scalar, direction: Any) -> Any:
@@ -164,11 +164,11 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
             reduction=-predicted,
         )
 
-        def told(search: TrustRegion) -> Any:
+        def constants(search: TrustRegion) -> Any:
             return search.high_constant, search.low_constant, search.reduction
 
         # As arrays, so that one program serves whatever they are; made of numbers first, which it checks by no program.
-        self.search = eqx.tree_at(told, search, jax.tree.map(np.asarray, told(search)))
+        self.search = eqx.tree_at(constants, search, jax.tree.map(np.asarray, constants(search)))
         self.verbose = _silent
 
 
@@ -249,8 +249,8 @@ def advance(
     unknowns: Unknowns, position: Any, expansion: Expansion, others: Any, rejections: int, predicted: float
 ) -> tuple[Unknowns, Any, Outcome]:
     """One step from the last one's unknowns and optimistix's state, with the expansion at `position.y_eval`, after so many
-    rejections in a row: new unknowns, which are the old ones if it is rejected, a new state, and what it did. `predicted`: the
-    last one's; of no account for the first.
+    rejections in a row: new unknowns, which are the old ones if it is rejected, a new state, and what it did. `predicted`: by
+    the last one, of the step that led to `position.y_eval`; of no account where that is a stage's first.
 
     What the old state holds of J makes room for that of the new one: it is gone.
     """
