@@ -100,8 +100,9 @@ def _stepped(state: State, place: _Place, stage: Stage, begin: float) -> tuple[S
 def _step(state: State, place: _Place) -> tuple[Unknowns, _Place, Outcome]:
     here = place.expansion
     there = expand(place.position.y_eval, here.problem) if state.steps else here  # the first evaluates where the stage begins
-    besides = state.others, state.rejections, state.predicted
-    unknowns, position, outcome = advance(state.unknowns, place.position, there, *besides)
+    unknowns, position, outcome = advance(
+        state.unknowns, place.position, there, state.others, state.rejections, state.predicted
+    )
     return unknowns, _Place(there if outcome.accepted else here, position), outcome
 
 
@@ -200,7 +201,7 @@ def _resumed(problems: Sequence[Problem], state: State) -> _Place:
         return _Place(here, whole_step=whole_step(here))
     position = first_position(here, state.step_size)
     if state.steps:
-        _, position, _ = advance(state.unknowns, position, here, state.others, 0, state.predicted)
+        _, position, _ = advance(state.unknowns, position, here, state.others, 0, 0.0)
     return _Place(here, position)
 
 
