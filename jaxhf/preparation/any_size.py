@@ -32,14 +32,15 @@ from .world import Ceilings, World, make_ceilings, make_world
 Module = TypeVar("Module", bound=eqx.Module)
 
 _LEAST_CELLS, _MOST_CELLS = 2**14, 2**22  # beyond, room takes hundreds of megabytes
-_SPARE = 5 / 4  # of the cells' number: vertices and the bins of a `Ceiling` are more
+_SPARE = 5 / 4  # of the cells' number: the bins of a `Ceiling` are more, and vertices where sides are 2^n + 1
 
 
 class Room(NamedTuple):
     """How many numbers arrays of a terrain have room for.
 
     Attributes:
-      vertices: in those with an entry a vertex, and in bounds of shadows.
+      vertices: in those with an entry a vertex; a power of two but for sides of 2^n + 1, see `values_at`.
+      bins: in bounds of shadows.
       bounds: in those of the pyramid, which rounds both sides up to powers of two.
       border: in those with an entry a vertex of the border.
       square: (ny, nx) of the arrays of two axes from which these are made, where a program makes them of terrains of many
@@ -47,6 +48,7 @@ class Room(NamedTuple):
     """
 
     vertices: int
+    bins: int
     bounds: int
     border: int
     square: tuple[int, int] | None = None
@@ -57,16 +59,16 @@ Rooms = tuple[Room | None, ...]
 
 
 def _room(shape: tuple[int, int], squared: bool = False) -> Room | None:
-    """Of two sizes for each power of four, so that room is at most five times what is needed; None where there is none."""
+    """Of two sizes for each power of four, or a third where sides are 2^n + 1, so that room is at most 5 times what is needed;
+    None where there is none."""
     ny, nx = shape
     width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)
     cells = max(4 ** math.ceil(math.log2(width * height) / 2), _LEAST_CELLS)
-    needed = max(nx * ny, (nx - 1) * (ny - 1) + 3 * max(nx, ny))
-    enough = [vertices for vertices in (int(_SPARE * cells / 4), int(_SPARE * cells)) if needed <= vertices]
     border = cells // 32 + 64
-    if cells > _MOST_CELLS or not enough or 2 * (nx + ny) > border:  # a narrow one has more of it than others
+    if cells > _MOST_CELLS or 2 * (nx + ny) > border:  # a narrow one has more of it than others
         return None
-    return Room(enough[0], 4 * cells, border, (height + 1, width + 1) if squared else None)
+    vertices = next((enough for enough in (cells // 4, cells) if nx * ny <= enough), int(_SPARE * cells))
+    return Room(vertices, int(_SPARE * min(vertices, cells)), 4 * cells, border, (height + 1, width + 1) if squared else None)
 
 
 def _rooms(shapes: Sequence[Shape | Surface], squared: bool) -> Rooms:
@@ -244,11 +246,11 @@ def _roomy_ceilings(surfaces: tuple[Surface, ...], ceilings: Ceilings, rooms: Ro
             return ceiling
         heights, first = ceiling.heights, ceiling.first
         if room.square is None:
-            heights = _padded(heights, room.vertices)
+            heights = _padded(heights, room.bins)
         else:
             (ny, nx), (x, y) = room.square, grid.cells
             width, cells, strips = (jnp.where(ceiling.columns, *pair) for pair in ((ny + 2, nx + 2), (y, x), (x, y)))
-            heights = _rows_of(width, cells + 3, strips, room.vertices)(heights)
+            heights = _rows_of(width, cells + 3, strips, room.bins)(heights)
             first = jnp.where(jnp.arange(first.size, dtype=jnp.int32) < strips, first, 0)
         return dataclasses.replace(ceiling, heights=heights, first=_padded(first, room.border))
 

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import UInt32
 
 from ..core.ray import Ray
 from ..core.types import Flag, Index, Scalar
@@ -142,6 +143,14 @@ def until_ended(advance: Callable[[Any], Any], carry: Any, budget: Index, fixed_
 
     def going(counted):
         step, (state, *_) = counted
-        return (step < budget) & walking(state).any()
+        return (step < budget) & _any_walking(state)
 
     return lax.while_loop(going, lambda counted: (counted[0] + 1, advance(counted[1])), (jnp.zeros((), jnp.int32), carry))[1]
+
+
+def _any_walking(state: UInt32[jax.Array, "*rays"]) -> Flag:
+    """Whether one of the walks goes on: what a bit tells of one, it tells of their states' union. Of many flags XLA takes `any`
+    byte by byte."""
+    while state.ndim and state.size % 2 == 0 and state.size > 8:
+        state = state[: state.size // 2] | state[state.size // 2 :]
+    return walking(state).any()

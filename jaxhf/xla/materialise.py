@@ -31,10 +31,14 @@ def values_at(values: jax.Array, place: jax.Array, further: tuple[Any, ...]) -> 
     For a processor without AVX-512 LLVM computes number by number, not in vectors, whatever stands in a gather's loop and has a
     part in its index. A place that comes from memory has no parts in that loop: frames take about half of the time
     (docs/measurements/experiments.md). XLA confines each index to the array, a signed one from below and from above, an
-    unsigned one only from above.
+    unsigned one only from above, by two instructions each; that is left out where it is known to have no more bits than the
+    array's length, which therefore should be a power of two.
     """
     place = materialise(place).astype(jnp.uint32)
     places = [place, *(place + jnp.asarray(step).astype(jnp.uint32) for step in further)]
+    last = len(values) - 1
+    if last & len(values) == 0:
+        places = [place & jnp.uint32(last) for place in places]
     return tuple(values.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False) for place in places)
 
 
