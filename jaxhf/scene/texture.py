@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from ..core.errors import ArgumentError
 from ..core.rules import OneOf, require_fields
 from ..core.types import AnyArray, Index, Point2, Scalar, Vector, float_leaf
-from ..core.vector import within
+from ..core.vector import lesser, within
 
 Wrap = Literal["repeat", "clamp"]
 
@@ -56,7 +56,7 @@ class ImageTexture(eqx.Module):
 
     def at(self, row: Int[AnyArray, "*n"], column: Int[AnyArray, "*n"]) -> Float[jax.Array, "*n 3"]:
         """The colour of a texel, or of each of some."""
-        return jnp.asarray(self.texels)[row, column]
+        return jnp.asarray(self.texels).at[row, column].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
     @property
     def columns(self) -> int:
@@ -95,7 +95,8 @@ class FlatTexture(eqx.Module):
 
     def at(self, row: Int[AnyArray, "*n"], column: Int[AnyArray, "*n"]) -> Float[jax.Array, "*n 3"]:
         """As of `ImageTexture`."""
-        return jnp.asarray(self.texels)[row * self.w + column]
+        place = row * self.w + column
+        return jnp.asarray(self.texels).at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
     @property
     def columns(self) -> Index:
@@ -133,6 +134,8 @@ def _between(uv: Point2, h: Index, w: Index, at_vertices: bool, wrap: Wrap) -> t
     column, row = jnp.floor(x), jnp.floor(y)
     fx, fy = x - column, y - row
     ix, iy = column.astype(jnp.int32), row.astype(jnp.int32)
+    if at_vertices or wrap == "clamp":
+        return (iy, lesser(iy + 1, h - 1), fy), (ix, lesser(ix + 1, w - 1), fx)
     return (iy % h, (iy + 1) % h, fy), (ix % w, (ix + 1) % w, fx)
 
 

@@ -221,18 +221,18 @@ def _shading_normal(
         return n, lambda: (jnp.zeros_like(n), jnp.zeros_like(n))
     n00, between, n11 = normals
     first, second = between - n00, n11 - between
-    per_u, per_v = jnp.where(upper, second, first), jnp.where(upper, first, second)
-    mean = n00 + u * per_u + v * per_v
+    mean = n00 + jnp.where(upper, v, u) * first + jnp.where(upper, u, v) * second
     if grid.object_from_world is not None:
-        mean, per_u, per_v = (grid.object_from_world.covector(normal) for normal in (mean, per_u, per_v))
+        mean, first, second = (grid.object_from_world.covector(normal) for normal in (mean, first, second))
     largest = lax.stop_gradient(largest_component(mean))
     largest = jnp.where(largest > 0, largest, 1)
     ns = unit(mean)
 
     def turning() -> tuple[Vector, Vector]:
         length = dot(mean / largest, ns)
+        per_u, per_v = jnp.where(upper, second, first), jnp.where(upper, first, second)
         changes = per_u / largest, per_v / largest
-        first, second = ((change - ns * dot(ns, change)) / jnp.where(length > 0, length, 1) for change in changes)
-        return first, second
+        dn_du, dn_dv = ((change - ns * dot(ns, change)) / jnp.where(length > 0, length, 1) for change in changes)
+        return dn_du, dn_dv
 
     return ns, turning

@@ -13,6 +13,7 @@ from ..core.types import Flag, Index, Scalar, Vector
 from ..core.vector import greater, largest_component, lesser, quotient, time_to, unit, within
 from ..scene.heightfield import Size
 from ..scene.skirt import Skirt
+from ..xla.materialise import materialise, values_at
 from .hit import Hit, hit_of_closed_form, orthogonal_tangents
 
 # The directions out of the solid through the four walls and the floor, object frame.
@@ -65,7 +66,8 @@ class Walls(eqx.Module):
             if side == _FLOOR:
                 inside = inside & (at[1] >= -wider[1]) & (at[1] <= self.size[1] + wider[1])
             else:
-                low, high, share = _tops(self, first, jnp.clip(at[along] / length, 0, 1) * cells.astype(at.dtype), cells)
+                position = jnp.clip(at[along] / length, 0, 1) * cells.astype(at.dtype)
+                low, high, share = materialise(_tops(self, first, position, cells))
                 more = wider[2] + jnp.abs(high - low) * (cells.astype(at.dtype) / length) * wider[along]
                 inside = inside & (at[2] >= self.base - wider[2]) & (at[2] <= low + share * (high - low) + more)
             met = ever & (t > 0) & (t < best) & inside
@@ -118,7 +120,7 @@ def _upright(walls: Walls) -> list[tuple[int, Scalar, int, Scalar, Index, Index]
 def _tops(walls: Walls, first: Index, position: Scalar, cells: Index) -> tuple[Scalar, Scalar, Scalar]:
     """The heights of a wall before and after a position from 0 to `cells` along it, and its share of the way."""
     cell = jnp.clip(position.astype(jnp.int32), 0, cells - 1)
-    return walls.tops[first + cell], walls.tops[first + cell + 1], position - cell.astype(position.dtype)
+    return *values_at(walls.tops, first + cell, (1,)), position - cell.astype(position.dtype)
 
 
 def wall_slopes(walls: Walls, number: int, level: Vector, leaving: Hit) -> tuple[Scalar, Scalar]:
