@@ -86,12 +86,26 @@ def trace_picture(
         tiles = trace_tiles(mesh, world, camera, aovs, tiling.corners())
         return jax.tree.map(tiling.assemble, tiles)
 
-    def across_boundaries(world: World, camera: Camera, key: jax.Array | None) -> dict[str, jax.Array]:
+    def differentiated(world: World, camera: Camera, key: jax.Array | None) -> dict[str, jax.Array]:
         others = picture(world, camera) if aovs else {}
+        if not has_edges(world):
+            samples = PictureSamples(camera, world.settings)
+            return others | {"image": samples.in_pixels(_light(world, camera, samples, mesh))}
         drawn = choose_resampled(draw_edges(world, camera, key, mesh), camera, world.settings)
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
 
-    return in_turn(picture, world, camera, key, derivative_of=across_boundaries if has_edges(world) else None)
+    # Samples one after the other within a tile would each have a derivative by all heights, and tiles another one.
+    in_one_loop = has_edges(world) or (world.settings.samples or 1) > 1
+    return in_turn(picture, world, camera, key, derivative_of=differentiated if in_one_loop else None)
+
+
+def _light(world: World, camera: Camera, samples: PictureSamples, mesh: Mesh) -> Float[jax.Array, "chunks n 3"]:
+    """The radiance of all samples, in one loop."""
+
+    def radiance(seen: tuple[World, Camera], points: tuple[jax.Array, ...]) -> jax.Array:
+        return one_kernel(lambda *args: light_along(*args)[0], *seen, *points)
+
+    return map_over(mesh, radiance, (world, camera), samples.positions())
 
 
 def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, mesh: Mesh) -> Float[jax.Array, "h w 3"]:
@@ -101,11 +115,7 @@ def _picture_across_boundaries(world: World, camera: Camera, drawn: Boundaries, 
     program compiled for 7 s longer.
     """
     samples = PictureSamples(camera, world.settings, drawn.resampled)
-
-    def radiance(seen: tuple[World, Camera], points: tuple[jax.Array, ...]) -> jax.Array:
-        return one_kernel(lambda *args: light_along(*args)[0], *seen, *points)
-
-    light = map_over(mesh, radiance, (world, camera), samples.positions())
+    light = _light(world, camera, samples, mesh)
     image = samples.in_pixels(light)
     finer = samples.of_resampled(light).mean(1)
     light = moved_light(world, camera, drawn, mesh)

@@ -168,6 +168,21 @@ def test_reverse_mode_keeps_no_heights_a_tile():
     assert max(sizes) < 37 * 53
 
 
+def test_a_picture_of_several_samples_is_the_same_where_it_is_differentiated():
+    """Tiles and samples are then one loop; sums over a pixel's samples may be rounded otherwise."""
+    heights, settings = jnp.asarray(waves(9, 7, 5, 0.06).astype(np.float32)), jaxhf.Settings(samples=4, chunk=64)
+    camera = dataclasses.replace(parallel().camera, width=20, height=12)
+
+    def render(heights: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera, [jaxhf.Directional((0.3, 0.4, 1.0))])
+        return jaxhf.render(scene, settings, aovs=("depth",))
+
+    (image, aovs), ((same, others), _) = render(heights), jax.jvp(render, (heights,), (heights,))
+    assert float(image.std()) > 0.01
+    np.testing.assert_allclose(same, image, rtol=0, atol=1e-6)
+    np.testing.assert_array_equal(others["depth"], aovs["depth"])
+
+
 @functools.cache
 def changes(name: str) -> dict[str, tuple[jaxhf.Scene, np.ndarray, np.ndarray]]:
     """Of each leaf: a change of it alone, and central differences along that with STEP and with half of it."""
