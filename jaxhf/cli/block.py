@@ -147,7 +147,10 @@ def _in_haze(
 ) -> Float[np.ndarray, "h w 3"]:
     met = np.isfinite(depth)
     far = np.subtract(depth, depth.min(where=met, initial=np.inf), out=np.zeros_like(depth), where=met)
-    share = np.exp(far * np.float32(math.log1p(-haze) / size))[..., None]
-    hazy = image + (1 - share) * (np.array(_HAZE, np.float32) - image)
-    rows = np.linspace(0, 1, len(image), dtype=np.float32)[:, None, None]
-    return np.where(met[..., None], hazy, (1 - rows) * np.array(_ABOVE, np.float32) + rows * np.array(_BELOW, np.float32))
+    veiled = 1 - np.exp(far * np.float32(math.log1p(-haze) / size))
+    rows, found = np.linspace(0, 1, len(image), dtype=np.float32)[:, None], np.empty_like(image)
+    for k, colours in enumerate(zip(_HAZE, _ABOVE, _BELOW, strict=True)):  # together they take 1.6 times as long
+        veil, above, below = np.array(colours, np.float32)
+        hazy = image[..., k] + veiled * (veil - image[..., k])
+        found[..., k] = np.where(met, hazy, (1 - rows) * above + rows * below)
+    return found
