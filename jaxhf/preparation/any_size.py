@@ -32,14 +32,14 @@ from .world import Ceilings, World, make_ceilings, make_world
 Module = TypeVar("Module", bound=eqx.Module)
 
 _LEAST_CELLS, _MOST_CELLS = 2**14, 2**22  # beyond, room takes hundreds of megabytes
-_SPARE = 5 / 4  # of the cells' number: the bins of a `Ceiling` are more, and vertices where sides are 2^n + 1
+_SPARE = 5 / 4  # of the cells' number: the bins of a `Ceiling` are more, and vertices of squares of 2^n + 1
 
 
 class Room(NamedTuple):
     """How many numbers arrays of a terrain have room for.
 
     Attributes:
-      vertices: in those with an entry a vertex; a power of two but for sides of 2^n + 1, see `values_at`.
+      vertices: in those with an entry a vertex; a power of two but for squares of 2^n + 1, see `values_at`.
       bins: in bounds of shadows.
       bounds: in those of the pyramid, which rounds both sides up to powers of two.
       border: in those with an entry a vertex of the border.
@@ -59,7 +59,7 @@ Rooms = tuple[Room | None, ...]
 
 
 def _room(shape: tuple[int, int], squared: bool = False) -> Room | None:
-    """Of two sizes for each power of four, or a third where sides are 2^n + 1, so that room is at most 5 times what is needed;
+    """Of two sizes for each power of four, or a third for squares of 2^n + 1, so that room is at most 5 times what is needed;
     None where there is none."""
     ny, nx = shape
     width, height = next_power_of_two(nx - 1), next_power_of_two(ny - 1)

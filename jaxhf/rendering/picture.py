@@ -94,7 +94,7 @@ def trace_picture(
         drawn = choose_resampled(draw_edges(world, camera, key, mesh), camera, world.settings)
         return others | {"image": _picture_across_boundaries(world, camera, drawn, mesh)}
 
-    # Samples one after the other within a tile would each have a derivative by all heights, and tiles another one.
+    # With a loop of samples in that of tiles, each tile would add an array of derivatives by all heights to that of the others.
     in_one_loop = has_edges(world) or (world.settings.samples or 1) > 1
     return in_turn(picture, world, camera, key, derivative_of=differentiated if in_one_loop else None)
 

@@ -45,7 +45,7 @@ def light_from(number: int, world: World, hit: Hit, wo: Vector | None, active: F
         return light.irradiance * share * _sent_on(world, towards, hit, wo), exhausted
     wi, arriving, distance = materialise(_towards(light, hit.p))
     lit, exhausted = _visible(number, world, wi, distance, hit, active)
-    return arriving * jnp.where(lit, _sent_on(world, wi, hit, wo), 0), exhausted
+    return jnp.where(lit, arriving * _sent_on(world, wi, hit, wo), 0), exhausted
 
 
 def _seen_share(grid: Grid, sky: Float[jax.Array, "_ 3"], hit: Hit) -> Scalar:

@@ -149,8 +149,8 @@ def until_ended(advance: Callable[[Any], Any], carry: Any, budget: Index, fixed_
 
 
 def _any_walking(state: UInt32[jax.Array, "*rays"]) -> Flag:
-    """Whether one of the walks goes on: what a bit tells of one, it tells of their states' union. Of many flags XLA takes `any`
-    byte by byte."""
-    while state.ndim and state.size % 2 == 0 and state.size > 8:
+    """Whether a walk, or one of several, goes on. Halves of the states are put together bit by bit first, in vectors: the bit
+    that says so is then set where it is in one of them. XLA's `any` would take flag after flag."""
+    while state.ndim == 1 and state.size % 2 == 0 and state.size > 8:
         state = state[: state.size // 2] | state[state.size // 2 :]
     return walking(state).any()

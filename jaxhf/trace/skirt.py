@@ -120,7 +120,8 @@ def _upright(walls: Walls) -> list[tuple[int, Scalar, int, Scalar, Index, Index]
 def _tops(walls: Walls, first: Index, position: Scalar, cells: Index) -> tuple[Scalar, Scalar, Scalar]:
     """The heights of a wall before and after a position from 0 to `cells` along it, and its share of the way."""
     cell = jnp.clip(position.astype(jnp.int32), 0, cells - 1)
-    return *values_at(walls.tops, first + cell, (1,)), position - cell.astype(position.dtype)
+    low, high = values_at(walls.tops, first + cell, (1,))
+    return low, high, position - cell.astype(position.dtype)
 
 
 def wall_slopes(walls: Walls, number: int, level: Vector, leaving: Hit) -> tuple[Scalar, Scalar]:

@@ -93,8 +93,9 @@ class Cell(NamedTuple):
 class Walk(eqx.Module):
     """The constants of one ray's walk and the steps that it takes.
 
-    Steps end in two selections, each with flags of its own, of which the inner one may leave the state as it is. Of one alone
-    LLVM makes a masked store, as XLA writes the new state where the old one was: a fifth of a step on AMD's processors.
+    A step ends in two selections: the outer one has its own flags and the inner one may keep the state. LLVM would make a
+    single selection between a new state and the old one a masked store, as XLA writes both in one place; that took a fifth of
+    a step on AMD's processors. Without levels `skip` still ends in one.
 
     The walk has a frame of its own: the grid's, mirrored so that the ray moves towards +x and +y. As it is mirrored
     within a width that is a power of two (that of the pyramid), a block stays a block.
@@ -209,9 +210,11 @@ class Walk(eqx.Module):
         cell = self.cell(state, ix, iy, size)
         met_first = cell.crosses & ~cell.on_own & _opposite(above, cell.gap_diagonal)
         met = cell.whole & (met_first | (~cell.skip_out & _opposite(above, cell.gap_out)))
-        # On which side of the diagonal the hit is: where that is crossed, before it or behind; else where the ray's middle is.
-        middle = jnp.where(cell.crosses, 0, (cell.near + cell.out) / 2 * self.rate)
-        line = jnp.where(cell.crosses, jnp.where(met_first, self.rate, -self.rate), cell.across)
+        # On which side of the diagonal the hit is: where the ray crosses it, before it or behind; else where its middle is. Two
+        # numbers are chosen and compared, as flags would be packed into bytes to choose between them.
+        least = jnp.finfo(self.rate.dtype).tiny
+        middle = jnp.where(cell.crosses, jnp.where(met_first, 0, self.rate), (cell.near + cell.out) / 2 * self.rate)
+        line = jnp.where(cell.crosses, jnp.where(met_first, self.rate, least), cell.across)
         upper = (middle < line) != self.back_x
 
         above = jnp.where(cell.whole, above, cell.gap_out >= 0)  # behind a hole the side is found anew
@@ -321,7 +324,7 @@ def _log2(size: Index) -> Index:
 
 
 def _opposite(above: Flag, gap: Scalar) -> Flag:
-    """Whether `gap` lies strictly on the other side; never where it is nan. A selection of flags would be packed into bytes."""
+    """Whether `gap` lies strictly on the other side; never where it is nan."""
     return jnp.where(above, gap, -gap) < 0
 
 

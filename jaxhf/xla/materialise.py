@@ -31,8 +31,8 @@ def values_at(values: jax.Array, place: jax.Array, further: tuple[Any, ...]) -> 
     For a processor without AVX-512 LLVM computes number by number, not in vectors, whatever stands in a gather's loop and has a
     part in its index. A place that comes from memory has no parts in that loop: frames take about half of the time
     (docs/measurements/experiments.md). XLA confines each index to the array, a signed one from below and from above, an
-    unsigned one only from above, by two instructions each; that is left out where it is known to have no more bits than the
-    array's length, which therefore should be a power of two.
+    unsigned one only from above, by two instructions a number. Where the array's length is a power of two, the index is masked
+    here by length - 1, which changes none that is in range and takes one instruction; XLA's two are then left out.
     """
     place = materialise(place).astype(jnp.uint32)
     places = [place, *(place + jnp.asarray(step).astype(jnp.uint32) for step in further)]

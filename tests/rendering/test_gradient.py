@@ -168,19 +168,23 @@ def test_reverse_mode_keeps_no_heights_a_tile():
     assert max(sizes) < 37 * 53
 
 
-def test_a_picture_of_several_samples_is_the_same_where_it_is_differentiated():
-    """Tiles and samples are then one loop; sums over a pixel's samples may be rounded otherwise."""
-    heights, settings = jnp.asarray(waves(9, 7, 5, 0.06).astype(np.float32)), jaxhf.Settings(samples=4, chunk=64)
-    camera = dataclasses.replace(parallel().camera, width=20, height=12)
+def test_a_picture_of_several_samples_has_the_derivative_of_their_mean():
+    """Samples of a pixel are the pixels of a picture of twice the size. Where it is differentiated, tiles and samples are one
+    loop; sums over a pixel's samples may be rounded otherwise."""
+    heights, change = (jnp.asarray(waves(9, 7, waves_of, 0.06).astype(np.float32)) for waves_of in (5, 3))
 
-    def render(heights: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+    def render(heights: jax.Array, finer: int, samples: int) -> tuple[jax.Array, dict[str, jax.Array]]:
+        camera = dataclasses.replace(parallel().camera, width=20 * finer, height=12 * finer)
         scene = jaxhf.Scene([jaxhf.Object(jaxhf.Heightfield(heights))], camera, [jaxhf.Directional((0.3, 0.4, 1.0))])
-        return jaxhf.render(scene, settings, aovs=("depth",))
+        return jaxhf.render(scene, jaxhf.Settings(samples=samples, chunk=64), aovs=("depth",))
 
-    (image, aovs), ((same, others), _) = render(heights), jax.jvp(render, (heights,), (heights,))
+    image, aovs = render(heights, 1, 4)
+    (same, others), (moved, _) = jax.jvp(lambda heights: render(heights, 1, 4), (heights,), (change,))
+    _, (finer, _) = jax.jvp(lambda heights: render(heights, 2, 1), (heights,), (change,))
     assert float(image.std()) > 0.01
     np.testing.assert_allclose(same, image, rtol=0, atol=1e-6)
-    np.testing.assert_array_equal(others["depth"], aovs["depth"])
+    np.testing.assert_allclose(others["depth"], aovs["depth"], rtol=1e-6)
+    np.testing.assert_allclose(moved, finer.reshape(12, 2, 20, 2, 3).mean((1, 3)), rtol=0, atol=1e-5 * float(abs(moved).max()))
 
 
 @functools.cache

@@ -242,3 +242,12 @@ def test_tiny_components_of_a_direction(dtype):
     for name, value in hit.items():
         np.testing.assert_array_equal(value[1:4], value[[0, 0, 0]], name)
         assert name == "t" or np.isfinite(value).all(), name
+
+
+def test_a_ray_that_never_leaves_its_diagonal_meets_the_triangle_before_it():
+    """Its distance to the diagonal, 1e-33 to 1e-31 cells, divided by the rate 0, lies within the cell all the same."""
+    field = jaxhf.Heightfield(np.array([[0.2, 1, 1], [0.1, 0.4, 1], [1, 1, 1]], np.float32))
+    starts = np.array([[0, 1e-33, 3.0], [0, 1e-31, 3.0], [0, 1e-32, 0.9]], np.float32)
+    hit = jaxhf.cast(field, starts, np.array([[0, 0, -1], [0, 0, -1], [1, 1, -1]], np.float32))
+    np.testing.assert_allclose(hit.t, [2.8, 2.8, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(hit.p[:, 2], [0.2, 0.2, 0.4], rtol=1e-6)
