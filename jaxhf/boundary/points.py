@@ -37,7 +37,7 @@ Tree = TypeVar("Tree")
 # The first of this many rounds of draws only refines the guiding distribution.
 _ROUNDS = 4
 # A program for any size draws from the edges of so many vertices, or times a power of two: at most twice as many as there are,
-# where arrays of a terrain have room for five times as many. What looks at all edges takes so much longer.
+# where arrays of a terrain have room for four times as many. What looks at all edges takes so much longer.
 _VERTICES = 2**14
 _CHUNKS = 16  # of a round, for which a program for any number of points has room at least
 

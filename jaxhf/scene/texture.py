@@ -56,7 +56,7 @@ class ImageTexture(eqx.Module):
 
     def at(self, row: Int[AnyArray, "*n"], column: Int[AnyArray, "*n"]) -> Float[jax.Array, "*n 3"]:
         """The colour of a texel, or of each of some."""
-        return jnp.asarray(self.texels).at[row, column].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        return jnp.asarray(self.texels)[row, column]
 
     @property
     def columns(self) -> int:
@@ -95,8 +95,7 @@ class FlatTexture(eqx.Module):
 
     def at(self, row: Int[AnyArray, "*n"], column: Int[AnyArray, "*n"]) -> Float[jax.Array, "*n 3"]:
         """As of `ImageTexture`."""
-        place = row * self.w + column
-        return jnp.asarray(self.texels).at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+        return jnp.asarray(self.texels)[row * self.w + column]
 
     @property
     def columns(self) -> Index:
