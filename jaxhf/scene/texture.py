@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from ..core.errors import ArgumentError
 from ..core.rules import OneOf, require_fields
 from ..core.types import AnyArray, Index, Point2, Scalar, Vector, float_leaf
-from ..core.vector import lesser, within
+from ..core.vector import within
 
 Wrap = Literal["repeat", "clamp"]
 
@@ -134,7 +134,7 @@ def _between(uv: Point2, h: Index, w: Index, at_vertices: bool, wrap: Wrap) -> t
     fx, fy = x - column, y - row
     ix, iy = column.astype(jnp.int32), row.astype(jnp.int32)
     if at_vertices or wrap == "clamp":
-        return (iy, lesser(iy + 1, h - 1), fy), (ix, lesser(ix + 1, w - 1), fx)
+        return (iy, jnp.minimum(iy + 1, h - 1), fy), (ix, jnp.minimum(ix + 1, w - 1), fx)
     return (iy % h, (iy + 1) % h, fy), (ix % w, (ix + 1) % w, fx)
 
 
