@@ -4,9 +4,8 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +17,7 @@ from ..core.types import Index
 from ..scene.heightfield import Heightfield, Size, next_power_of_two
 from ..scene.light import Light
 from ..scene.material import map_textures
+from ..scene.record import changed
 from ..scene.scene import Scene, Shape
 from ..scene.skirt import Skirt
 from ..scene.texture import FlatTexture, ImageTexture
@@ -28,8 +28,6 @@ from ..xla.materialise import materialise
 from .ceiling import Ceiling
 from .localise import precision
 from .world import Ceilings, World, make_ceilings, make_world
-
-Module = TypeVar("Module", bound=eqx.Module)
 
 _LEAST_CELLS, _MOST_CELLS = 2**14, 2**22  # beyond, room takes hundreds of megabytes
 _SPARE = 5 / 4  # of the cells' number: the bins of a `Ceiling` are more, and vertices of squares of 2^n + 1
@@ -120,10 +118,8 @@ def in_room(scene: Scene, settings: Settings) -> tuple[Scene, tuple[Size | None,
         if room.square is not None:
             shapes[k], sizes[k] = _squared(shape, *room.square, precision(scene))
 
-    def parts(scene: Scene) -> list[Any]:
-        return [*(obj.shape for obj in scene.objects), *(obj.material for obj in scene.objects), scene.camera]
-
-    return eqx.tree_at(parts, scene, [*shapes, *materials, None]), tuple(sizes), rooms
+    objects = (changed(obj, shape=shapes[k], material=materials[k]) for k, obj in enumerate(scene.objects))
+    return changed(scene, objects=tuple(objects), camera=None), tuple(sizes), rooms
 
 
 def _squared(shape: Heightfield | Skirt, ny: int, nx: int, dtype: Any) -> tuple[Heightfield | Skirt, Size]:
@@ -192,18 +188,10 @@ def with_shapes_of(scene: Scene, world: World) -> World:
     def with_shape(surface: Surface, shape: Shape) -> Surface:
         if not isinstance(surface, Grid | Walls) or surface.known_shape is not None:
             return surface
-        return _changed(surface, known_shape=_known_shape(shape))
+        return changed(surface, known_shape=_known_shape(shape))
 
     surfaces = tuple(with_shape(surface, obj.shape) for surface, obj in zip(world.surfaces, scene.objects, strict=True))
-    return _changed(world, surfaces=surfaces)
-
-
-def _changed(module: Module, **fields: Any) -> Module:
-    """As `dataclasses.replace`, but leaves may be of any kind: `jax.ShapeDtypeStruct`s, where a program is only compiled."""
-    new = object.__new__(type(module))
-    for name, value in (vars(module) | fields).items():
-        object.__setattr__(new, name, value)
-    return new
+    return changed(world, surfaces=surfaces)
 
 
 def _roomy_walls(walls: Walls, room: Room) -> Walls:
@@ -290,8 +278,8 @@ def of_any_terrain(world: World) -> World:
     leaves, structure = jax.tree.flatten(world)
     if structure not in _FORMS:
         pairs = zip(world.surfaces, _rooms(world.surfaces, squared=False), strict=True)
-        surfaces = (surface if room is None else _changed(surface, known_shape=None) for surface, room in pairs)
-        _FORMS[structure] = jax.tree.structure(_changed(world, surfaces=tuple(surfaces)))
+        surfaces = (surface if room is None else changed(surface, known_shape=None) for surface, room in pairs)
+        _FORMS[structure] = jax.tree.structure(changed(world, surfaces=tuple(surfaces)))
     return jax.tree.unflatten(_FORMS[structure], leaves)
 
 

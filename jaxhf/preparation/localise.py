@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from ..core.affine import affine, translate
 from ..scene.camera import Camera
 from ..scene.heightfield import Heightfield
 from ..scene.light import Light, Point
+from ..scene.record import changed
 from ..scene.scene import Object, Scene, Shape
 from ..scene.skirt import Skirt
 from ..xla.compilation import compiled
@@ -47,8 +47,8 @@ def localise(scene: Scene) -> Scene:
         lights=localise_lights(scene.lights, origin, dtype),
         samples=scene.samples,
     )
-    moved = jax.tree.map(lambda leaf: _in_precision(leaf, dtype), moved)
-    return eqx.tree_at(lambda moved: moved.camera, moved, localise_camera(scene.camera, scene, origin, dtype))
+    objects = jax.tree.map(lambda leaf: _in_precision(leaf, dtype), moved.objects)
+    return changed(moved, objects=objects, camera=localise_camera(scene.camera, scene, origin, dtype))
 
 
 def precision(scene: Scene) -> Any:
@@ -81,8 +81,7 @@ def localise_camera(camera: Camera, scene: Scene | None, origin: np.ndarray, dty
         numbers = (np.asarray(value, dtype) for value in (shares, moved, distance, size))
         moved, ahead = _in_front(shapes, *numbers)
         camera = dataclasses.replace(camera, _ahead=ahead)
-    camera = eqx.tree_at(lambda camera: camera.world_from_camera, camera, moved)
-    return jax.tree.map(lambda leaf: _in_precision(leaf, dtype), camera)
+    return jax.tree.map(lambda leaf: _in_precision(leaf, dtype), changed(camera, world_from_camera=moved))
 
 
 _FAR = 16  # times the size of the scene: nearer cameras see well enough from where they are

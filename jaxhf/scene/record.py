@@ -1,13 +1,15 @@
 """What the parts of a scene have in common: their fields keep rules, and they print by their numbers, also while traced."""
 
 import dataclasses
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 
 from ..core.rules import require_fields
+
+Module = TypeVar("Module", bound=eqx.Module)
 
 
 class Record(eqx.Module):
@@ -28,6 +30,17 @@ class Record(eqx.Module):
             if not (field.metadata.get("static") and getattr(self, field.name) == field.default)
         )
         return f"{type(self).__name__}({', '.join(values)})"
+
+
+def changed(module: Module, **fields: Any) -> Module:
+    """As `dataclasses.replace`, but without the module's rules, in a twentieth of the time that `equinox.tree_at` takes.
+
+    Leaves may be of any kind: `jax.ShapeDtypeStruct`s, where a program is only compiled.
+    """
+    new = object.__new__(type(module))
+    for name, value in (vars(module) | fields).items():
+        object.__setattr__(new, name, value)
+    return new
 
 
 def known(leaf: Any) -> np.ndarray | None:
