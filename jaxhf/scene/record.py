@@ -33,10 +33,8 @@ class Record(eqx.Module):
 
 
 def changed(module: Module, **fields: Any) -> Module:
-    """As `dataclasses.replace`, but without the module's rules, in a twentieth of the time that `equinox.tree_at` takes.
-
-    Leaves may be of any kind: `jax.ShapeDtypeStruct`s, where a program is only compiled.
-    """
+    """As `dataclasses.replace`, but the module's rules are not asked again, and leaves may be of any kind:
+    `jax.ShapeDtypeStruct`s, where a program is only compiled. `equinox.tree_at` would copy the whole tree."""
     new = object.__new__(type(module))
     for name, value in (vars(module) | fields).items():
         object.__setattr__(new, name, value)
