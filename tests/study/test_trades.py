@@ -30,8 +30,9 @@ def test_variants_give_the_same_picture_from_other_arrays(tmp_path):
     subprocess.run([sys.executable, str(BENCHMARK), str(tmp_path), *options], check=True, capture_output=True)
     rows = {row["variant"]: row for row in json.loads((tmp_path / "out.json").read_text())}
     assert [row["difference"] for row in rows.values()] == [0, 0]
-    # Six numbers a cell in place of one a height; and no bounds, which a pyramid has on both sides, in rows as long as a side.
+    # Six numbers a cell in place of one a height; and one number in place of bounds, which a pyramid has on both sides, in rows
+    # as long as a side.
     cells = SIDE - 1
     pyramid = 2 * cells * (cells + cells - 1)
-    more = 6 * cells**2 - SIDE**2 - pyramid
+    more = 6 * cells**2 - SIDE**2 + 1 - pyramid
     assert rows[stored]["held_mb"] - rows[base]["held_mb"] == 4 * more / 2**20
