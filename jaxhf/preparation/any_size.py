@@ -74,7 +74,7 @@ def _rooms(shapes: Sequence[Shape | Surface], squared: bool) -> Rooms:
 
     `squared`: for a program that serves many sizes, whose arrays of two axes then have sides of a power of two, and one. That
     pays where mountains hide the sky: to look round takes as long for the cells that are there, and compiles for seconds. The
-    rest would take 1.6 to 2.5 times as long (by hand, 1024 x 1024 and 600 x 600 heights), and compiles in 0.8 s.
+    rest would take at least twice as long, see docs/measurements/speed.md.
     """
 
     def may_have_room(shape: Shape | Surface) -> bool:
