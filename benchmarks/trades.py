@@ -32,12 +32,12 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "flat": {"settings": {"shading": "flat"}},
 }
 
-HELD = {  # pairs of variants, of which the first holds less
+HELD = [  # pairs of variants, of which the first holds less
     ("dda without bounds", "dda with bounds"),
-    ("dda with bounds", "pyramid, triangles on demand, normals of six, smooth"),
-    ("pyramid, triangles on demand, normals of six, smooth", "triangles stored"),
+    ("dda with bounds", next(iter(VARIANTS))),
+    (next(iter(VARIANTS)), "triangles stored"),
     ("dda without bounds", "dda without bounds, triangles stored"),
-}
+]
 
 
 def without_bounds() -> None:
@@ -191,8 +191,8 @@ def main() -> None:
         if options.output:
             options.output.write_text(json.dumps(rows, indent=1))
     held = {(row["scene"], row["variant"]): row["held_mb"] for row in rows}
-    for (name, more), less in itertools.product(held, options.variants):
-        if (less, more) in HELD:
+    for name, (less, more) in itertools.product(options.scenes, HELD):
+        if {less, more} <= set(options.variants):
             run.claim(held[name, less] < held[name, more], f"{name}: {less} holds less than {more}")
     for row in rows:
         title, variant = f"{row.pop('scene')}, {row['variant']}", VARIANTS[row.pop("variant")].get("settings", {})
